@@ -1,0 +1,1 @@
+"""The synthetic street: generator and one small committed tile."""

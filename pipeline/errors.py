@@ -1,0 +1,83 @@
+"""What can go wrong, said once: every error names the file, the cause and the remedy.
+
+`EXIT_CODES` is the one table that turns errors into exit codes of the command (and, for the
+services, HTTP statuses).
+"""
+
+from __future__ import annotations
+
+import errno
+from pathlib import Path
+
+
+class ScanError(Exception):
+    """An error that the user can act on.
+
+    Args:
+        where: the file (or setting) that the error is about.
+        cause: what is wrong with it.
+        remedy: what to do about it.
+    """
+
+    def __init__(self, where: str | Path, cause: str, remedy: str) -> None:
+        super().__init__(where, cause, remedy)  # args must survive pickling between processes
+        self.where = str(where)
+        self.cause = cause
+        self.remedy = remedy
+
+    def __str__(self) -> str:
+        return f"{self.where}: {self.cause}. {self.remedy}"
+
+
+class SettingError(ScanError):
+    """A setting, option or parameter that doesn't exist or is out of range."""
+
+
+class InputError(ScanError):
+    """A file of the tile that is missing, unreadable, or says something impossible."""
+
+
+class DataError(ScanError):
+    """Readable input from which no world can be made (too few points, nothing overlaps)."""
+
+
+class StepError(ScanError):
+    """A step that failed, its retry and its fallback included."""
+
+
+class SpaceError(ScanError):
+    """The disk is full or may not be written to."""
+
+
+class UnavailableError(ScanError):
+    """Something that is not installed or can't run on this machine."""
+
+
+# exception: (exit code, HTTP status, meaning)
+EXIT_CODES: dict[type[BaseException], tuple[int, int, str]] = {
+    SettingError: (2, 422, "a setting or option is wrong"),
+    InputError: (3, 422, "an input file is missing, unreadable or wrong"),
+    DataError: (4, 422, "the input is readable, but no world can be made from it"),
+    StepError: (5, 500, "a step failed, its retry and fallback included"),
+    SpaceError: (6, 507, "the disk is full or can't be written to"),
+    UnavailableError: (7, 501, "something needed is not installed or can't run here"),
+    KeyboardInterrupt: (130, 499, "interrupted; what was finished is kept"),
+}
+
+
+def exit_code(error: BaseException) -> int:
+    """The command's exit code for an error; 1 for one that the table doesn't know."""
+    for kind, (code, _, _) in EXIT_CODES.items():
+        if isinstance(error, kind):
+            return code
+    return 1
+
+
+def from_os_error(error: OSError, path: str | Path) -> ScanError:
+    """Turn an operating system's refusal to write into a `SpaceError` that names the path."""
+    where = error.filename or path
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return SpaceError(where, "no space left on the disk", "Free some space and run again; finished steps are kept")
+    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+        return SpaceError(where, "may not be written to", "Choose another --out, or change its permissions")
+    return InputError(where, str(error.strerror or error), "Check that the path exists and can be read")

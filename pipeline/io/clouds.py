@@ -1,0 +1,50 @@
+"""Point cloud files: LAS, LAZ and COPC through laspy, PLY through trimesh."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.errors import InputError
+from pipeline.io import las, ply
+from pipeline.types import F64, Frame, PointCloud
+
+
+@dataclass(frozen=True)
+class Header:
+    """What a cloud file says of itself: number of points, bounds (CRS units, float64), CRS as WKT or None."""
+
+    count: int
+    low: F64
+    high: F64
+    crs: str | None
+
+
+READERS = {".las": las, ".laz": las, ".ply": ply}
+
+
+def _reader(path: Path):  # type: ignore[no-untyped-def]  # a module
+    try:
+        return READERS[path.suffix.lower()]
+    except KeyError:
+        raise InputError(
+            path, f"is no known cloud format ({path.suffix or 'no suffix'})", "Use LAS, LAZ, COPC or PLY"
+        ) from None
+
+
+def read_header(path: Path) -> Header:
+    """Number of points, bounds and CRS, without reading the points where the format allows it.
+
+    Raises:
+        InputError: missing, truncated, or of an unknown format.
+    """
+    return Header(*_reader(path).read_header(path))
+
+
+def read(path: Path, frame: Frame) -> PointCloud:
+    """Read a cloud into `frame`'s local coordinates.
+
+    Raises:
+        InputError: missing, truncated, or of an unknown format.
+    """
+    return _reader(path).read(path, frame)

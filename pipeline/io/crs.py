@@ -1,0 +1,130 @@
+"""Coordinate reference systems: which one a tile is in, and metres per unit of its axes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.errors import InputError
+from pipeline.types import Frame
+
+if TYPE_CHECKING:
+    from pipeline.io.clouds import Header
+
+UNITS = {"m": 1.0, "ft": 0.3048, "us-ft": 1200 / 3937}
+LOCAL = "local"
+
+
+def common(
+    tile: Path, crs: str | None, units: str | None, clouds: Sequence[Path], headers: Sequence[Header]
+) -> tuple[str, float]:
+    """The CRS of a tile and metres per unit: the tile's own word, else what its clouds agree on.
+
+    Raises:
+        InputError: no CRS at all, clouds in different ones, or one that isn't projected.
+    """
+    own = [(path, h.crs) for path, h in zip(clouds, headers, strict=True)]
+    known = [(path, c) for path, c in own if c]
+    for path, other in known[1:]:
+        if not _same(known[0][1], other):
+            raise InputError(
+                path,
+                f"is in {_name(other)}, but {known[0][0].name} is in {_name(known[0][1])}",
+                "Bring all clouds of a tile to one CRS first",
+            )
+    if crs is None:
+        unknown = [path for path, c in own if not c]
+        if unknown:
+            raise InputError(
+                unknown[0],
+                "has no CRS, and the tile names none",
+                'Add crs = "EPSG:..." to tile.toml, or crs = "local" for metres without georeference',
+            )
+        crs = known[0][1] or LOCAL
+    elif crs != LOCAL and known and not _same(crs, known[0][1]):
+        raise InputError(
+            known[0][0],
+            f"is in {_name(known[0][1])}, but {tile.name} says {_name(crs)}",
+            "Mend `crs` in tile.toml, or leave it out to take the cloud's",
+        )
+    if crs == LOCAL:
+        return LOCAL, UNITS[units or "m"]
+    unit = _metres_per_unit(tile, crs)
+    if units:
+        unit = UNITS[units]
+    return crs, unit
+
+
+def to_wgs84(frame: Frame, xyz: npt.ArrayLike = (0.0, 0.0, 0.0)) -> tuple[float, float, float] | None:
+    """(latitude deg, longitude deg, height m) of a local point; None for a local frame.
+
+    The height is the CRS's own (ellipsoidal or local, as it says); no vertical shift is applied.
+    """
+    if frame.crs == LOCAL:
+        return None
+    from pyproj import Transformer
+
+    local = np.asarray(xyz, float)
+    x, y, _ = frame.to_crs(local).tolist()
+    lon, lat = Transformer.from_crs(_horizontal(frame.crs), "EPSG:4979", always_xy=True).transform(x, y)[:2]
+    return float(lat), float(lon), float(local[2] + frame.origin[2])
+
+
+def convergence(frame: Frame) -> float:
+    """Meridian convergence at the origin, radians: the angle from true north to grid north, clockwise positive."""
+    if frame.crs == LOCAL:
+        return 0.0
+    from pyproj import Proj
+
+    here = to_wgs84(frame)
+    assert here is not None
+    return float(np.radians(Proj(_horizontal(frame.crs)).get_factors(here[1], here[0]).meridian_convergence))
+
+
+def _parsed(crs: str):  # type: ignore[no-untyped-def]  # pyproj is imported late
+    from pyproj import CRS
+    from pyproj.exceptions import CRSError
+
+    try:
+        return CRS.from_user_input(crs)
+    except CRSError as error:
+        raise InputError(
+            "crs", f"{crs[:60]!r} is not a CRS ({error})", 'Give a code such as "EPSG:32633", or WKT'
+        ) from None
+
+
+def _horizontal(crs: str):  # type: ignore[no-untyped-def]
+    parsed = _parsed(crs)
+    return parsed.sub_crs_list[0] if parsed.is_compound else parsed
+
+
+def _same(a: str | None, b: str | None) -> bool:
+    if a == b:
+        return True
+    if not a or not b or LOCAL in (a, b):
+        return False
+    first, second = _horizontal(a), _horizontal(b)
+    return bool(first == second or (first.to_epsg() is not None and first.to_epsg() == second.to_epsg()))
+
+
+def _name(crs: str | None) -> str:
+    if not crs or crs == LOCAL:
+        return "no CRS"
+    parsed = _parsed(crs)
+    code = parsed.to_epsg()
+    return f"EPSG:{code}" if code else str(parsed.name)
+
+
+def _metres_per_unit(tile: Path, crs: str) -> float:
+    horizontal = _horizontal(crs)
+    if not horizontal.is_projected:
+        raise InputError(
+            tile,
+            f"its CRS {_name(crs)} is not projected (degrees can't be meshed)",
+            "Reproject the clouds, to UTM for example",
+        )
+    return float(horizontal.axis_info[0].unit_conversion_factor)

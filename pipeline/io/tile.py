@@ -1,0 +1,256 @@
+"""The tile: `tile.toml` names clouds, photos, cameras and poses, CRS and units.
+
+```toml
+name = "my_street"
+crs = "EPSG:32633"          # code or WKT; "local" without georeference; default: the clouds' own
+units = "m"                 # "ft", "us-ft"; default: as the CRS says, else metres
+clouds = ["cloud.laz"]      # LAS, LAZ, COPC, PLY; coordinates in that CRS and unit
+trajectory = "path.csv"     # optional: time,x,y,z of the scanner
+
+[[cameras]]
+id = "front"
+model = "opencv"            # pinhole, opencv (Brown-Conrady), fisheye, equirectangular
+size = [1920, 1080]         # pixels
+focal = [1000.0, 1000.0]    # fx, fy in pixels (not for equirectangular)
+centre = [959.5, 539.5]     # cx, cy in pixels; the centre of the top left pixel is (0, 0)
+distortion = [-0.1, 0.01, 0.0, 0.0]
+
+[[photos]]
+file = "photos/0001.jpg"
+camera = "front"
+position = [500010.2, 5400020.1, 210.5]               # camera centre, CRS coordinates
+rotation = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]        # camera to world; x right, y down, z forward
+time = 1234.5               # optional: GPS time, seconds
+mask = "masks/0001.png"     # optional: 0 where the photo must not be used
+```
+Paths are relative to the `tile.toml`. A generated tile also names its ground truth:
+`[truth]` with `mesh` and `points`.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from pipeline.errors import InputError
+from pipeline.io import clouds as cloud_io
+from pipeline.io import crs as crs_io
+from pipeline.types import Camera, CameraModel, Frame, Tile, Trajectory, View
+
+Vector = tuple[float, float, float]
+DISTORTION_LENGTHS = {"pinhole": (0,), "opencv": (0, 4, 5, 8), "fisheye": (0, 4), "equirectangular": (0,)}
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class CameraEntry(_Strict):
+    """A `[[cameras]]` entry of `tile.toml`."""
+
+    id: str
+    model: CameraModel
+    size: tuple[int, int]
+    focal: tuple[float, float] = (0.0, 0.0)
+    centre: tuple[float, float] = (0.0, 0.0)
+    distortion: tuple[float, ...] = ()
+
+
+class PhotoEntry(_Strict):
+    """A `[[photos]]` entry of `tile.toml`."""
+
+    file: str
+    camera: str
+    position: Vector
+    rotation: tuple[Vector, Vector, Vector]
+    time: float | None = None
+    mask: str | None = None
+
+
+class TruthEntry(_Strict):
+    """The `[truth]` entry of a generated tile."""
+
+    mesh: str
+    points: str
+
+
+class TileFile(_Strict):
+    """All of `tile.toml`."""
+
+    name: str = Field(pattern=r"^[A-Za-z0-9_]+$")
+    crs: str | None = None
+    units: Literal["m", "ft", "us-ft"] | None = None
+    clouds: tuple[str, ...] = Field(min_length=1)
+    trajectory: str | None = None
+    cameras: tuple[CameraEntry, ...] = ()
+    photos: tuple[PhotoEntry, ...] = ()
+    truth: TruthEntry | None = None
+
+
+def read_tile(path: Path) -> Tile:
+    """Read and check a tile: a `tile.toml`, or a folder that holds one.
+
+    The frame's origin is the middle of the clouds' bounding box in x and y and its bottom in z,
+    in whole metres.
+
+    Raises:
+        InputError: naming the file, the field and what was expected.
+    """
+    path = path / "tile.toml" if path.is_dir() else path
+    spec = _parse(path)
+    clouds = tuple(_existing(path, name, "clouds") for name in spec.clouds)
+    headers = [cloud_io.read_header(cloud) for cloud in clouds]
+    crs, unit = crs_io.common(path, spec.crs, spec.units, clouds, headers)
+    low = np.min([h.low for h in headers], axis=0) * unit
+    high = np.max([h.high for h in headers], axis=0) * unit
+    x, y, z = np.floor([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]]).tolist()
+    frame = Frame(crs, (x, y, z), unit)
+    cameras = {entry.id: _camera(path, entry) for entry in spec.cameras}
+    return Tile(
+        path=path,
+        name=spec.name,
+        frame=frame,
+        clouds=clouds,
+        views=tuple(_view(path, i, entry, cameras, frame) for i, entry in enumerate(spec.photos)),
+        trajectory=_trajectory(_existing(path, spec.trajectory, "trajectory"), frame) if spec.trajectory else None,
+        truth_mesh=_existing(path, spec.truth.mesh, "truth.mesh") if spec.truth else None,
+        truth_points=_existing(path, spec.truth.points, "truth.points") if spec.truth else None,
+    )
+
+
+def write_tile(
+    folder: Path,
+    *,
+    name: str,
+    crs: str,
+    clouds: Sequence[str],
+    cameras: dict[str, Camera],
+    photos: Sequence[dict[str, Any]] = (),
+    trajectory: str | None = None,
+    units: str | None = None,
+    truth: dict[str, str] | None = None,
+) -> Path:
+    """Write `folder/tile.toml` and return its path.
+
+    Args:
+        photos: dicts with the keys of a `[[photos]]` entry; `position` and `rotation` may be arrays.
+        others: as in `tile.toml`; file names relative to `folder`.
+    """
+    import tomli_w
+
+    body: dict[str, Any] = {"name": name, "crs": crs, "clouds": list(clouds)}
+    if units:
+        body["units"] = units
+    if trajectory:
+        body["trajectory"] = trajectory
+    if truth:
+        body["truth"] = truth
+    body["cameras"] = [_camera_entry(key, camera) for key, camera in cameras.items()]
+    body["photos"] = [
+        {k: (v.tolist() if isinstance(v, np.ndarray) else v) for k, v in photo.items() if v is not None}
+        for photo in photos
+    ]
+    body = {key: value for key, value in body.items() if value != []}
+    TileFile.model_validate(body)
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "tile.toml"
+    path.write_text(tomli_w.dumps(body), encoding="utf-8")
+    return path
+
+
+def tile_name(text: str) -> str:
+    """`text` made fit for a tile's name (letters, digits, underscores)."""
+    return "".join(c if c.isascii() and c.isalnum() else "_" for c in text).strip("_") or "tile"
+
+
+def _parse(path: Path) -> TileFile:
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(
+            path, "there is no tile here", "Name a tile.toml or its folder; `scan2sim import` makes one from your files"
+        ) from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(path, f"is not valid TOML ({error})", "Mend the line that the message names") from None
+    try:
+        return TileFile.model_validate(data)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise InputError(
+            path, f"field `{where}`: {first['msg']}", "docs/formats.md lists the fields of a tile"
+        ) from None
+
+
+def _existing(tile: Path, name: str, field: str) -> Path:
+    path = tile.parent / name
+    if not path.is_file():
+        raise InputError(path, f"is missing (named under `{field}` of {tile.name})", "Put it there, or mend the name")
+    return path
+
+
+def _camera(tile: Path, entry: CameraEntry) -> Camera:
+    where = f"camera `{entry.id}`"
+    if min(entry.size) < 1:
+        raise InputError(tile, f"{where}: size {entry.size} is not positive", "Give the photo's size in pixels")
+    if entry.model != "equirectangular" and not (np.isfinite(entry.focal).all() and min(entry.focal) > 0):
+        raise InputError(tile, f"{where}: focal {entry.focal} is not positive", "Give fx and fy in pixels")
+    if len(entry.distortion) not in DISTORTION_LENGTHS[entry.model]:
+        lengths = " or ".join(map(str, DISTORTION_LENGTHS[entry.model]))
+        raise InputError(
+            tile, f"{where}: {len(entry.distortion)} distortion coefficients", f"A {entry.model} camera takes {lengths}"
+        )
+    return Camera(entry.model, *entry.size, *entry.focal, *entry.centre, entry.distortion)
+
+
+def _camera_entry(key: str, camera: Camera) -> dict[str, Any]:
+    entry: dict[str, Any] = {"id": key, "model": camera.model, "size": [camera.width, camera.height]}
+    if camera.model != "equirectangular":
+        entry |= {"focal": [camera.fx, camera.fy], "centre": [camera.cx, camera.cy]}
+    if camera.distortion:
+        entry["distortion"] = list(camera.distortion)
+    return entry
+
+
+def _view(tile: Path, index: int, entry: PhotoEntry, cameras: dict[str, Camera], frame: Frame) -> View:
+    where = f"photo {index} ({entry.file})"
+    if entry.camera not in cameras:
+        raise InputError(tile, f"{where}: there is no camera `{entry.camera}`", f"Cameras are: {', '.join(cameras)}")
+    rotation, position = np.array(entry.rotation), np.array(entry.position)
+    if not (np.isfinite(rotation).all() and np.isfinite(position).all()):
+        raise InputError(tile, f"{where}: its pose holds NaN or infinity", "Mend the pose, or leave the photo out")
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
+        raise InputError(
+            tile,
+            f"{where}: `rotation` is no rotation (rows must be orthonormal, determinant +1)",
+            "Give the 3x3 camera-to-world rotation, camera axes x right, y down, z forward",
+        )
+    u, _, vt = np.linalg.svd(rotation)  # rounded digits: nearest true rotation
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = u @ vt, frame.to_local(position)
+    return View(
+        name=Path(entry.file).with_suffix("").as_posix(),
+        camera=cameras[entry.camera],
+        T_world_cam=pose,
+        photo=tile.parent / entry.file,
+        mask=tile.parent / entry.mask if entry.mask else None,
+        time=entry.time,
+    )
+
+
+def _trajectory(path: Path, frame: Frame) -> Trajectory:
+    try:
+        rows = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2)
+        if rows.shape[1] != 4 or len(rows) == 0 or not np.isfinite(rows).all():
+            raise ValueError(f"shape {rows.shape}")
+    except ValueError as error:
+        raise InputError(
+            path, f"is no trajectory ({error})", "Write a CSV: a heading, then time,x,y,z a line, CRS coordinates"
+        ) from None
+    rows = rows[np.argsort(rows[:, 0], kind="stable")]
+    return Trajectory(rows[:, 0], frame.to_local(rows[:, 1:]))

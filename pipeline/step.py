@@ -1,0 +1,73 @@
+"""What a step is: a pure function on files with frozen parameters, a name and a version.
+
+To add one: a function, its `Params`, one line in `flows/recipe.py`, one test.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+from pydantic import BaseModel, ConfigDict
+
+
+class Params(BaseModel):
+    """Base of every step's parameters: frozen, and unknown names are refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Report(Protocol):
+    """Progress callback: a bar in the command, an artifact in Prefect, nothing in tests."""
+
+    def __call__(self, fraction: float, message: str = "") -> None: ...
+
+
+def silent(fraction: float, message: str = "") -> None:
+    """A `Report` that says nothing."""
+
+
+Inputs = Mapping[str, Path]
+
+
+@dataclass(frozen=True)
+class Done:
+    """What a step made.
+
+    Attributes:
+        files: name to path of a file or folder inside the step's output folder.
+        facts: JSON-able figures for the report (counts in and out, errors, ...).
+        warnings: sentences that the user should read; shown and kept with the result.
+    """
+
+    files: dict[str, Path]
+    facts: dict[str, Any] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+
+
+class Run(Protocol):
+    """The function of a step: reads `inputs`, writes below the folder `out`, nowhere else."""
+
+    def __call__(self, inputs: Inputs, params: Any, out: Path, report: Report) -> Done: ...
+
+
+@dataclass(frozen=True)
+class Step:
+    """A step of the mission.
+
+    Attributes:
+        name: as on the command line (`--from NAME`, `--set NAME.param=value`).
+        version: raised whenever its results change for the same input and parameters.
+        run: the function; must be importable by name (it may run in another process), and
+            import what is heavy inside.
+        params: its parameters; defaults are the mission's numbers.
+        per_class: defaults that differ between terrain, building and vegetation.
+    """
+
+    name: str
+    version: int
+    run: Run
+    params: type[Params] = Params
+    per_class: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)

@@ -1,0 +1,1 @@
+"""The steps of the mission (D3.2, section 4.2), one file each."""

@@ -1,0 +1,273 @@
+"""The values that flow between steps: frozen, each spatial one with its CRS and origin.
+
+Conventions, everywhere inside: metres; world z-up; camera axes of OpenCV (x right, y down,
+z forward); poses are `T_world_cam` (camera to world). World coordinates are float64; a `Frame`'s
+origin is subtracted before anything becomes float32 ("local" coordinates below).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any, Literal, Self
+
+import numpy as np
+import numpy.typing as npt
+
+F32 = npt.NDArray[np.float32]
+F64 = npt.NDArray[np.float64]
+U8 = npt.NDArray[np.uint8]
+I32 = npt.NDArray[np.int32]
+
+CameraModel = Literal["pinhole", "opencv", "fisheye", "equirectangular"]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Where local coordinates are: `crs = (local + origin) / unit`.
+
+    Attributes:
+        crs: WKT or authority code of the CRS; "local" where there is none.
+        origin: (3,) metres, float64, subtracted from world coordinates.
+        unit: metres per unit of the CRS's axes (0.3048 for international feet).
+    """
+
+    crs: str = "local"
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    unit: float = 1.0
+
+    def to_local(self, xyz: npt.ArrayLike) -> F64:
+        """CRS coordinates (..., 3) to local metres, float64."""
+        return np.asarray(xyz, np.float64) * self.unit - np.asarray(self.origin)
+
+    def to_crs(self, xyz: npt.ArrayLike) -> F64:
+        """Local metres (..., 3) to CRS coordinates, float64."""
+        return (np.asarray(xyz, np.float64) + np.asarray(self.origin)) / self.unit
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A camera's intrinsics.
+
+    Attributes:
+        model: "pinhole"; "opencv" (Brown-Conrady, k1 k2 p1 p2 [k3 [k4 k5 k6]]); "fisheye" (OpenCV's
+            equidistant model, k1 k2 k3 k4); "equirectangular" (full sphere; column 0 looks back,
+            the centre looks along +z, the right half along +x; fx, fy, cx, cy unused).
+        width, height: pixels.
+        fx, fy, cx, cy: pixels; the centre of the top left pixel is (0, 0), as in OpenCV.
+        distortion: coefficients as `model` says.
+    """
+
+    model: CameraModel
+    width: int
+    height: int
+    fx: float = 0.0
+    fy: float = 0.0
+    cx: float = 0.0
+    cy: float = 0.0
+    distortion: tuple[float, ...] = ()
+
+    def scaled(self, factor: float) -> Camera:
+        """The camera of the photo resized by `factor` (pixel centres kept aligned)."""
+        w, h = max(1, round(self.width * factor)), max(1, round(self.height * factor))
+        sx, sy = w / self.width, h / self.height
+        return replace(
+            self, width=w, height=h, fx=self.fx * sx, fy=self.fy * sy,
+            cx=(self.cx + 0.5) * sx - 0.5, cy=(self.cy + 0.5) * sy - 0.5,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class View:
+    """A posed photo.
+
+    Attributes:
+        name: unique within the tile.
+        camera: its intrinsics.
+        T_world_cam: (4, 4) float64, camera to local coordinates.
+        photo: path of the image file.
+        mask: path of a single-channel image, 0 where the photo must not be used, or None.
+        time: GPS time in seconds, or None.
+    """
+
+    name: str
+    camera: Camera
+    T_world_cam: F64
+    photo: Path
+    mask: Path | None = None
+    time: float | None = None
+
+    @property
+    def centre(self) -> F64:
+        """(3,) camera centre, local coordinates."""
+        return self.T_world_cam[:3, 3]
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """The scanner's path: `times` (T,) seconds, ascending; `positions` (T, 3) local, float64."""
+
+    times: F64
+    positions: F64
+
+    def at(self, times: npt.ArrayLike) -> F64:
+        """(N, 3) positions at `times`, linearly interpolated, held at both ends."""
+        return np.stack([np.interp(times, self.times, self.positions[:, k]) for k in range(3)], axis=-1)
+
+
+def _save(value: Any, path: Path) -> None:
+    """Write a dataclass of arrays and a frame as an uncompressed .npz."""
+    arrays: dict[str, Any] = {}
+    for f in fields(value):
+        part = getattr(value, f.name)
+        if isinstance(part, Frame):
+            arrays["frame"] = np.array([part.crs, repr(part.origin), repr(part.unit)])
+        elif part is not None:
+            arrays[f.name] = part
+    with open(path, "wb") as file:
+        np.savez(file, **arrays)
+
+
+def _load(cls: Any, path: Path) -> Any:
+    with np.load(path) as data:
+        arrays = {name: data[name] for name in data.files}
+    crs, origin, unit = arrays.pop("frame").tolist()
+    origin = tuple(float(part) for part in origin.strip("()").split(","))
+    return cls(frame=Frame(crs, origin, float(unit)), **arrays)
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """Points in local coordinates with what is known of each; absent attributes are None.
+
+    Attributes:
+        frame: CRS and origin.
+        xyz: (N, 3) float32, local metres.
+        rgb: (N, 3) uint8.
+        normal: (N, 3) float32, unit.
+        label: (N,) uint8, LAS class codes (`pipeline.classes`).
+        time: (N,) float64, GPS time in seconds.
+        intensity: (N,) uint16.
+    """
+
+    frame: Frame
+    xyz: F32
+    rgb: U8 | None = None
+    normal: F32 | None = None
+    label: U8 | None = None
+    time: F64 | None = None
+    intensity: npt.NDArray[np.uint16] | None = None
+
+    def __len__(self) -> int:
+        return len(self.xyz)
+
+    def take(self, index: npt.NDArray[Any] | slice) -> Self:
+        """The points that `index` (integers, mask or slice) selects."""
+        parts = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "frame"}
+        return replace(self, **{k: v[index] for k, v in parts.items() if v is not None})
+
+    def save(self, path: Path) -> None:
+        """Write as .npz."""
+        _save(self, path)
+
+    @classmethod
+    def load(cls, path: Path) -> PointCloud:
+        """Read what `save` wrote."""
+        return _load(cls, path)
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles in local coordinates, oriented counter-clockwise seen from outside.
+
+    Attributes:
+        frame: CRS and origin.
+        vertices: (V, 3) float32, local metres.
+        faces: (F, 3) int32, into `vertices`.
+        density: (V,) float32, Poisson's octree depth of the samples near the vertex, or None.
+        uv: (F, 3, 2) float32, per corner in [0, 1], origin at the lower left (as in OBJ), or None.
+        page: (F,) int16, index of the face's texture page, or None.
+        label: (F,) uint8, LAS class codes, or None.
+    """
+
+    frame: Frame
+    vertices: F32
+    faces: I32
+    density: F32 | None = None
+    uv: F32 | None = None
+    page: npt.NDArray[np.int16] | None = None
+    label: U8 | None = None
+
+    def __len__(self) -> int:
+        return len(self.faces)
+
+    @property
+    def corners(self) -> F32:
+        """(F, 3, 3) the three corners of every face."""
+        return self.vertices[self.faces]
+
+    @property
+    def face_area(self) -> F32:
+        """(F,) m2."""
+        return np.linalg.norm(self._cross, axis=1) / 2
+
+    @property
+    def face_normal(self) -> F32:
+        """(F, 3) unit, zero for degenerate faces."""
+        cross = self._cross
+        return cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-20)
+
+    @property
+    def _cross(self) -> F32:
+        c = self.corners
+        return np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0])
+
+    def keep(self, mask: npt.NDArray[np.bool_]) -> Mesh:
+        """The faces that `mask` (F,) selects, without the vertices that none of them uses."""
+        faces = self.faces[mask]
+        used = np.zeros(len(self.vertices), bool)
+        used[faces] = True
+        renumber = np.cumsum(used, dtype=np.int32) - 1
+        return replace(
+            self,
+            vertices=self.vertices[used],
+            faces=renumber[faces],
+            density=None if self.density is None else self.density[used],
+            uv=None if self.uv is None else self.uv[mask],
+            page=None if self.page is None else self.page[mask],
+            label=None if self.label is None else self.label[mask],
+        )
+
+    def save(self, path: Path) -> None:
+        """Write as .npz."""
+        _save(self, path)
+
+    @classmethod
+    def load(cls, path: Path) -> Mesh:
+        """Read what `save` wrote."""
+        return _load(cls, path)
+
+
+@dataclass(frozen=True)
+class Tile:
+    """What `tile.toml` names, checked (`pipeline.io.tile`).
+
+    Attributes:
+        path: the `tile.toml`.
+        name: of the tile and its world.
+        frame: CRS, unit and origin that the clouds will be brought to (origin of the tile's data).
+        clouds: point cloud files.
+        views: posed photos, poses in the frame's local coordinates.
+        trajectory: the scanner's path, or None.
+        truth_mesh: ground-truth surface (.npz `Mesh` with `label`), for generated tiles, or None.
+        truth_points: ground-truth coloured surface samples (LAZ), for generated tiles, or None.
+    """
+
+    path: Path
+    name: str
+    frame: Frame
+    clouds: tuple[Path, ...]
+    views: tuple[View, ...] = ()
+    trajectory: Trajectory | None = None
+    truth_mesh: Path | None = None
+    truth_points: Path | None = None

@@ -1,0 +1,1 @@
+"""Photos to classes per pixel to classes per point."""
