@@ -1,1 +1,1 @@
-"""The synthetic street: generator and one small committed tile."""
+"""A synthetic street with its ground truth: generator, and one small committed tile."""

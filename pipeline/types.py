@@ -7,6 +7,7 @@ origin is subtracted before anything becomes float32 ("local" coordinates below)
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -114,6 +115,15 @@ class Trajectory:
         """(N, 3) positions at `times`, linearly interpolated, held at both ends."""
         return np.stack([np.interp(times, self.times, self.positions[:, k]) for k in range(3)], axis=-1)
 
+    def save(self, path: Path) -> None:
+        """Write as .npz."""
+        _save(self, path)
+
+    @classmethod
+    def load(cls, path: Path) -> Trajectory:
+        """Read what `save` wrote."""
+        return _load(cls, path)
+
 
 def _save(value: Any, path: Path) -> None:
     """Write a dataclass of arrays and a frame as an uncompressed .npz."""
@@ -131,9 +141,11 @@ def _save(value: Any, path: Path) -> None:
 def _load(cls: Any, path: Path) -> Any:
     with np.load(path) as data:
         arrays = {name: data[name] for name in data.files}
-    crs, origin, unit = arrays.pop("frame").tolist()
-    origin = tuple(float(part) for part in origin.strip("()").split(","))
-    return cls(frame=Frame(crs, origin, float(unit)), **arrays)
+    if "frame" in arrays:
+        crs, origin, unit = arrays.pop("frame").tolist()
+        x, y, z = (float(part) for part in origin.strip("()").split(","))
+        arrays["frame"] = Frame(crs, (x, y, z), float(unit))
+    return cls(**arrays)
 
 
 @dataclass(frozen=True)
@@ -165,6 +177,37 @@ class PointCloud:
         """The points that `index` (integers, mask or slice) selects."""
         parts = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "frame"}
         return replace(self, **{k: v[index] for k, v in parts.items() if v is not None})
+
+    @staticmethod
+    def join(clouds: Sequence[PointCloud]) -> PointCloud:
+        """All points of clouds in one frame, in order.
+
+        Colours become grey and classes 1 (unclassified) where only some clouds have them; other
+        attributes that not all of them have are dropped.
+        """
+        if len(clouds) == 1:
+            return clouds[0]
+
+        def column(name: str, filler: tuple[Any, Any] | None = None) -> Any:
+            values = [getattr(c, name) for c in clouds]
+            if filler is not None and any(v is not None for v in values):
+                value, kind = filler
+                shape = {"rgb": (3,)}.get(name, ())
+                values = [
+                    np.full((len(c), *shape), value, kind) if v is None else v
+                    for c, v in zip(clouds, values, strict=True)
+                ]
+            return None if any(v is None for v in values) else np.concatenate(values)
+
+        return PointCloud(
+            clouds[0].frame,
+            column("xyz"),
+            column("rgb", (128, np.uint8)),
+            column("normal"),
+            column("label", (1, np.uint8)),
+            column("time"),
+            column("intensity"),
+        )
 
     def save(self, path: Path) -> None:
         """Write as .npz."""

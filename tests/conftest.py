@@ -16,3 +16,13 @@ def real_data() -> Path:
     if not DATA.is_dir():
         pytest.skip(f"real data is not at {DATA}")
     return DATA
+
+
+@pytest.fixture(scope="session")
+def small_street(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A synthetic street small enough for tests: 12 m, 150,000 points, 8 photos."""
+    from data_samples.street import generate
+
+    out = tmp_path_factory.mktemp("street") / "tile"
+    generate(out, length=12.0, points=150_000, photos=8, seed=5, photo_width=480)
+    return out

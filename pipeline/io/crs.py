@@ -33,7 +33,7 @@ def common(
         if not _same(known[0][1], other):
             raise InputError(
                 path,
-                f"is in {_name(other)}, but {known[0][0].name} is in {_name(known[0][1])}",
+                f"is in {name(other)}, but {known[0][0].name} is in {name(known[0][1])}",
                 "Bring all clouds of a tile to one CRS first",
             )
     if crs is None:
@@ -48,7 +48,7 @@ def common(
     elif crs != LOCAL and known and not _same(crs, known[0][1]):
         raise InputError(
             known[0][0],
-            f"is in {_name(known[0][1])}, but {tile.name} says {_name(crs)}",
+            f"is in {name(known[0][1])}, but {tile.name} says {name(crs)}",
             "Mend `crs` in tile.toml, or leave it out to take the cloud's",
         )
     if crs == LOCAL:
@@ -111,7 +111,8 @@ def _same(a: str | None, b: str | None) -> bool:
     return bool(first == second or (first.to_epsg() is not None and first.to_epsg() == second.to_epsg()))
 
 
-def _name(crs: str | None) -> str:
+def name(crs: str | None) -> str:
+    """How a person calls a CRS: its EPSG code, else its name."""
     if not crs or crs == LOCAL:
         return "no CRS"
     parsed = _parsed(crs)
@@ -124,7 +125,7 @@ def _metres_per_unit(tile: Path, crs: str) -> float:
     if not horizontal.is_projected:
         raise InputError(
             tile,
-            f"its CRS {_name(crs)} is not projected (degrees can't be meshed)",
+            f"its CRS {name(crs)} is not projected (degrees can't be meshed)",
             "Reproject the clouds, to UTM for example",
         )
     return float(horizontal.axis_info[0].unit_conversion_factor)

@@ -1,0 +1,1 @@
+"""Side-by-side benchmarks; each ends with one line `RESULT {json}`."""

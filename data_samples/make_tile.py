@@ -1,0 +1,31 @@
+"""Make the small committed tile again: `python -m data_samples.make_tile [FOLDER]`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from data_samples.photos import Effects
+from data_samples.street import generate
+
+TILE = Path(__file__).parent / "tile"
+
+
+def make(out: Path = TILE) -> Path:
+    """Write the tile that `data_samples/README.md` describes; returns its `tile.toml`."""
+    return generate(
+        out,
+        length=26.0,
+        points=4.2e5,
+        photos=10,
+        seed=5,
+        photo_width=800,
+        truth_density=30.0,
+        cloud_scale=0.005,
+        effects=Effects(quality=90),
+        name="sample_street",
+    )
+
+
+if __name__ == "__main__":
+    print(make(Path(sys.argv[1]) if len(sys.argv) > 1 else TILE))

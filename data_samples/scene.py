@@ -1,0 +1,342 @@
+"""The street as triangles under a sun: what a ray hits, and how it is lit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from data_samples import objects, paints, signs
+from data_samples.layout import FRAME, HALF_WIDTH, Layout
+from data_samples.paints import Material, Paint, linear
+from data_samples.shapes import Part, join, sheet
+from pipeline.types import F32, F64, Mesh
+
+CAR_SPEED = 8.0
+SUN_COLOUR = np.array([1.06, 1.0, 0.88], np.float32)
+SKY_COLOUR = np.array([0.90, 1.0, 1.16], np.float32)
+GROUND_STEP = 0.33  # metres between vertices of the ground
+CLEAR = 0.2  # metres above a surface from where its openness to the sky is traced: beyond sills and surrounds
+FINE = np.float32(0.01)  # metres that a true colour stands for
+
+
+def build(layout: Layout) -> tuple[Part, Part, Part]:
+    """Meshes of what stays in a world, of the parked cars (local coordinates), and of the moving car (its own)."""
+    still = [*_ground(layout)]
+    for h in layout.houses:
+        xy, heading = layout.axis.place(h.s + h.width / 2, h.side * h.front)
+        still.append(_upright(layout, objects.house(h), -h.width / 2, h.side, xy, heading))
+    for t in layout.trees:
+        xy, heading = layout.axis.place(t.s, t.t)
+        mesh = objects.bush(t) if t.bush else objects.tree(t)
+        still.append(mesh.moved(float(heading), (*xy, float(layout.height(t.s, t.t)))))
+    for b in layout.boundaries:
+        pieces = max(1, round((b.s1 - b.s0) / 6))  # straight pieces follow the road's bend
+        for s0 in np.linspace(b.s0, b.s1, pieces + 1)[:-1]:
+            length = (b.s1 - b.s0) / pieces
+            xy, heading = layout.axis.place(s0 + length / 2, b.t)
+            piece = objects.boundary(replace(b, seed=b.seed + int(s0 * 10)), length)
+            still.append(_upright(layout, piece, -length / 2, 1 if b.t > 0 else -1, xy, heading))
+    for p in layout.posts:
+        xy, heading = layout.axis.place(p.s, p.t)
+        if p.sign is None:  # the lamp's arm reaches over the road
+            mesh, turn = objects.lamp(), float(heading) + (np.pi if p.t > 0 else 0.0)
+        else:  # a sign faces those who drive towards it
+            mesh, turn = objects.sign(p.sign), float(heading) + (-np.pi / 2 if p.towards == 1 else np.pi / 2)
+        still.append(mesh.moved(turn, (*xy, float(layout.height(p.s, p.t)))))
+    parked = []
+    for c in layout.parked:
+        xy, heading = layout.axis.place(c.s, c.t)
+        turn = float(heading) + (0.0 if c.towards == 1 else np.pi)
+        parked.append(objects.car(c.colour).moved(turn, (*xy, float(layout.height(c.s, c.t)) + 0.01)))
+    moving = objects.car(layout.moving)
+    empty = _slice(moving, np.zeros(len(moving.faces), bool))
+    fixed = join(still)
+    grid = np.round(fixed.vertices * 2048) / np.float32(
+        2048
+    )  # half a millimetre: exact in float32, and compresses well
+    return replace(fixed, vertices=grid.astype(np.float32)), join(parked) if parked else empty, moving
+
+
+def _upright(layout: Layout, mesh: Part, x: float, side: int, xy: F64, heading: F64) -> Part:
+    """Stand a mesh whose front looks towards -y at `xy` beside the road, its front to the road."""
+    turn = float(heading) + (0.0 if side == 1 else np.pi)
+    s, t = layout.axis.locate(xy)
+    return mesh.moved(0.0, (x, 0, 0)).moved(turn, (*xy, float(layout.height(s, t))))
+
+
+def _slice(mesh: Part, keep: npt.NDArray[np.bool_]) -> Part:
+    per_face = {name: getattr(mesh, name)[keep] for name in ("faces", "material", "label", "colour", "seed", "size")}
+    return replace(mesh, **per_face)
+
+
+def _ground(layout: Layout) -> list[Part]:
+    """Carriageway, bays, kerbs, pavements and terrain, as strips along the axis; none inside houses."""
+    rows = max(2, round(layout.axis.length / GROUND_STEP) + 1)
+    s = np.linspace(0, layout.axis.length, rows)
+    grass = Paint(Material.GRASS, linear("#5d7434"), paints.TERRAIN, layout.seed % 1000)
+    slabs = Paint(Material.SLABS, linear("#b5b0a6"), paints.SIDEWALK, layout.seed % 1000)
+    stone = Paint(Material.KERB, linear("#a8a6a0"), paints.SIDEWALK, 3)
+    setts = Paint(Material.SETTS, linear("#7d7873"), paints.ROAD, 5)
+    asphalt = Paint(Material.ASPHALT, layout.asphalt, paints.ROAD, 100 + layout.seed % 1000)
+
+    def strip(t0: float, t1: float, paint: Paint, *, below: bool = False) -> Part:
+        count = max(2, round((t1 - t0) / GROUND_STEP) + 1)
+        return surface(np.linspace(t0, t1, count), paint, below)
+
+    def surface(t: F64, paint: Paint, below: bool) -> Part:
+        tt, ss = np.meshgrid(t, s, indexing="ij")
+        xy, _ = layout.axis.place(ss, tt)
+        xyz = np.concatenate([xy, layout.height(ss, tt, below_kerb=below)[..., None]], axis=-1)
+        return sheet(xyz, np.stack([ss, tt], axis=-1), paint)
+
+    parts = [strip(-layout.lane, layout.lane, asphalt, below=True)]
+    for side in (1, -1):
+        k, g = layout.kerb(side), layout.garden(side)
+        for near, far, paint, below in (
+            (layout.lane, k, setts, True),
+            (k, k + 0.15, stone, False),
+            (k + 0.15, g, slabs, False),
+            (g, HALF_WIDTH, grass, False),
+        ):
+            if far > near:
+                parts.append(strip(min(side * near, side * far), max(side * near, side * far), paint, below=below))
+        xy, _ = layout.axis.place(s, side * k)
+        foot = np.column_stack([xy, layout.height(s, side * k, below_kerb=True)])
+        top = np.column_stack([xy, layout.height(s, side * k)])
+        face = np.stack([foot, top] if side == 1 else [top, foot])
+        uv = np.stack([np.column_stack([s, v + 0 * s]) for v in ((0, 0.12) if side == 1 else (0.12, 0))])
+        parts.append(sheet(face[::-1], uv[::-1], stone))
+    return [_slice(p, ~_inside_houses(layout, p)) if p.label[0] == paints.TERRAIN else p for p in parts]
+
+
+def _inside_houses(layout: Layout, mesh: Part) -> npt.NDArray[np.bool_]:
+    """(F,) whether a face lies well inside a house."""
+    middle = mesh.vertices[mesh.faces].mean(axis=1)[:, :2]
+    inside = np.zeros(len(middle), bool)
+    for h in layout.houses:
+        xy, heading = layout.axis.place(h.s + h.width / 2, h.side * h.front)
+        turn = float(heading) + (0.0 if h.side == 1 else np.pi)
+        d = middle - xy
+        x, y = d @ [np.cos(turn), np.sin(turn)], d @ [-np.sin(turn), np.cos(turn)]
+        inside |= (abs(x) < h.width / 2 - 0.4) & (y > 0.4) & (y < h.depth - 0.4)
+    return inside
+
+
+@dataclass(frozen=True)
+class Hits:
+    """What rays hit.
+
+    Attributes:
+        distance: (N,) float32 metres, infinite where nothing was hit.
+        face: (N,) int32 into `Scene.surface`, -1 where nothing was hit.
+        bary: (N, 2) float32 weights of the face's second and third corner.
+        heading: (N,) float32, how far the moving car that was hit is turned; 0 for what stands still.
+    """
+
+    distance: F32
+    face: npt.NDArray[np.int32]
+    bary: F32
+    heading: F32
+
+    @property
+    def hit(self) -> npt.NDArray[np.bool_]:
+        """(N,) whether anything was hit."""
+        return self.face >= 0
+
+
+class Scene:
+    """A street that rays can be cast into; local float32 coordinates of `layout.FRAME`.
+
+    Attributes:
+        surface: everything: the static street, then parked cars, then the moving car in its own coordinates.
+        static: number of faces that stay in a world.
+    """
+
+    def __init__(self, layout: Layout) -> None:
+        self.layout = layout
+        still, parked, moving = build(layout)
+        self.static = len(still.faces)
+        self._moving_at = self.static + len(parked.faces)
+        both = join([still, parked])
+        self._street = _caster(both)
+        self._car = _caster(moving)
+        self._pictures = signs.pictures()
+        car_sky = np.clip(0.55 + 0.4 * moving.normals[:, 2], 0, 1).astype(np.float32)
+        self.surface = join([replace(both, sky=self._openness(both)), replace(moving, sky=car_sky)])
+
+    def truth_mesh(self) -> Mesh:
+        """The static street, labelled; vehicles are left out."""
+        part = self.surface
+        mesh = Mesh(FRAME, part.vertices, part.faces, label=part.label)
+        return mesh.keep(np.arange(len(part.faces)) < self.static)
+
+    def car_at(self, time: npt.ArrayLike, centre: Any = 0.0, way: Any = 1.0) -> tuple[F64, F64, npt.NDArray[np.bool_]]:
+        """Where the moving car is `time` seconds after it passes the street's middle.
+
+        Returns:
+            Position (..., 3), heading (...), and whether it is within the street.
+        """
+        s = self.layout.axis.length / 2 + np.asarray(time, np.float64) * CAR_SPEED * way + centre
+        t = -np.asarray(way) * self.layout.lane / 2
+        xy, heading = self.layout.axis.place(s, t)
+        z = self.layout.height(s, t) + 0.01
+        margin = objects.CAR_LENGTH / 2 + 0.1
+        inside = (s > margin) & (s < self.layout.axis.length - margin)
+        return np.concatenate([xy, z[..., None]], axis=-1), heading + np.where(np.asarray(way) > 0, 0.0, np.pi), inside
+
+    def cast(self, origins: F32, directions: F32, car: CarPoses | None = None) -> Hits:
+        """First hits of rays (N, 3), (N, 3) unit; `car`: where the moving car is for each ray."""
+        rays = np.concatenate([origins, directions], axis=1)
+        answer = _cast(self._street, rays)
+        heading = np.zeros(len(rays), np.float32)
+        if car is not None:
+            index, own = self._to_car(rays, car)
+            if len(index):
+                near = _cast(self._car, own)
+                closer = near.distance < answer.distance[index]
+                at = index[closer]
+                answer.distance[at] = near.distance[closer]
+                answer.face[at] = near.face[closer] + self._moving_at
+                answer.bary[at] = near.bary[closer]
+                heading[at] = car.heading[at]
+        return replace(answer, heading=heading)
+
+    def _to_car(self, rays: F32, car: CarPoses) -> tuple[npt.NDArray[np.intp], F32]:
+        """Rays that may meet the moving car: their indices, and the rays in the car's coordinates."""
+        if not car.present.any():
+            return np.zeros(0, np.intp), np.zeros((0, 6), np.float32)
+        middle = car.position + np.array([0, 0, 0.7], np.float32)
+        to = middle - rays[:, :3]
+        along = np.einsum("ij,ij->i", to, rays[:, 3:])
+        aside = np.einsum("ij,ij->i", to, to) - along**2
+        index = np.flatnonzero(car.present & (aside < 2.5**2) & (along > -2.5))
+        c, s = np.cos(car.heading[index]), np.sin(car.heading[index])
+        o, d = rays[index, :3] - car.position[index], rays[index, 3:]
+        own = [
+            c * o[:, 0] + s * o[:, 1],
+            c * o[:, 1] - s * o[:, 0],
+            o[:, 2],
+            c * d[:, 0] + s * d[:, 1],
+            c * d[:, 1] - s * d[:, 0],
+            d[:, 2],
+        ]
+        return index, np.stack(own, axis=1).astype(np.float32)
+
+    def colour(
+        self, origins: F32, directions: F32, hits: Hits, footprint: npt.ArrayLike, car: CarPoses | None = None
+    ) -> F32:
+        """Linear light (N, 3) from where rays hit; zero where they hit nothing.
+
+        Args:
+            footprint: (N,) or scalar, metres that a ray stands for at its hit.
+            car: the moving car, for its shadow; None leaves the shadow out.
+        """
+        light = np.zeros((len(directions), 3), np.float32)
+        at = np.flatnonzero(hits.hit)
+        xyz = origins[at] + directions[at] * hits.distance[at, None]
+        size = np.broadcast_to(np.asarray(footprint, np.float32), len(directions))[at]
+        light[at] = self.lit(xyz, hits.face[at], hits.bary[at], hits.heading[at], size, car.take(at) if car else None)
+        return light
+
+    def lit(self, xyz: F32, face: Any, bary: F32, heading: F32, footprint: F32, car: CarPoses | None = None) -> F32:
+        """Linear light (N, 3) that leaves the surface points `xyz` (the surfaces are matt: in all directions)."""
+        from data_samples import materials
+
+        p = self.surface
+        albedo, normal, sky = materials.surface(
+            face, bary, footprint, p.faces, p.normals, p.uv, p.sky, p.material, p.colour, p.seed, p.size,
+            self.layout.road, self._pictures,
+        )  # fmt: skip
+        turned = np.flatnonzero(heading)
+        if len(turned):
+            c, s = np.cos(heading[turned]), np.sin(heading[turned])
+            x, y = normal[turned, 0].copy(), normal[turned, 1].copy()
+            normal[turned, 0], normal[turned, 1] = c * x - s * y, s * x + c * y
+        sun = self.layout.sun.astype(np.float32)
+        facing = normal @ sun
+        leaf = p.material[face] == Material.FOLIAGE
+        facing = np.where(leaf, np.clip(0.30 + 0.70 * facing, 0.12, 1), np.clip(facing, 0, 1)).astype(np.float32)
+        lit = np.flatnonzero(facing > 0)
+        rays = np.empty((len(lit), 6), np.float32)
+        rays[:, :3] = xyz[lit] + 0.012 * np.where(leaf[lit, None], 0, normal[lit]) + 0.012 * sun
+        rays[:, 3:] = sun
+        shaded = _occluded(self._street, rays)
+        if car is not None:
+            index, own = self._to_car(rays, car.take(lit))
+            shaded[index] |= _occluded(self._car, own)
+        facing[lit[shaded]] = 0
+        up = normal[:, 2]
+        direct = facing[:, None] * (SUN_COLOUR * np.float32(self.layout.sun_strength))
+        ambient = (sky * (0.68 + 0.32 * up))[:, None] * (SKY_COLOUR * np.float32(self.layout.sky_strength))
+        bounce = (sky * (0.5 - 0.5 * up))[:, None] * (SUN_COLOUR * np.float32(0.14))
+        return (albedo * (direct + ambient + bounce)).astype(np.float32)
+
+    def _openness(self, part: Part) -> F32:
+        """(V,) share of the hemisphere above each vertex that is open for 5 metres, cosine-weighted."""
+        rng = np.random.default_rng([self.layout.seed, 2])
+        sky = part.sky.copy()
+        todo = np.flatnonzero(np.isnan(sky))
+        directions = rng.normal(size=(40, 3))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        for block in np.array_split(todo, max(1, len(todo) // 40_000)):
+            normal = part.normals[block]
+            d = normal[:, None] * 1.02 + directions[None]
+            d /= np.linalg.norm(d, axis=2, keepdims=True)
+            o = np.broadcast_to((part.vertices[block] + CLEAR * normal)[:, None], d.shape)
+            rays = np.concatenate([o, d], axis=2).reshape(-1, 6).astype(np.float32)
+            sky[block] = 1 - _occluded(self._street, rays, 5.0).reshape(-1, len(directions)).mean(axis=1)
+        return np.clip(0.12 + 0.88 * sky, 0, 1).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class CarPoses:
+    """Where the moving car is for each of N rays: position (N, 3) float32, heading (N,), present (N,)."""
+
+    position: F32
+    heading: F32
+    present: npt.NDArray[np.bool_]
+
+    def repeated(self, times: int) -> CarPoses:
+        """Each pose for that many rays in a row."""
+        index = np.repeat(np.arange(len(self.heading)), times)
+        return self.take(index)
+
+    def take(self, index: npt.NDArray[Any]) -> CarPoses:
+        """Those of some of the rays."""
+        return CarPoses(self.position[index], self.heading[index], self.present[index])
+
+
+def _caster(part: Part) -> Any:
+    import open3d as o3d
+
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(_tensor(part.vertices), _tensor(part.faces.astype(np.uint32)))
+    return scene
+
+
+def _tensor(array: npt.NDArray[Any]) -> Any:
+    import open3d as o3d
+
+    return o3d.core.Tensor.from_numpy(np.ascontiguousarray(array))
+
+
+def _cast(caster: Any, rays: F32) -> Hits:
+    answer = caster.cast_rays(_tensor(rays))
+    distance = answer["t_hit"].numpy().copy()
+    face = np.where(np.isfinite(distance), answer["primitive_ids"].numpy().astype(np.int64), -1).astype(np.int32)
+    return Hits(distance, face, answer["primitive_uvs"].numpy().copy(), np.zeros(len(rays), np.float32))
+
+
+def _occluded(caster: Any, rays: F32, far: float = float("inf")) -> npt.NDArray[np.bool_]:
+    if len(rays) == 0:
+        return np.zeros(0, bool)
+    return caster.test_occlusions(_tensor(rays), 0.0, far).numpy().copy()
+
+
+def srgb(light: npt.ArrayLike) -> npt.NDArray[np.uint8]:
+    """Linear light to 8-bit sRGB, clipped."""
+    x = np.clip(np.asarray(light, np.float32), 0, 1)
+    return (255 * np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** np.float32(1 / 2.4) - 0.055) + 0.5).astype(np.uint8)

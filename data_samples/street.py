@@ -1,0 +1,175 @@
+"""Make a synthetic street: a tile as a mobile-mapping vehicle would record it, with its ground truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from data_samples.layout import FRAME, Layout, Style, lay_out
+from data_samples.photos import Effects, cameras, develop, plan_shots, render
+from data_samples.scanner import Drive, plan_drive, scan
+from data_samples.scene import FINE, Scene, srgb
+from pipeline.errors import SettingError
+from pipeline.step import Report, silent
+from pipeline.types import F64, Mesh, PointCloud, Trajectory
+
+SHORTEST = 8.0
+
+
+def generate(
+    out: Path,
+    *,
+    length: float = 100.0,
+    points: float = 9e6,
+    photos: int = 40,
+    seed: int = 0,
+    photo_width: int = 1600,
+    truth_density: float = 150.0,
+    photo_labels: bool = False,
+    cloud_scale: float = 0.001,
+    style: Style | None = None,
+    effects: Effects | None = None,
+    name: str = "street",
+    report: Report = silent,
+) -> Path:
+    """Write a tile folder and return the path of its `tile.toml`; the same arguments write the same bytes.
+
+    Args:
+        out: the folder; made if need be, files of the same names are replaced.
+        length: metres of road.
+        points: lidar returns; kept to the point.
+        photos: in all; taken at stations at most 5 m apart where there are enough of them.
+        seed: of everything drawn.
+        photo_width: pixels of a pinhole photo (4:3); panoramas are 1.28 times as wide (2:1).
+        truth_density: true surface samples a square metre.
+        photo_labels: also write `truth/labels/NAME.png`, LAS class codes a pixel, 0 for the sky.
+        cloud_scale: metres, the precision of LAZ coordinates.
+        style: ranges from which the street is drawn; the default is a European town.
+        effects: what the cameras add: exposure changes, noise, vignetting, JPEG quality.
+        name: of the tile.
+
+    Raises:
+        SettingError: a length, number or width that no street can be made of.
+    """
+    for key, value, least in (
+        ("length", length, SHORTEST),
+        ("points", points, 1),
+        ("photos", photos, 0),
+        ("photo_width", photo_width, 64),
+    ):
+        if not (np.isfinite(value) and value >= least):
+            raise SettingError(key, f"{value} is less than {least:g}", f"Give {least:g} or more")
+    from pipeline.io import las
+    from pipeline.io.tile import read_tile, write_tile
+
+    effects = effects or Effects()
+    (out / "photos").mkdir(parents=True, exist_ok=True)
+    (out / "truth").mkdir(exist_ok=True)
+    report(0.0, "building the street")
+    layout = lay_out(length, seed, style)
+    scene = Scene(layout)
+    drive = plan_drive(layout, points)
+
+    cloud = scan(scene, drive, points, lambda f, m="": report(0.05 + 0.25 * f, m))
+    report(0.3, "writing the cloud")
+    las.write(out / "cloud.laz", cloud, cloud_scale)
+    del cloud
+    _write_trajectory(out / "trajectory.csv", drive.trajectory())
+
+    entries = _take_photos(
+        out, scene, drive, photos, photo_width, effects, photo_labels, lambda f, m="": report(0.4 + 0.55 * f, m)
+    )
+    report(0.95, "writing the truth")
+    _write_truth(out / "truth", scene, truth_density, cloud_scale)
+    path = write_tile(
+        out,
+        name=name,
+        crs=FRAME.crs,
+        clouds=["cloud.laz"],
+        cameras=cameras(photo_width) if photos else {},
+        photos=entries,
+        trajectory="trajectory.csv",
+        truth={"mesh": "truth/mesh.npz", "points": "truth/points.laz"},
+    )
+    read_tile(path)  # what is written must be readable
+    report(1.0, "done")
+    return path
+
+
+def _write_trajectory(path: Path, trajectory: Trajectory) -> None:
+    rows = np.column_stack([trajectory.times, FRAME.to_crs(trajectory.positions)])
+    np.savetxt(path, rows, fmt="%.4f", delimiter=",", header="time,x,y,z", comments="")
+
+
+def _take_photos(
+    out: Path, scene: Scene, drive: Drive, photos: int, width: int, effects: Effects, labels: bool, report: Report
+) -> list[dict[str, object]]:
+    """Render and write the photos and their exposures; their `[[photos]]` entries."""
+    import cv2
+
+    kinds = cameras(width)
+    shots = plan_shots(scene.layout, drive, photos, effects.exposure_ev)
+    entries: list[dict[str, object]] = []
+    for i, shot in enumerate(shots):
+        report(i / len(shots), f"photo {i + 1} of {len(shots)}")
+        seen = render(scene, drive, kinds[shot.camera], shot.T_world_cam, shot.time)
+        image = develop(seen, shot.ev, effects, np.random.default_rng([scene.layout.seed, 5, i]))
+        file = f"photos/{shot.name}.jpg"
+        _, jpeg = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, effects.quality])
+        (out / file).write_bytes(jpeg.tobytes())
+        if labels:
+            (out / "truth" / "labels").mkdir(exist_ok=True)
+            _, png = cv2.imencode(".png", seen.label)
+            (out / "truth" / "labels" / f"{shot.name}.png").write_bytes(png.tobytes())
+        entries.append(
+            {
+                "file": file,
+                "camera": shot.camera,
+                "position": FRAME.to_crs(shot.T_world_cam[:3, 3]),
+                "rotation": shot.T_world_cam[:3, :3],
+                "time": shot.time,
+            }
+        )
+    lines = ["photo,exposure_ev", *(f"photos/{shot.name}.jpg,{shot.ev:.6f}" for shot in shots)]
+    (out / "truth" / "exposures.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return entries
+
+
+def _write_truth(folder: Path, scene: Scene, density: float, scale: float) -> None:
+    from pipeline.io import las
+
+    mesh = scene.truth_mesh()
+    assert mesh.label is not None
+    frame = np.array([mesh.frame.crs, repr(mesh.frame.origin), repr(mesh.frame.unit)])
+    with open(folder / "mesh.npz", "wb") as file:  # as Mesh.save does, but compressed
+        np.savez_compressed(file, frame=frame, vertices=mesh.vertices, faces=mesh.faces, label=mesh.label)
+    las.write(folder / "points.laz", sample_truth(scene, mesh, density), scale)
+
+
+def sample_truth(scene: Scene, mesh: Mesh, density: float) -> PointCloud:
+    """Random points of the static surface above the ground, `density` a square metre, with true lit colours."""
+    rng = np.random.default_rng([scene.layout.seed, 6])
+    area = mesh.face_area.astype(np.float64)
+    count = max(1, round(density * area.sum()))
+    face = np.sort(rng.choice(len(area), count, p=area / area.sum())).astype(np.int32)
+    bary = rng.random((count, 2)).astype(np.float32)
+    outside = bary.sum(axis=1) > 1
+    bary[outside] = 1 - bary[outside]
+    c = scene.surface.vertices[scene.surface.faces[face]]
+    xyz = c[:, 0] + bary[:, :1] * (c[:, 1] - c[:, 0]) + bary[:, 1:] * (c[:, 2] - c[:, 0])
+    seen = ~_buried(scene.layout, xyz.astype(np.float64))
+    xyz, face, bary = xyz[seen], face[seen], bary[seen]
+    n = len(xyz)
+    colour = np.empty((n, 3), np.uint8)
+    for i in range(0, n, 1 << 20):
+        at = slice(i, i + (1 << 20))
+        still = np.zeros(len(face[at]), np.float32)
+        colour[at] = srgb(scene.lit(xyz[at], face[at], bary[at], still, still + FINE))
+    return PointCloud(FRAME, xyz.astype(np.float32), rgb=colour, label=scene.surface.label[face])
+
+
+def _buried(layout: Layout, xyz: F64) -> np.ndarray:
+    """(N,) whether points lie below the ground."""
+    s, t = layout.axis.locate(xyz[:, :2])
+    return xyz[:, 2] < layout.height(s, t, below_kerb=True) - 0.03

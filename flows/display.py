@@ -1,0 +1,88 @@
+"""What the user sees of long work: progress bars on a terminal, lines elsewhere."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+from flows.execute import Event
+from flows.recipe import Node
+from pipeline.step import Report
+
+console = Console()
+
+
+def _progress() -> Progress:
+    return Progress(
+        SpinnerColumn(),
+        TextColumn("{task.description:<22}"),
+        BarColumn(bar_width=28),
+        TimeElapsedColumn(),
+        TextColumn("[dim]{task.fields[message]}", markup=True),
+        console=console,
+        transient=True,
+        disable=not console.is_terminal,
+    )
+
+
+@contextmanager
+def progress(title: str) -> Iterator[Report]:
+    """One bar for one long call."""
+    with _progress() as bars:
+        task = bars.add_task(title, total=1.0, message="")
+
+        def report(fraction: float, message: str = "") -> None:
+            bars.update(task, completed=fraction, message=message)
+
+        yield report
+
+
+class RunDisplay:
+    """A bar for every step that runs, one for the whole, and a line for each that ends."""
+
+    def __init__(self, nodes: int) -> None:
+        self._bars = _progress()
+        self._nodes = nodes
+        self._tasks: dict[str, int] = {}
+        self._started: dict[str, float] = {}
+        self._done = self._kept = 0
+
+    def __enter__(self) -> RunDisplay:
+        self._bars.start()
+        self._whole = self._bars.add_task("[bold]tile", total=self._nodes, message="")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bars.stop()
+        if self._kept:
+            console.print(f"[dim]{self._kept} of {self._nodes} results kept from before")
+
+    def watch(self, node: Node, event: Event, fraction: float, message: str) -> None:
+        """An `execute.Watch`."""
+        if event == "start":
+            self._started[node.label] = time.perf_counter()
+            self._tasks[node.label] = self._bars.add_task(node.label, total=1.0, message="")
+        elif event == "progress":
+            self._bars.update(self._tasks[node.label], completed=fraction, message=message)  # type: ignore[arg-type]
+        else:
+            self._done += 1
+            self._kept += event == "kept"
+            self._bars.update(self._whole, completed=self._done)
+            if event == "done":
+                self._bars.remove_task(self._tasks.pop(node.label))  # type: ignore[arg-type]
+                seconds = time.perf_counter() - self._started[node.label]
+                console.print(f"[green]✓[/] {node.label:<22}[dim]{seconds:7.1f} s  {self._done}/{self._nodes}")
+
+
+def log_unexpected(error: BaseException) -> Path:
+    """Write an unexpected error's traceback where the user can find it."""
+    with tempfile.NamedTemporaryFile("w", prefix="scan2sim-error-", suffix=".log", delete=False) as file:
+        file.write("".join(traceback.format_exception(error)))
+    return Path(file.name)

@@ -1,0 +1,171 @@
+"""`scan2sim inspect`: one screen of facts about a cloud, a tile, a mesh or a world."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from xml.etree import ElementTree
+
+from rich.table import Table
+
+from flows.display import console
+from pipeline.errors import InputError
+
+Facts = list[tuple[str, str]]
+
+
+def inspect_path(path: Path) -> None:
+    """Print what is at `path`.
+
+    Raises:
+        InputError: nothing is there, or of no known kind.
+    """
+    kind, facts = _reader(path)(path)
+    table = Table(show_header=False, box=None, title=f"{kind}: {path}", title_justify="left", title_style="bold")
+    for name, value in facts:
+        table.add_row(name, value)
+    console.print(table, highlight=False)
+
+
+def _reader(path: Path) -> Callable[[Path], tuple[str, Facts]]:
+    if not path.exists():
+        raise InputError(path, "is missing", "Mend the name")
+    if path.is_dir():
+        if (path / "tile.toml").is_file():
+            return _tile
+        if (path / "world").is_dir():
+            return lambda p: _world(_sdf(p / "world"))
+        if any(path.glob("*.sdf")):
+            return lambda p: _world(_sdf(p))
+        raise InputError(path, "holds neither tile.toml nor a world", "Name a cloud, a tile, a mesh or a world")
+    readers = {
+        ".toml": _tile, ".las": _cloud, ".laz": _cloud, ".sdf": _world, ".npz": _result,
+        ".obj": _mesh, ".dae": _mesh, ".glb": _mesh, ".ply": _ply,
+    }  # fmt: skip
+    if path.suffix.lower() not in readers:
+        raise InputError(path, f"is of no known kind ({path.suffix or 'no suffix'})", f"Known: {' '.join(readers)}")
+    return readers[path.suffix.lower()]
+
+
+def _bounds(low: object, high: object) -> str:
+    import numpy as np
+
+    size = np.asarray(high) - np.asarray(low)
+    return " x ".join(f"{v:,.2f}" for v in size) + "   from " + ", ".join(f"{v:,.2f}" for v in np.asarray(low))
+
+
+def _cloud(path: Path) -> tuple[str, Facts]:
+    import numpy as np
+
+    from pipeline.classes import CLASSES
+    from pipeline.io import clouds
+    from pipeline.io.crs import name as crs_name
+    from pipeline.types import Frame
+
+    header = clouds.read_header(path)
+    low = tuple(np.floor(header.low).tolist())
+    cloud = clouds.read(path, Frame(origin=low))  # type: ignore[arg-type]
+    area = float(np.prod(np.maximum((header.high - header.low)[:2], 1e-3)))
+    facts = [
+        ("points", f"{header.count:,}"),
+        ("CRS", crs_name(header.crs)),
+        ("extent", _bounds(header.low, header.high)),
+        ("density", f"{header.count / area:,.1f} per square unit of its bounding box"),
+        ("colours", "yes" if cloud.rgb is not None else "no"),
+    ]
+    if cloud.time is not None and len(cloud):
+        facts.append(("GPS time", f"{cloud.time.min():.3f} to {cloud.time.max():.3f} s"))
+    if cloud.label is not None:
+        names = {c.code: c.name for c in CLASSES}
+        codes, counts = np.unique(cloud.label, return_counts=True)
+        facts += [
+            (
+                "classes" if i == 0 else "",
+                f"{code:3d} {names.get(code, '?'):<16}{count:>14,}  {count / len(cloud):6.1%}",
+            )
+            for i, (code, count) in enumerate(zip(codes.tolist(), counts.tolist(), strict=True))
+        ]
+    return "cloud", facts
+
+
+def _tile(path: Path) -> tuple[str, Facts]:
+    from pipeline.io import clouds
+    from pipeline.io.crs import name as crs_name
+    from pipeline.io.tile import read_tile
+
+    tile = read_tile(path)
+    count = sum(clouds.read_header(p).count for p in tile.clouds)
+    missing = sum(not view.photo.is_file() for view in tile.views)
+    cameras = sorted({f"{v.camera.model} {v.camera.width}x{v.camera.height}" for v in tile.views})
+    return "tile", [
+        ("name", tile.name),
+        ("CRS", f"{crs_name(tile.frame.crs)}, 1 unit = {tile.frame.unit:g} m"),
+        ("origin", ", ".join(f"{v:,.0f}" for v in tile.frame.origin) + " m"),
+        ("clouds", f"{len(tile.clouds)} files, {count:,} points"),
+        ("photos", f"{len(tile.views)}" + (f", {missing} of them missing" if missing else "")),
+        ("cameras", "; ".join(cameras) or "none"),
+        ("masks", str(sum(v.mask is not None for v in tile.views))),
+        ("trajectory", f"{len(tile.trajectory.times):,} positions" if tile.trajectory else "none"),
+        ("ground truth", "yes" if tile.truth_mesh else "no"),
+    ]
+
+
+def _mesh(path: Path) -> tuple[str, Facts]:
+    import trimesh
+
+    try:
+        loaded = trimesh.load_scene(path, process=False)
+    except Exception as error:  # trimesh's parsers raise whatever the damage leads to
+        raise InputError(path, f"is no readable mesh ({error})", "Export it again") from None
+    meshes = list(loaded.geometry.values())
+    textures = {getattr(getattr(m.visual, "material", None), "name", None) for m in meshes} - {None}
+    return "mesh", [
+        ("parts", str(len(meshes))),
+        ("triangles", f"{sum(len(m.faces) for m in meshes):,}"),
+        ("vertices", f"{sum(len(m.vertices) for m in meshes):,}"),
+        ("extent", _bounds(*loaded.bounds) if loaded.bounds is not None else "empty"),
+        ("materials", ", ".join(sorted(map(str, textures))) or "none"),
+    ]
+
+
+def _ply(path: Path) -> tuple[str, Facts]:
+    head = path.read_bytes()[:4096]
+    return _mesh(path) if b"element face" in head and b"element face 0" not in head else _cloud(path)
+
+
+def _result(path: Path) -> tuple[str, Facts]:
+    import numpy as np
+
+    try:
+        with np.load(path) as data:
+            facts = [(name, f"{data[name].shape} {data[name].dtype}") for name in data.files]
+    except (OSError, ValueError) as error:
+        raise InputError(path, f"can't be read ({error})", "Run the step that makes it again") from None
+    return "kept result", facts
+
+
+def _sdf(folder: Path) -> Path:
+    worlds = sorted(folder.glob("*.sdf"))
+    if not worlds:
+        raise InputError(folder, "holds no .sdf file", "Name the folder of a world")
+    return worlds[0]
+
+
+def _world(path: Path) -> tuple[str, Facts]:
+    try:
+        root = ElementTree.parse(path).getroot()
+    except ElementTree.ParseError as error:
+        raise InputError(path, f"is no readable SDF ({error})", "Export it again") from None
+    place = [root.findtext(f".//spherical_coordinates/{k}") for k in ("latitude_deg", "longitude_deg", "elevation")]
+    facts = [
+        ("SDF", root.get("version", "?")),
+        ("includes", ", ".join(e.text or "" for e in root.iter("uri")) or "none"),
+        ("place", "{} N, {} E, {} m".format(*place) if place[0] else "no georeference"),
+    ]
+    metadata = path.parent / "metadata.json"
+    if metadata.is_file():
+        body = json.loads(metadata.read_text(encoding="utf-8"))
+        facts += [(key, json.dumps(value)) for key, value in body.items() if key not in ("crs",)]
+    size = sum(p.stat().st_size for p in path.parent.rglob("*") if p.is_file())
+    return "world", [*facts, ("size", f"{size / 1e6:,.1f} MB")]

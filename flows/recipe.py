@@ -1,0 +1,153 @@
+"""Which steps make a tile, in order: the whole graph on one page."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from flows.settings import Settings
+from pipeline.classes import GROUPS
+from pipeline.io import views as views_io
+from pipeline.step import Params, Step
+from pipeline.steps.collision import COLLISION
+from pipeline.steps.decimate import DECIMATE
+from pipeline.steps.export import EXPORT
+from pipeline.steps.geometry import GEOMETRY
+from pipeline.steps.ingest import INGEST
+from pipeline.steps.islands import ISLANDS
+from pipeline.steps.path import PATH
+from pipeline.steps.pictures import PICTURES
+from pipeline.steps.plants import PLANTS
+from pipeline.steps.poisson import POISSON
+from pipeline.steps.split import SPLIT
+from pipeline.steps.trim import TRIM
+from pipeline.steps.views import VIEWS
+from pipeline.steps.visibility import VISIBILITY
+from pipeline.steps.voxel import VOXEL
+from pipeline.types import Tile
+from segmentation.segment import SEGMENT
+from texturing.score import SCORE
+from texturing.texture import TEXTURE
+from texturing.unwrap import UNWRAP
+
+STEPS: tuple[Step, ...] = (
+    INGEST, PATH, SEGMENT, SPLIT, VOXEL, POISSON, TRIM, ISLANDS, DECIMATE, PLANTS, VIEWS, UNWRAP,
+    VISIBILITY, TEXTURE, COLLISION, EXPORT, GEOMETRY, SCORE, PICTURES,
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Output:
+    """An output of a node, as another's input."""
+
+    node: str
+    name: str
+
+
+@dataclass(frozen=True)
+class Node:
+    """A step to be run.
+
+    Attributes:
+        label: unique in the graph: the step's name, with the class where it is per class.
+        step, params: what is run.
+        inputs: name to a source file, or to another node's output.
+    """
+
+    label: str
+    step: Step
+    params: Params
+    inputs: Mapping[str, Path | Output]
+
+
+def recipe(tile: Tile, settings: Settings) -> list[Node]:
+    """The graph of a tile, each node after those that it reads.
+
+    Raises:
+        SettingError: a setting that doesn't exist or is out of range.
+    """
+    settings.check(STEPS)
+    nodes: list[Node] = []
+
+    def add(step: Step, inputs: Mapping[str, Path | Output], group: str | None = None, **given: object) -> str:
+        label = f"{step.name}.{group}" if group else step.name
+        nodes.append(Node(label, step, settings.params(step, group, **given), inputs))
+        return label
+
+    frame = {"crs": tile.frame.crs, "origin": tile.frame.origin, "unit": tile.frame.unit}
+    add(INGEST, {f"cloud.{i:04d}": path for i, path in enumerate(tile.clouds)}, **frame)
+    add(SEGMENT, {"cloud": Output("ingest", "cloud")})
+    add(SPLIT, {"cloud": Output("segment", "cloud")})
+    path = scanner_path(tile)
+    if path:
+        add(PATH, {}, **path)
+
+    vegetation = settings.params(SPLIT).vegetation
+    groups = [g for g in GROUPS if g != "vegetation" or vegetation != "locations"]
+    size = settings.params(VOXEL).size
+    scanner = {"path": Output("path", "path")} if path else {}
+    for part in (*GROUPS, "rest"):
+        add(VOXEL, {"cloud": Output("split", part)} | scanner, part)
+    for group in groups:
+        cloud = Output(f"voxel.{group}", "cloud")
+        add(POISSON, {"cloud": cloud}, group, voxel=size)
+        add(TRIM, {"mesh": Output(f"poisson.{group}", "mesh"), "cloud": cloud}, group, voxel=size)
+        add(ISLANDS, {"mesh": Output(f"trim.{group}", "mesh")}, group)
+        add(DECIMATE, {"mesh": Output(f"islands.{group}", "mesh")}, group)
+        add(UNWRAP, {"mesh": Output(f"decimate.{group}", "mesh")}, group)
+    meshes = {f"mesh.{g}": Output(f"decimate.{g}", "mesh") for g in groups}
+    clouds = {f"cloud.{part}": Output(f"voxel.{part}", "cloud") for part in (*GROUPS, "rest")}
+    plants: dict[str, Path | Output] = {}
+    if vegetation != "mesh":
+        add(PLANTS, {name: Output(f"voxel.{name}", "cloud") for name in ("vegetation", "terrain")})
+        plants = {"plants": Output("plants", "geojson"), "plants_csv": Output("plants", "csv")}
+
+    photos: dict[str, Path | Output] = {f"photo.{i}": view.photo for i, view in enumerate(tile.views)}
+    masks: dict[str, Path | Output] = {f"mask.{i}": view.mask for i, view in enumerate(tile.views) if view.mask}
+    add(VIEWS, photos | masks | clouds, poses=tuple(views_io.to_json(view, with_paths=False) for view in tile.views))
+    seen = {"views": Output("views", "views")}
+    add(VISIBILITY, meshes | clouds | seen)
+    for group in groups:
+        inputs = {"mesh": Output(f"unwrap.{group}", "mesh"), "pages": Output(f"unwrap.{group}", "pages")}
+        add(TEXTURE, inputs | clouds | seen | {"depth": Output("visibility", "depth")}, group)
+    textured = {g: Output(f"texture.{g}", "textured") for g in groups}
+    add(COLLISION, {g: Output(f"decimate.{g}", "mesh") for g in groups})
+    add(EXPORT, textured | plants | {"collision": Output("collision", "mesh")}, name=tile.name)
+
+    truth: dict[str, Path | Output] = {}
+    if tile.truth_mesh and tile.truth_points:
+        truth = {"truth.mesh": tile.truth_mesh, "truth.points": tile.truth_points}
+    add(GEOMETRY, meshes | clouds | truth)
+    add(SCORE, textured | seen | truth)
+    stages = {
+        f"{step.name}.{g}": Output(f"{step.name}.{g}", "mesh") for step in (POISSON, TRIM, DECIMATE) for g in groups
+    }
+    add(
+        PICTURES,
+        textured
+        | stages
+        | seen
+        | {"cloud": Output("segment", "cloud")}
+        | ({"path": Output("path", "path")} if path else {}),
+    )
+    return nodes
+
+
+def scanner_path(tile: Tile) -> dict[str, object]:
+    """Parameters of the path: the trajectory, else the cameras; empty where there is neither."""
+    if tile.trajectory is not None:
+        return {"positions": _rows(tile.trajectory.positions), "times": tuple(tile.trajectory.times.tolist())}
+    if not tile.views:
+        return {}
+    times = tuple(view.time for view in tile.views)
+    return {
+        "positions": _rows([view.centre for view in tile.views]),
+        "times": times if all(t is not None for t in times) else None,
+    }
+
+
+def _rows(positions: object) -> tuple[tuple[float, ...], ...]:
+    import numpy as np
+
+    return tuple(tuple(row) for row in np.asarray(positions).round(4).tolist())

@@ -1,0 +1,89 @@
+"""The report of a run: `report.json` for programs, `report.html` for people."""
+
+from __future__ import annotations
+
+import base64
+import json
+import mimetypes
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from flows.execute import Planned, versions
+from pipeline.classes import GROUPS
+from pipeline.store import Manifest, Store
+from pipeline.types import Tile
+
+TEMPLATE = "report.html.j2"
+
+
+def write_report(
+    tile: Tile, planned: Sequence[Planned], done: Mapping[str, Manifest], store: Store, out: Path, *, seconds: float
+) -> Path:
+    """Write both reports into `out`; returns the page's path."""
+    body = figures(tile, done) | {"seconds_this_run": round(seconds, 2)}
+    _replace(out / "report.json", json.dumps(body, indent=1))
+    pictures: list[dict[str, Any]] = []
+    if "pictures" in done:
+        key = next(p.key for p in planned if p.node.label == "pictures")
+        folder = store.folder("pictures", key) / done["pictures"].files["pictures"]
+        pictures = json.loads((folder / "index.json").read_text(encoding="utf-8"))
+        for picture in pictures:
+            picture["src"] = _embedded(folder / picture["file"])
+            if "other" in picture:
+                picture["other_src"] = _embedded(folder / picture["other"])
+    page = out / "report.html"
+    _replace(page, _render(body, pictures))
+    return page
+
+
+def figures(tile: Tile, done: Mapping[str, Manifest]) -> dict[str, Any]:
+    """All figures of a run as one JSON-able table; keys as docs/formats.md names them."""
+    facts = {label: manifest.facts for label, manifest in done.items()}
+    geometry: dict[str, dict[str, float]] = {}
+    for group, values in facts["geometry"].items():
+        for name, value in values.items():
+            geometry.setdefault(name, {})[group] = value
+    seen = {g: facts[f"texture.{g}"] for g in GROUPS if f"texture.{g}" in facts}
+    area = sum(s.get("area_m2", 0.0) for s in seen.values())
+    texture: dict[str, Any] = {
+        "coverage": round(sum(s.get("seen_m2", 0.0) for s in seen.values()) / area, 4) if area else 0.0,
+        "coverage_by_class": {g: s.get("coverage", 0.0) for g, s in seen.items()},
+    }
+    return {
+        "tile": tile.name,
+        "crs": tile.frame.crs[:80],
+        "origin": list(tile.frame.origin),
+        "made": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        "versions": versions(),
+        "seconds": round(sum(m.seconds for m in done.values()), 2),
+        "peak_mb": max(m.peak_mb for m in done.values()),
+        "geometry": geometry,
+        "texture": texture | facts["score"],
+        "world": facts["export"],
+        "steps": {
+            label: {"seconds": m.seconds, "peak_mb": m.peak_mb, "facts": m.facts, "warnings": m.warnings}
+            for label, m in done.items()
+        },
+    }
+
+
+def _render(body: Mapping[str, Any], pictures: Sequence[Mapping[str, Any]]) -> str:
+    from jinja2 import Environment, FileSystemLoader
+
+    environment = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True)
+    return environment.get_template(TEMPLATE).render(body=body, pictures=pictures, groups=GROUPS)
+
+
+def _embedded(path: Path) -> str:
+    """The picture as a data URI, so that the page can be sent as one file."""
+    kind = mimetypes.guess_type(path.name)[0]
+    return f"data:{kind};base64,{base64.b64encode(path.read_bytes()).decode()}"
+
+
+def _replace(path: Path, text: str) -> None:
+    """Write a file whole or not at all."""
+    fresh = path.with_name(f".{path.name}")
+    fresh.write_text(text, encoding="utf-8")
+    fresh.replace(path)

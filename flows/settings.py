@@ -1,0 +1,106 @@
+"""Settings of a run: the mission's defaults, a TOML file, and `--set step.param=value`, in that order.
+
+`--set decimate.target=50000` holds for every class, `--set decimate.building.target=50000` for one.
+In a file: `[decimate]` and `[decimate.building]`.
+"""
+
+from __future__ import annotations
+
+import difflib
+import tomllib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import ValidationError
+
+from pipeline.classes import GROUPS
+from pipeline.errors import SettingError
+from pipeline.step import Params, Step
+
+P = TypeVar("P", bound=Params)
+
+
+class Settings:
+    """What the user set, by step and class; `params` merges it with a step's defaults."""
+
+    def __init__(self, values: Mapping[str, Mapping[str, Any]] | None = None) -> None:
+        self.values = dict(values or {})
+
+    @classmethod
+    def read(cls, file: Path | None = None, assignments: Iterable[str] = ()) -> Settings:
+        """From a TOML file and `step[.class].param=value` texts; later ones win.
+
+        Raises:
+            SettingError: the file can't be read, or an assignment isn't one.
+        """
+        values: dict[str, Any] = {}
+        if file is not None:
+            try:
+                values = tomllib.loads(file.read_text(encoding="utf-8"))
+            except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+                raise SettingError(file, f"can't be read as TOML ({error})", "Mend it, or leave --config out") from None
+        for text in assignments:
+            path, equals, value = text.partition("=")
+            parts = path.strip().split(".")
+            if not equals or len(parts) not in (2, 3):
+                raise SettingError(f"--set {text}", "is no assignment", "Write --set step.param=value")
+            table = values
+            for part in parts[:-1]:
+                table = table.setdefault(part, {})
+            table[parts[-1]] = _value(value.strip())
+        return cls(values)
+
+    def check(self, steps: Iterable[Step]) -> None:
+        """Refuse names that no step knows.
+
+        Raises:
+            SettingError: naming the nearest one that exists.
+        """
+        known = {step.name: step for step in steps}
+        for name, table in self.values.items():
+            if name not in known:
+                raise SettingError(name, "there is no such step", _nearest(name, known))
+            if not isinstance(table, Mapping):
+                raise SettingError(name, "must be a table of parameters", f"Write [{name}] or --set {name}.param=value")
+            for key, value in table.items():
+                inner = value if key in GROUPS and isinstance(value, Mapping) else {key: value}
+                for param in inner:
+                    if param not in known[name].params.model_fields:
+                        raise SettingError(
+                            f"{name}.{param}",
+                            "there is no such parameter",
+                            _nearest(param, known[name].params.model_fields),
+                        )
+
+    def params(self, step: Step, group: str | None = None, **given: Any) -> Any:
+        """The step's parameters: `given` by the recipe, defaults of the class, what the user set.
+
+        Raises:
+            SettingError: a value out of range or of the wrong kind.
+        """
+        table = self.values.get(step.name, {})
+        general = {k: v for k, v in table.items() if k not in GROUPS}
+        special = table.get(group, {}) if group else {}
+        merged = {**given, **step.per_class.get(group or "", {}), **general, **special}
+        try:
+            return step.params(**merged)
+        except ValidationError as error:
+            first = error.errors()[0]
+            where = ".".join([step.name, *(str(part) for part in first["loc"])])
+            raise SettingError(
+                where, f"{first['msg']} (got {first['input']!r})", "docs/settings.md lists them"
+            ) from None
+
+
+def _value(text: str) -> Any:
+    """A TOML value where it is one, else the text itself."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def _nearest(name: str, known: Iterable[str]) -> str:
+    close = difflib.get_close_matches(name, known, 1)
+    return f"Did you mean `{close[0]}`?" if close else f"There are: {', '.join(sorted(known))}"

@@ -1,0 +1,392 @@
+"""KITTI raw drives (Geiger et al., "Vision meets Robotics: The KITTI Dataset", IJRR 2013) as tiles.
+
+Sweeps are merged by OXTS (GPS/IMU) poses or by a file of scan-matched ones; photos become posed
+views. The tile is in UTM (WGS 84) where there is OXTS, with OXTS altitude as z; otherwise local,
+in the first sweep's axes.
+
+Sweeps of raw drives are not compensated for the car's motion: the scanner turns clockwise, starts
+and ends looking back, and faces forward at the sweep's time stamp. Each point is placed by the pose
+of its own moment (at 11 m/s that is up to half a metre of difference). Photos are taken as the
+scanner faces forward and get the pose of the sweep's time stamp. OXTS packets come up to 20 ms later
+than the sweep of the same number, so poses are interpolated to the sweep's time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.errors import InputError, SettingError
+from pipeline.io import las
+from pipeline.io.importing import place, tile_folder
+from pipeline.io.tile import tile_name, write_tile
+from pipeline.step import Report, silent
+from pipeline.types import F32, F64, U8, Camera, Frame, PointCloud
+
+GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
+# the recording car's own returns, scanner axes: (low, high) corner in metres
+OWN_CAR: tuple[tuple[float, float, float], tuple[float, float, float]] = ((-3.2, -1.3, -2.0), (2.8, 1.3, 0.3))
+COLOUR_REACH = 0.5  # metres over which a point that its own photo doesn't show borrows a colour
+COLOUR_VOXEL = 0.1
+GREY = 128
+
+
+@dataclass(frozen=True)
+class Rig:
+    """A rectified camera and where it sits: `T_velo_cam` (4, 4), camera to scanner."""
+
+    camera: Camera
+    T_velo_cam: F64
+
+
+def import_kitti_raw(
+    drive: Path,
+    out: Path,
+    *,
+    poses: Path | None = None,
+    cameras: Sequence[str] = ("image_02",),
+    frames: tuple[int, int] | None = None,
+    max_range: float = 50.0,
+    deskew: bool = True,
+    link: bool = False,
+    overwrite: bool = False,
+    name: str | None = None,
+    report: Report = silent,
+) -> Path:
+    """Make a tile of a KITTI raw drive (synced and rectified).
+
+    Points get the colour of the photo of their own frame (scanner and camera sit side by side, so no
+    visibility test is made), otherwise that of the nearest coloured point within 0.5 m, otherwise
+    grey. Times are seconds since 1980-01-06 as the drive's time stamps count them.
+
+    Args:
+        drive: the `..._sync` folder, or a folder that holds exactly one; calibration files are
+            looked for in it and in its parent.
+        out: the tile's folder to make.
+        poses: row-major 3x4 matrices, one a line, scanner of sweep i to scanner of sweep 0; without
+            it, OXTS poses.
+        cameras: folders of photos.
+        frames: first and last frame number to take; all by default.
+        max_range: metres; farther returns are left out (a pose error of 0.1 degrees is 9 cm at 50 m).
+        deskew: place each point by the pose of its own moment; off for sweeps that are already
+            compensated (as those of KITTI odometry are).
+        link: link to the photos instead of copying them.
+
+    Returns:
+        Path of the `tile.toml`.
+
+    Raises:
+        InputError: a file is missing or damaged. SettingError: `out` is not empty, no frame is left.
+    """
+    drive = _find_drive(drive)
+    sweeps = _numbered(drive / "velodyne_points" / "data", ".bin")
+    if frames is not None:
+        sweeps = {k: v for k, v in sweeps.items() if frames[0] <= k <= frames[1]}
+        if not sweeps:
+            raise SettingError("frames", f"no sweep of {drive} lies in {frames[0]}..{frames[1]}", "Widen the range")
+    numbers = list(sweeps)
+    rigs = {folder: _rig(drive, folder) for folder in cameras}
+    photos = {folder: _numbered(drive / folder / "data", (".png", ".jpg", ".jpeg")) for folder in cameras}
+    spans = _spans(drive, numbers)
+    T_velo, crs = _poses(drive, poses, numbers, spans[:, 1])
+    frame = Frame(crs, (0.0, 0.0, 0.0) if crs == "local" else tuple(np.floor(T_velo[0, :3, 3]).tolist()))
+    T_velo[:, :3, 3] -= frame.origin
+
+    parts: list[dict[str, Any]] = []
+    for i, number in enumerate(numbers):
+        report(0.7 * i / len(numbers), f"sweep {number}")
+        xyz, reflectance = _read_sweep(sweeps[number], max_range)
+        phase = 0.5 - np.arctan2(xyz[:, 1], xyz[:, 0]) / (2 * np.pi) if deskew else np.full(len(xyz), 0.5)
+        times = spans[i, 0] + phase * (spans[i, 2] - spans[i, 0])
+        at = _interpolate(T_velo, spans[:, 1], times)
+        world = np.einsum("nij,nj->ni", at[:, :3, :3], xyz) + at[:, :3, 3]
+        rgb = np.zeros((len(xyz), 3), np.uint8)
+        seen = np.zeros(len(xyz), bool)
+        for folder, rig in rigs.items():
+            if number in photos[folder]:
+                _colour(world, T_velo[i] @ rig.T_velo_cam, rig.camera, photos[folder][number], rgb, seen)
+        parts.append(
+            {
+                "xyz": world.astype(np.float32),
+                "rgb": rgb,
+                "seen": seen,
+                "time": times,
+                "intensity": np.round(reflectance * 65535).astype(np.uint16),
+                "range": np.linalg.norm(xyz, axis=1).astype(np.float32),
+            }
+        )
+    whole = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+    report(0.7, "colours")
+    rgb = borrow_colours(whole["xyz"], whole["rgb"], whole["seen"], whole["range"])
+    cloud = PointCloud(frame, whole["xyz"], rgb, time=whole["time"], intensity=whole["intensity"])
+    report(0.85, "writing")
+
+    with tile_folder(out, overwrite) as work:
+        las.write(work / "cloud.laz", cloud)
+        entries = []
+        for key, rig in rigs.items():
+            for i, number in enumerate(numbers):
+                if number not in photos[key]:
+                    continue
+                pose = T_velo[i] @ rig.T_velo_cam
+                source = photos[key][number]
+                entries.append(
+                    {
+                        "file": place(source, work, f"photos/{key}/{source.name}", link),
+                        "camera": key,
+                        "position": frame.to_crs(pose[:3, 3]),
+                        "rotation": pose[:3, :3],
+                        "time": float(spans[i, 1]),
+                    }
+                )
+        rows = np.column_stack([spans[:, 1], frame.to_crs(T_velo[:, :3, 3])])
+        np.savetxt(work / "trajectory.csv", rows, "%.6f", delimiter=",", header="time,x,y,z", comments="")
+        write_tile(
+            work,
+            name=tile_name(name or drive.name),
+            crs=frame.crs,
+            clouds=["cloud.laz"],
+            cameras={key: rig.camera for key, rig in rigs.items()},
+            photos=entries,
+            trajectory="trajectory.csv",
+        )
+    report(1.0, "done")
+    return Path(out) / "tile.toml"
+
+
+def borrow_colours(xyz: F32, rgb: U8, seen: Any, distance: F32) -> U8:
+    """Colours (N, 3) where points that are not `seen` take that of the nearest seen one within reach, or grey.
+
+    Of the seen points in a 10 cm voxel only the one at the smallest `distance` from its camera counts.
+    """
+    from scipy.spatial import cKDTree
+
+    out = rgb.copy()
+    out[~seen] = GREY
+    index = np.flatnonzero(seen)
+    if len(index) in (0, len(xyz)):
+        return out
+    index = index[np.argsort(distance[index], kind="stable")]
+    cells = np.floor(xyz[index] / COLOUR_VOXEL).astype(np.int64)
+    cells -= cells.min(axis=0)
+    _, first = np.unique(np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1)), return_index=True)
+    index = index[first]
+    tree = cKDTree(xyz[index])
+    rest = np.flatnonzero(~seen)
+    for some in np.array_split(rest, max(1, len(rest) // 2_000_000)):
+        gap, nearest = tree.query(xyz[some], distance_upper_bound=COLOUR_REACH, workers=-1)
+        close = np.isfinite(gap)
+        out[some[close]] = rgb[index[nearest[close]]]
+    return out
+
+
+def _find_drive(folder: Path) -> Path:
+    if (folder / "velodyne_points").is_dir():
+        return folder
+    found = sorted(path.parent for path in folder.glob("**/velodyne_points") if path.is_dir())
+    if len(found) == 1:
+        return found[0]
+    cause = f"holds {len(found)} drives" if found else "holds no KITTI raw drive (no folder velodyne_points in it)"
+    raise InputError(folder, cause, "Name one folder ..._sync of the synced and rectified data")
+
+
+def _numbered(folder: Path, suffixes: str | tuple[str, ...]) -> dict[int, Path]:
+    """Files by frame number, ascending."""
+    found = sorted(p for p in folder.glob("*") if p.name.lower().endswith(suffixes) and p.stem.isdigit())
+    if not found:
+        kind = suffixes if isinstance(suffixes, str) else " or ".join(suffixes)
+        raise InputError(folder, f"holds no numbered {kind} files", "Unpack the drive's synced data here")
+    return {int(path.stem): path for path in found}
+
+
+def _calibration(drive: Path, name: str) -> dict[str, F64]:
+    path = next((f / name for f in (drive, drive.parent) if (f / name).is_file()), drive.parent / name)
+    try:
+        lines = path.read_text().splitlines()
+    except FileNotFoundError:
+        raise InputError(path, "is missing", "Unpack the calibration of the drive's day beside the drive") from None
+    entries = {}
+    for key, _, rest in (line.partition(":") for line in lines):
+        try:
+            entries[key.strip()] = np.array(rest.split(), np.float64)
+        except ValueError:
+            continue  # calib_time is a date
+    return entries
+
+
+def _entry(drive: Path, name: str, key: str, size: int) -> F64:
+    values = _calibration(drive, name).get(key)
+    if values is None or values.size != size:
+        raise InputError(drive.parent / name, f"has no `{key}` of {size} numbers", "Unpack the calibration again")
+    return values
+
+
+def _rigid(drive: Path, name: str) -> F64:
+    T = np.eye(4)
+    T[:3, :3] = _entry(drive, name, "R", 9).reshape(3, 3)
+    T[:3, 3] = _entry(drive, name, "T", 3)
+    return T
+
+
+def _rig(drive: Path, folder: str) -> Rig:
+    """The camera of a photo folder: `pixel ~ P_rect . R_rect_00 . T_cam0_velo . X`."""
+    n, file = folder.removeprefix("image_"), "calib_cam_to_cam.txt"
+    P = _entry(drive, file, f"P_rect_{n}", 12).reshape(3, 4)
+    width, height = _entry(drive, file, f"S_rect_{n}", 2).astype(int).tolist()
+    rectify = np.eye(4)
+    rectify[:3, :3] = _entry(drive, file, "R_rect_00", 9).reshape(3, 3)
+    K = P[:, :3]
+    shift = np.eye(4)
+    shift[:3, 3] = np.linalg.solve(K, P[:, 3])  # rectified camera 0 to this camera
+    T_cam_velo = shift @ rectify @ _rigid(drive, "calib_velo_to_cam.txt")
+    u, _, vt = np.linalg.svd(T_cam_velo[:3, :3])  # the files have seven digits
+    T_cam_velo[:3, :3] = u @ vt
+    T_velo_cam = np.linalg.inv(T_cam_velo).astype(np.float64)
+    return Rig(Camera("pinhole", width, height, K[0, 0], K[1, 1], K[0, 2], K[1, 2]), T_velo_cam)
+
+
+def _spans(drive: Path, numbers: list[int]) -> F64:
+    """(F, 3) seconds of each sweep's start, middle (facing forward) and end."""
+    folder = drive / "velodyne_points"
+    names = ("timestamps_start.txt", "timestamps.txt", "timestamps_end.txt")
+    return np.stack([_times(folder / name, numbers) for name in names], axis=1)
+
+
+def _times(path: Path, numbers: list[int]) -> F64:
+    try:
+        lines = path.read_text().splitlines()
+    except FileNotFoundError:
+        raise InputError(path, "is missing", "Unpack the drive's time stamps again") from None
+    times = np.empty(len(numbers))
+    for i, number in enumerate(numbers):
+        line = lines[number].strip() if number < len(lines) else ""
+        try:
+            whole, _, fraction = line.partition(".")
+            moment = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
+            times[i] = (moment - GPS_EPOCH).total_seconds() + float(f"0.{fraction or 0}")
+        except ValueError:
+            raise InputError(
+                path, f"line {number + 1} is no time stamp ({line!r})", "Unpack it again, or leave that frame out"
+            ) from None
+    return times
+
+
+def _poses(drive: Path, poses: Path | None, numbers: list[int], times: F64) -> tuple[F64, str]:
+    """(F, 4, 4) scanner to CRS at each sweep's time stamp, and the CRS."""
+    has_oxts = (drive / "oxts" / "data").is_dir()
+    if poses is None and not has_oxts:
+        raise InputError(drive / "oxts", "is missing, and no pose file is given", "Unpack oxts, or give poses")
+    crs = "local"
+    first = np.eye(4)
+    if has_oxts:
+        some = slice(None) if poses is None else slice(2)  # the first sweep's, interpolated, is all that is needed
+        T_imu, crs = _read_oxts(drive, numbers[some])
+        stamps = _times(drive / "oxts" / "timestamps.txt", numbers[some])
+        T_world = _interpolate(T_imu, stamps, times[some]) @ np.linalg.inv(_rigid(drive, "calib_imu_to_velo.txt"))
+        if poses is None:
+            return T_world, crs
+        first = T_world[0]
+    assert poses is not None
+    relative = _read_poses(poses, numbers)
+    return first @ np.linalg.inv(relative[0]) @ relative, crs
+
+
+def _interpolate(T: F64, at: F64, times: F64) -> F64:
+    """(N, 4, 4) poses at `times`, by the motion between neighbours of (F, 4, 4) `T` at `at`, beyond its ends too."""
+    from scipy.spatial.transform import Rotation
+
+    if len(T) == 1:
+        return np.repeat(T, len(times), axis=0)
+    b = np.clip(np.searchsorted(at, times), 1, len(at) - 1)
+    a = b - 1
+    share = ((times - at[a]) / (at[b] - at[a]))[:, None]
+    turn = Rotation.from_matrix(np.swapaxes(T[a, :3, :3], 1, 2) @ T[b, :3, :3]).as_rotvec()
+    out = np.tile(np.eye(4), (len(times), 1, 1))
+    out[:, :3, :3] = T[a, :3, :3] @ Rotation.from_rotvec(share * turn).as_matrix()
+    out[:, :3, 3] = T[a, :3, 3] + share * (T[b, :3, 3] - T[a, :3, 3])
+    return out
+
+
+def _read_poses(path: Path, numbers: list[int]) -> F64:
+    try:
+        rows = np.loadtxt(path, ndmin=2)
+        if rows.shape[1] != 12 or not np.isfinite(rows).all():
+            raise ValueError(f"shape {rows.shape}")
+    except FileNotFoundError:
+        raise InputError(path, "is missing", "Put it there, or leave it out for OXTS poses") from None
+    except ValueError as error:
+        raise InputError(path, f"is no pose file ({error})", "Write 12 numbers a line, row-major 3x4") from None
+    if len(rows) <= numbers[-1]:
+        raise InputError(
+            path, f"has {len(rows)} poses, but sweep {numbers[-1]} is asked for", "Give a line a frame, from 0 on"
+        )
+    T = np.tile(np.eye(4), (len(numbers), 1, 1))
+    T[:, :3] = rows[numbers].reshape(-1, 3, 4)
+    return T
+
+
+def _read_oxts(drive: Path, numbers: list[int]) -> tuple[F64, str]:
+    """(F, 4, 4) IMU to UTM, and the zone's code; roll, pitch, yaw are against true east, north, up."""
+    from pyproj import Proj, Transformer
+    from scipy.spatial.transform import Rotation
+
+    rows = np.empty((len(numbers), 6))
+    for i, number in enumerate(numbers):
+        path = drive / "oxts" / "data" / f"{number:010d}.txt"
+        try:
+            rows[i] = np.array(path.read_text().split()[:6], np.float64)
+        except FileNotFoundError:
+            raise InputError(path, "is missing", "Unpack oxts again, or give poses") from None
+        except ValueError as error:
+            raise InputError(path, f"is no OXTS record ({error})", "Unpack oxts again, or give poses") from None
+        if not np.isfinite(rows[i]).all() or abs(rows[i, 0]) > 84 or abs(rows[i, 1]) > 180:
+            raise InputError(path, "says an impossible place", "Unpack oxts again, or give poses")
+    lat, lon, alt, roll, pitch, yaw = rows.T
+    zone = min(int((lon[0] + 180) // 6) + 1, 60)
+    crs = f"EPSG:{(32600 if lat[0] >= 0 else 32700) + zone}"
+    east, north = Transformer.from_crs("EPSG:4326", crs, always_xy=True).transform(lon, lat)
+    yaw = yaw + np.radians(Proj(crs).get_factors(lon, lat).meridian_convergence)  # true to grid
+    T = np.tile(np.eye(4), (len(numbers), 1, 1))
+    T[:, :3, :3] = Rotation.from_euler("ZYX", np.stack([yaw, pitch, roll], axis=1)).as_matrix()
+    T[:, :3, 3] = np.stack([east, north, alt], axis=1)
+    return T, crs
+
+
+def _read_sweep(path: Path, max_range: float) -> tuple[F32, F32]:
+    """(N, 3) points in scanner axes and (N,) reflectance, without the car itself and what is too far."""
+    data = np.fromfile(path, np.float32)
+    if data.size == 0 or data.size % 4:
+        raise InputError(path, f"is no Velodyne sweep ({data.size * 4} bytes)", "Copy it again")
+    data = data.reshape(-1, 4)
+    data = data[np.isfinite(data).all(axis=1)]
+    xyz = data[:, :3]
+    low, high = np.array(OWN_CAR, np.float32)
+    keep = ~((xyz > low) & (xyz < high)).all(axis=1) & (np.linalg.norm(xyz, axis=1) <= max_range)
+    return xyz[keep], np.clip(data[keep, 3], 0, 1)
+
+
+def _colour(world: F64, T_world_cam: F64, camera: Camera, photo: Path, rgb: U8, seen: Any) -> None:
+    """Fill `rgb` and `seen` of points that fall into the photo and no earlier one has shown."""
+    import cv2
+
+    image = cv2.imread(str(photo), cv2.IMREAD_COLOR_RGB)
+    if image is None:
+        raise InputError(photo, "is no readable image", "Copy it again")
+    if image.shape[:2] != (camera.height, camera.width):
+        raise InputError(
+            photo,
+            f"is {image.shape[1]}x{image.shape[0]}, but its calibration says {camera.width}x{camera.height}",
+            "Use the synced and rectified photos with the calibration of the same day",
+        )
+    local = (world - T_world_cam[:3, 3]) @ T_world_cam[:3, :3]
+    depth = np.maximum(local[:, 2], 1e-6)
+    u = np.round(camera.fx * local[:, 0] / depth + camera.cx)
+    v = np.round(camera.fy * local[:, 1] / depth + camera.cy)
+    inside = (local[:, 2] > 0.5) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height) & ~seen
+    rgb[inside] = image[v[inside].astype(int), u[inside].astype(int)]
+    seen |= inside

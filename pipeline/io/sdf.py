@@ -1,0 +1,185 @@
+"""SDF 1.9: a Gazebo world and the static model of a tile.
+
+Choices, and why:
+
+- The world names its systems. A world that names none gets Gazebo's default ones, which leave out
+  the sensors; one that names any gets no default. The names are those of Garden and later; Fortress
+  takes them too since 6.16 (gz-sim #2275).
+- World axes are the CRS's grid axes, so that world coordinates plus the origin are CRS coordinates.
+  Grid north is not true north: `heading_deg` turns them back by the meridian convergence at the
+  world's origin. With 0 a NavSat sensor would be 3 m off at 100 m where the convergence is 2 degrees.
+- The photos hold the light and shadows of their day: the ambient light is strong, the sun weak, and
+  the tile's surfaces cast no shadow a second time; robots do.
+- No `<material>`: it would replace the mesh's own textures.
+- Every visual carries its class's LAS code for Gazebo's segmentation cameras.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.classes import CODE
+from pipeline.io import crs
+from pipeline.types import Frame
+
+LABEL = {"terrain": CODE["terrain"], "building": CODE["building"], "vegetation": CODE["high_vegetation"]}
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Georeference:
+    """Where a world's origin is on WGS 84, and how its axes lie.
+
+    Attributes:
+        latitude, longitude: degrees.
+        elevation: metres, in the height system of the CRS (no vertical shift is applied).
+        heading: degrees counter-clockwise from east to the world's x axis, as SDF counts.
+    """
+
+    latitude: float
+    longitude: float
+    elevation: float
+    heading: float
+
+    @classmethod
+    def of(cls, frame: Frame) -> Georeference | None:
+        """The georeference of a frame's origin; None for a local frame."""
+        from math import degrees
+
+        here = crs.to_wgs84(frame)
+        return None if here is None else cls(*here, -degrees(crs.convergence(frame)))
+
+
+def write_world(path: Path, name: str, place: Georeference | None, offset: Vector) -> None:
+    """Write a world that includes `model://<name>`.
+
+    Args:
+        path: of the world's .sdf.
+        name: of the world and its model.
+        place: of the world's origin, or None.
+        offset: metres from the world's origin to the model's.
+    """
+    path.write_text(
+        f"""<?xml version="1.0"?>
+<!-- Run in this folder: GZ_SIM_RESOURCE_PATH=$PWD/models gz sim {path.name}
+     (Fortress: IGN_GAZEBO_RESOURCE_PATH=$PWD/models ign gazebo {path.name}) -->
+<sdf version="1.9">
+  <world name="{name}">
+    <physics name="dart_1ms" type="dart">
+      <max_step_size>0.001</max_step_size>
+      <real_time_factor>1</real_time_factor>
+    </physics>
+    <gravity>0 0 -9.8</gravity>
+    <plugin filename="gz-sim-physics-system" name="gz::sim::systems::Physics"/>
+    <plugin filename="gz-sim-user-commands-system" name="gz::sim::systems::UserCommands"/>
+    <plugin filename="gz-sim-scene-broadcaster-system" name="gz::sim::systems::SceneBroadcaster"/>
+    <plugin filename="gz-sim-contact-system" name="gz::sim::systems::Contact"/>
+    <plugin filename="gz-sim-imu-system" name="gz::sim::systems::Imu"/>
+    <plugin filename="gz-sim-navsat-system" name="gz::sim::systems::NavSat"/>
+    <plugin filename="gz-sim-sensors-system" name="gz::sim::systems::Sensors">
+      <render_engine>ogre2</render_engine>
+    </plugin>
+{_spherical(place)}    <scene>
+      <ambient>0.7 0.7 0.7 1</ambient>
+      <background>0.7 0.8 0.9 1</background>
+      <grid>false</grid>
+    </scene>
+    <light name="sun" type="directional">
+      <cast_shadows>true</cast_shadows>
+      <pose>0 0 100 0 0 0</pose>
+      <diffuse>0.4 0.4 0.4 1</diffuse>
+      <specular>0.1 0.1 0.1 1</specular>
+      <direction>-0.4 0.2 -0.9</direction>
+    </light>
+    <include>
+      <uri>model://{name}</uri>
+      <pose>{_numbers(offset)} 0 0 0</pose>
+    </include>
+  </world>
+</sdf>
+""",
+        encoding="utf-8",
+    )
+
+
+def write_model(folder: Path, name: str, visuals: Mapping[str, str], collision: str, friction: float) -> None:
+    """Write `model.sdf` and `model.config` of a static model.
+
+    Args:
+        folder: of the model.
+        name: of the model; its meshes are found as `model://<name>/...`.
+        visuals: path of every visual mesh, relative to `folder`, to its group.
+        collision: path of the collision mesh, relative to `folder`.
+        friction: Coulomb friction coefficient of all surfaces.
+    """
+    shown = "".join(_visual(name, mesh, group) for mesh, group in visuals.items())
+    (folder / "model.sdf").write_text(
+        f"""<?xml version="1.0"?>
+<sdf version="1.9">
+  <model name="{name}">
+    <static>true</static>
+    <link name="link">
+{shown}      <collision name="collision">
+        <geometry>
+          <mesh><uri>model://{name}/{collision}</uri></mesh>
+        </geometry>
+        <surface>
+          <friction>
+            <ode><mu>{friction:g}</mu><mu2>{friction:g}</mu2></ode>
+            <bullet><friction>{friction:g}</friction><friction2>{friction:g}</friction2></bullet>
+          </friction>
+        </surface>
+      </collision>
+    </link>
+  </model>
+</sdf>
+""",
+        encoding="utf-8",
+    )
+    (folder / "model.config").write_text(
+        f"""<?xml version="1.0"?>
+<model>
+  <name>{name}</name>
+  <version>1.0</version>
+  <sdf version="1.9">model.sdf</sdf>
+  <author>
+    <name>scan2sim</name>
+  </author>
+  <description>A street scanned by lidar and photos: textured surfaces and one collision mesh.</description>
+</model>
+""",
+        encoding="utf-8",
+    )
+
+
+def _visual(name: str, mesh: str, group: str) -> str:
+    return f"""      <visual name="{Path(mesh).stem}">
+        <cast_shadows>false</cast_shadows>
+        <geometry>
+          <mesh><uri>model://{name}/{mesh}</uri></mesh>
+        </geometry>
+        <plugin filename="gz-sim-label-system" name="gz::sim::systems::Label">
+          <label>{LABEL[group]}</label>
+        </plugin>
+      </visual>
+"""
+
+
+def _spherical(place: Georeference | None) -> str:
+    if place is None:
+        return ""
+    return f"""    <spherical_coordinates>
+      <surface_model>EARTH_WGS84</surface_model>
+      <world_frame_orientation>ENU</world_frame_orientation>
+      <latitude_deg>{place.latitude:.9f}</latitude_deg>
+      <longitude_deg>{place.longitude:.9f}</longitude_deg>
+      <elevation>{place.elevation:.4f}</elevation>
+      <heading_deg>{place.heading:.7f}</heading_deg>
+    </spherical_coordinates>
+"""
+
+
+def _numbers(values: Vector) -> str:
+    return " ".join(f"{value:.6f}".rstrip("0").rstrip(".") for value in values)

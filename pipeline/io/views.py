@@ -1,0 +1,74 @@
+"""Posed photos as JSON (`views.json`): what steps hand on of a tile's views."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.errors import InputError
+from pipeline.types import Camera, View
+
+CAMERA_FIELDS = ("model", "width", "height", "fx", "fy", "cx", "cy", "distortion")
+
+
+def to_json(view: View, *, with_paths: bool = True) -> dict[str, Any]:
+    """A view as JSON-able values; without paths, `photo` and `mask` are file names alone."""
+
+    def place(path: Path | None) -> str | None:
+        return None if path is None else (str(path) if with_paths else path.name)
+
+    return {
+        "name": view.name,
+        "camera": {name: getattr(view.camera, name) for name in CAMERA_FIELDS},
+        "T_world_cam": np.asarray(view.T_world_cam, np.float64).tolist(),
+        "photo": place(view.photo),
+        "mask": place(view.mask),
+        "time": view.time,
+    }
+
+
+def from_json(entry: dict[str, Any]) -> View:
+    """What `to_json` made of a view."""
+    camera = dict(entry["camera"], distortion=tuple(entry["camera"]["distortion"]))
+    return View(
+        name=entry["name"],
+        camera=Camera(**camera),
+        T_world_cam=np.array(entry["T_world_cam"], np.float64),
+        photo=Path(entry["photo"]),
+        mask=Path(entry["mask"]) if entry.get("mask") else None,
+        time=entry.get("time"),
+    )
+
+
+def save(path: Path, views: Sequence[View], held_out: Sequence[bool] = ()) -> None:
+    """Write views, and which of them are held out of texturing (none by default)."""
+    held = list(held_out) or [False] * len(views)
+    rows = [to_json(view) | {"hold_out": bool(out)} for view, out in zip(views, held, strict=True)]
+    path.write_text(json.dumps(rows, indent=1), encoding="utf-8")
+
+
+def load(path: Path) -> tuple[View, ...]:
+    """Read the views that `save` wrote, in order; relative photos are beside the file, links are followed."""
+
+    def place(file: Path | None) -> Path | None:
+        return None if file is None else (path.parent / file).resolve()
+
+    views = (from_json(row) for row in _rows(path))
+    return tuple(replace(view, photo=place(view.photo), mask=place(view.mask)) for view in views)
+
+
+def load_held_out(path: Path) -> tuple[bool, ...]:
+    """Read which of the views are held out of texturing, in the views' order."""
+    return tuple(bool(row["hold_out"]) for row in _rows(path))
+
+
+def _rows(path: Path) -> list[dict[str, Any]]:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, json.JSONDecodeError) as error:
+        raise InputError(path, f"is no list of views ({error})", "Run again with `--from views`") from None

@@ -1,0 +1,55 @@
+"""Normals of points, oriented to where the scanner was."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+import open3d as o3d
+from scipy.spatial import cKDTree
+
+from pipeline.types import F32, F64, PointCloud, Trajectory
+
+STEEP = 0.3  # |nz| below which "up" says nothing of a surface's outside
+WALL_RADIUS = 3.0  # metres around a wall's point in which its building is looked for
+
+
+def oriented_normals(cloud: PointCloud, neighbours: int, path: Trajectory | None) -> PointCloud:
+    """The cloud with unit normals (N, 3): smallest principal axis of `neighbours`, turned to the scanner.
+
+    With a path and GPS times that overlap, each point looks to where the scanner was at its time;
+    without times to the nearest point of the path; without a path, up and, where steep, away from
+    the mass around it.
+    """
+    if len(cloud) < 3:
+        return replace(cloud, normal=np.tile(np.float32([0, 0, 1]), (len(cloud), 1)))
+    points = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.xyz.astype(np.float64)))
+    points.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(min(neighbours, len(cloud))))
+    normal = np.asarray(points.normals).astype(np.float32)
+    toward = _away_from_mass(cloud.xyz, normal) if path is None else _scanner(cloud, path) - cloud.xyz
+    normal[np.einsum("ij,ij->i", normal, toward) < 0] *= -1
+    return replace(cloud, normal=normal)
+
+
+def _scanner(cloud: PointCloud, path: Trajectory) -> F64:
+    """(N, 3) where the scanner was when it saw each point."""
+    times = cloud.time
+    if times is not None and len(path.times) > 1:
+        inside = (times >= path.times[0] - 1) & (times <= path.times[-1] + 1)
+        if inside.mean() > 0.99:
+            return path.at(times)
+    return path.positions[cKDTree(path.positions).query(cloud.xyz, workers=-1)[1]]
+
+
+def _away_from_mass(xyz: F32, normal: F32) -> npt.NDArray[np.floating]:
+    """(N, 3) directions to the outside, for clouds scanned from above: up, and away from what is near."""
+    toward = np.tile(np.array([0.0, 0.0, 1.0]), (len(xyz), 1))
+    steep = np.flatnonzero(np.abs(normal[:, 2]) < STEEP)
+    if len(steep):
+        coarse = np.unique(np.round(xyz / 0.5).astype(np.int32), axis=0).astype(np.float32) * 0.5
+        tree = cKDTree(coarse)
+        near = tree.query_ball_point(xyz[steep], WALL_RADIUS, workers=-1)
+        toward[steep] = [xyz[i] - coarse[j].mean(axis=0) if j else (0, 0, 1) for i, j in zip(steep, near, strict=True)]
+        toward[steep, 2] = 0
+    return toward

@@ -1,0 +1,290 @@
+"""Pictures of meshes by ray casting: from a photo's own camera, from above, from a driver's eye.
+
+Used to score textures against photos that were held out, and for the report's pictures.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.errors import InputError
+from pipeline.types import F32, F64, I32, U8, Camera, Mesh
+
+CHUNK = 500_000
+"""Rays at a time, to bound memory."""
+SKY = (200, 214, 230)
+SUN = np.array([0.45, 0.3, 0.84])
+
+Rays = Callable[[int, int], tuple[F64, F64]]
+
+
+@dataclass(frozen=True)
+class Body:
+    """A mesh to be rendered, and what gives it its colour.
+
+    Attributes:
+        mesh: with `uv` and `page` if it has `pages`.
+        pages: texture images (RGB) of the mesh's pages; the masks `page_<i>_seen.png` beside them are read as well.
+        colour: (F, 3) or (3,) uint8 of the faces, where there are no pages.
+    """
+
+    mesh: Mesh
+    pages: tuple[Path, ...] = ()
+    colour: U8 | tuple[int, int, int] = (200, 200, 200)
+
+
+@dataclass(frozen=True)
+class Image:
+    """A rendered picture; arrays are (H, W).
+
+    Attributes:
+        rgb: (H, W, 3) uint8.
+        hit: bool, whether the pixel's ray met a mesh.
+        seen: uint8 of the textures' masks (255 from a photo, 128 from points, 64 filled); 0 without textures.
+        face: int32 within its body's mesh, -1 where nothing was hit.
+        body: int16 index of the body, -1 where nothing was hit.
+        range: float32 metres along the ray, inf where nothing was hit.
+        barycentric: (H, W, 2) float32 weights of the face's second and third corner.
+    """
+
+    rgb: U8
+    hit: npt.NDArray[np.bool_]
+    seen: U8
+    face: I32
+    body: npt.NDArray[np.int16]
+    range: F32
+    barycentric: F32
+
+
+def textured(folder: Path) -> Body:
+    """The body of a folder that the step `texture` wrote (`mesh.npz`, `page_<i>.png`)."""
+    mesh = Mesh.load(folder / "mesh.npz")
+    count = 0 if mesh.page is None or not len(mesh) else int(mesh.page.max()) + 1
+    return Body(mesh, tuple(folder / f"page_{i}.png" for i in range(count)))
+
+
+class Renderer:
+    """Meshes ready to be rendered from any number of cameras.
+
+    Args:
+        bodies: what there is to see.
+    """
+
+    def __init__(self, bodies: Sequence[Body]) -> None:
+        import open3d as o3d
+
+        self.bodies = tuple(bodies)
+        self._casting = o3d.t.geometry.RaycastingScene()
+        self._body_of: dict[int, int] = {}
+        for i, body in enumerate(self.bodies):
+            if len(body.mesh):
+                key = self._casting.add_triangles(
+                    o3d.core.Tensor(np.ascontiguousarray(body.mesh.vertices)),
+                    o3d.core.Tensor(np.ascontiguousarray(body.mesh.faces, dtype=np.uint32)),
+                )
+                self._body_of[int(key)] = i
+        self._pixels = lru_cache(maxsize=16)(_read)
+
+    def view(
+        self,
+        camera: Camera,
+        T_world_cam: F64,
+        *,
+        background: tuple[int, int, int] = SKY,
+        shaded: bool = False,
+        wireframe: bool = False,
+    ) -> Image:
+        """What a camera sees.
+
+        Args:
+            camera, T_world_cam: intrinsics and pose.
+            background: colour where nothing is.
+            shaded: darken by the angle to a made-up sun (for plain colours; textures have their own light).
+            wireframe: draw the triangles' edges.
+        """
+        from pipeline.cameras import pixel_rays
+
+        rays = pixel_rays(camera).reshape(-1, 3)
+        rotation, centre = np.asarray(T_world_cam)[:3, :3], np.asarray(T_world_cam)[:3, 3]
+
+        def at(first: int, last: int) -> tuple[F64, F64]:
+            directions = rays[first:last] @ rotation.T
+            return np.broadcast_to(centre, directions.shape), directions
+
+        return self._cast(camera.width, camera.height, at, background, shaded, wireframe)
+
+    def above(
+        self,
+        low: npt.ArrayLike,
+        high: npt.ArrayLike,
+        *,
+        width: int = 1600,
+        background: tuple[int, int, int] = (255, 255, 255),
+        shaded: bool = False,
+        wireframe: bool = False,
+    ) -> Image:
+        """A map: straight down onto the box from `low` to `high` (3,), x to the right and y up."""
+        low, high = np.asarray(low, float), np.asarray(high, float)
+        metre = max(high[0] - low[0], 1e-3) / width
+        height = max(1, round((high[1] - low[1]) / metre))
+        top = high[2] + 1.0
+
+        def at(first: int, last: int) -> tuple[F64, F64]:
+            row, column = np.divmod(np.arange(first, last), width)
+            x, y = low[0] + (column + 0.5) * metre, high[1] - (row + 0.5) * metre
+            return np.column_stack([x, y, np.full(len(x), top)]), np.broadcast_to([0.0, 0.0, -1.0], (len(x), 3))
+
+        return self._cast(width, height, at, background, shaded, wireframe)
+
+    def nearest(self, points: F32) -> tuple[U8, U8, F32]:
+        """Colours (N, 3) and masks (N,) of the places on the meshes nearest to points (N, 3), and metres to them (N,)."""
+        import open3d as o3d
+
+        rgb, seen = np.zeros((len(points), 3), np.uint8), np.zeros(len(points), np.uint8)
+        distance = np.full(len(points), np.inf, np.float32)
+        if not self._body_of:
+            return rgb, seen, distance
+        points = np.ascontiguousarray(points, np.float32)
+        answer = self._casting.compute_closest_points(o3d.core.Tensor(points))
+        distance[:] = np.linalg.norm(answer["points"].numpy() - points, axis=1)
+        face = answer["primitive_ids"].numpy().astype(np.int32)
+        barycentric, which = answer["primitive_uvs"].numpy(), answer["geometry_ids"].numpy()
+        for key, i in self._body_of.items():
+            at = np.flatnonzero(which == key)
+            if len(at):
+                rgb[at], seen[at] = self._colour(self.bodies[i], face[at], barycentric[at])
+        return rgb, seen, distance
+
+    def _cast(
+        self, width: int, height: int, rays: Rays, background: tuple[int, int, int], shaded: bool, wireframe: bool
+    ) -> Image:
+        import open3d as o3d
+
+        n = width * height
+        rgb = np.tile(np.array(background, np.uint8), (n, 1))
+        seen = np.zeros(n, np.uint8)
+        face = np.full(n, -1, np.int32)
+        which = np.full(n, -1, np.int16)
+        distance = np.full(n, np.inf, np.float32)
+        barycentric = np.zeros((n, 2), np.float32)
+        lookup = np.full(max(self._body_of, default=0) + 1, -1, np.int16)
+        for key, i in self._body_of.items():
+            lookup[key] = i
+        for first in range(0, n, CHUNK) if self._body_of else ():
+            here = slice(first, min(n, first + CHUNK))
+            origin, direction = rays(here.start, here.stop)
+            cast = np.nan_to_num(np.concatenate([origin, direction], axis=1)).astype(np.float32)
+            answer = self._casting.cast_rays(o3d.core.Tensor(np.ascontiguousarray(cast)))
+            t = answer["t_hit"].numpy()
+            hit = np.isfinite(t) & np.isfinite(direction).all(axis=1)
+            distance[here] = np.where(hit, t, np.inf)
+            face[here][hit] = answer["primitive_ids"].numpy()[hit].astype(np.int32)
+            which[here][hit] = lookup[answer["geometry_ids"].numpy()[hit]]
+            barycentric[here][hit] = answer["primitive_uvs"].numpy()[hit]
+            for i, body in enumerate(self.bodies):
+                at = np.flatnonzero(which[here] == i) + here.start
+                if len(at):
+                    rgb[at], seen[at] = self._colour(body, face[at], barycentric[at])
+                    if shaded:
+                        rgb[at] = _shade(body.mesh, face[at], direction[at - here.start], rgb[at])
+            if wireframe:
+                at = np.flatnonzero(which[here] >= 0) + here.start
+                size = np.linalg.norm(direction[at - here.start], axis=1)
+                edge = self._edge_distance(which[at], face[at], barycentric[at]) < 0.0012 * distance[at] * size + 0.002
+                rgb[at[edge]] = (rgb[at[edge]] * 0.35).astype(np.uint8)
+        shape = (height, width)
+        return Image(
+            rgb.reshape(*shape, 3), (which >= 0).reshape(shape), seen.reshape(shape), face.reshape(shape),
+            which.reshape(shape), distance.reshape(shape), barycentric.reshape(*shape, 2),
+        )  # fmt: skip
+
+    def _colour(self, body: Body, face: I32, barycentric: F32) -> tuple[U8, U8]:
+        if not body.pages:
+            colour = np.asarray(body.colour, np.uint8)
+            return (colour[face] if colour.ndim == 2 else np.tile(colour, (len(face), 1))), np.zeros(
+                len(face), np.uint8
+            )
+        assert body.mesh.uv is not None and body.mesh.page is not None
+        corners = body.mesh.uv[face]
+        b = barycentric
+        uv = corners[:, 0] * (1 - b.sum(axis=1, keepdims=True)) + corners[:, 1] * b[:, :1] + corners[:, 2] * b[:, 1:]
+        page = body.mesh.page[face]
+        rgb, seen = np.empty((len(face), 3), np.uint8), np.empty(len(face), np.uint8)
+        for k in np.unique(page).tolist():
+            on = np.flatnonzero(page == k)
+            texture, mask = self._pixels(body.pages[k])
+            rgb[on], seen[on] = _look_up(texture, mask, uv[on])
+        return rgb, seen
+
+    def _edge_distance(self, which: npt.NDArray[np.int16], face: I32, barycentric: F32) -> F32:
+        """(N,) metres from a hit to the nearest edge of its triangle."""
+        out = np.empty(len(face), np.float32)
+        for i, body in enumerate(self.bodies):
+            on = which == i
+            c = body.mesh.corners[face[on]] if on.any() else np.zeros((0, 3, 3), np.float32)
+            doubled = np.linalg.norm(np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0]), axis=1)
+            weights = np.column_stack([1 - barycentric[on].sum(axis=1), barycentric[on]])
+            opposite = np.linalg.norm(c[:, [2, 0, 1]] - c[:, [1, 2, 0]], axis=2)
+            out[on] = (weights * doubled[:, None] / np.maximum(opposite, 1e-9)).min(axis=1)
+        return out
+
+
+def _read(path: Path) -> tuple[U8, U8 | None]:
+    """A page (H, W, 3) RGB, and its mask (H, W) or None."""
+    import cv2
+
+    page = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if page is None:
+        raise InputError(path, "can't be read as an image", "Run again with `--from texture`")
+    mask = cv2.imread(str(path.with_name(f"{path.stem}_seen.png")), cv2.IMREAD_GRAYSCALE)
+    return np.ascontiguousarray(page[..., ::-1]), mask
+
+
+def _look_up(page: U8, mask: U8 | None, uv: F32) -> tuple[U8, U8]:
+    """Bilinear colours (N, 3) of a page, and the nearest value (N,) of its mask, at uv (N, 2), origin lower left."""
+    height, width = page.shape[:2]
+    x = np.clip(uv[:, 0] * width - 0.5, 0, width - 1)
+    y = np.clip((1 - uv[:, 1]) * height - 0.5, 0, height - 1)
+    x0, y0 = np.minimum(x.astype(np.int32), max(0, width - 2)), np.minimum(y.astype(np.int32), max(0, height - 2))
+    x1, y1 = np.minimum(x0 + 1, width - 1), np.minimum(y0 + 1, height - 1)
+    fx, fy = (x - x0)[:, None].astype(np.float32), (y - y0)[:, None].astype(np.float32)
+    upper = page[y0, x0] * (1 - fx) + page[y0, x1] * fx
+    lower = page[y1, x0] * (1 - fx) + page[y1, x1] * fx
+    rgb = np.round(upper * (1 - fy) + lower * fy).astype(np.uint8)
+    if mask is None:
+        return rgb, np.zeros(len(uv), np.uint8)
+    return rgb, mask[np.round(y).astype(np.int32), np.round(x).astype(np.int32)]
+
+
+def _shade(mesh: Mesh, face: I32, direction: F64, rgb: U8) -> U8:
+    """Lambert's law under a made-up sun and sky; faces seen from behind are lit as from their front."""
+    c = mesh.corners[face]
+    normal = np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0]).astype(np.float64)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-20)
+    normal *= np.where(np.einsum("ij,ij->i", normal, direction) > 0, -1.0, 1.0)[:, None]
+    light = 0.35 + 0.2 * (0.5 + 0.5 * normal[:, 2]) + 0.5 * np.maximum(0, normal @ (SUN / np.linalg.norm(SUN)))
+    return np.clip(rgb * light[:, None], 0, 255).astype(np.uint8)
+
+
+def look_at(eye: npt.ArrayLike, target: npt.ArrayLike) -> F64:
+    """(4, 4) pose of an upright camera at `eye` that looks towards `target` (both (3,), local coordinates)."""
+    eye, target = np.asarray(eye, float), np.asarray(target, float)
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right = right / np.linalg.norm(right) if np.linalg.norm(right) > 1e-6 else np.array([1.0, 0.0, 0.0])
+    pose = np.eye(4)
+    pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = right, np.cross(forward, right), forward, eye
+    return pose
+
+
+def pinhole(width: int, height: int, *, field: float = 70.0) -> Camera:
+    """A pinhole camera with a horizontal field of view of `field` degrees."""
+    f = width / 2 / math.tan(math.radians(field) / 2)
+    return Camera("pinhole", width, height, f, f, (width - 1) / 2, (height - 1) / 2)

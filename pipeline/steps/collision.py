@@ -1,0 +1,115 @@
+"""Collision: one light mesh for physics, and how far it lies from what is seen."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pydantic import Field
+
+from pipeline.errors import DataError, StepError
+from pipeline.step import Done, Inputs, Params, Report, Step
+
+if TYPE_CHECKING:
+    from pipeline.types import Mesh
+
+SAMPLES = 100_000  # points at which the deviation is measured
+
+
+class CollisionParams(Params):
+    """What bodies collide with.
+
+    Attributes:
+        triangles: at most; physics engines stay interactive up to about 50 thousand.
+        vegetation: whether plants are solid too.
+        seed: of the points at which the deviation is measured.
+    """
+
+    triangles: int = Field(50_000, ge=100, le=200_000)
+    vegetation: bool = False
+    seed: int = 0
+
+
+def collision(inputs: Inputs, params: CollisionParams, out: Path, report: Report) -> Done:
+    """Simplify `terrain` and `building` (and `vegetation`, if asked) into one mesh.
+
+    They are simplified together, so the budget goes where the error would be greatest. Borders are
+    kept where the budget allows it; if not, a warning says so.
+
+    Raises:
+        DataError: no mesh has a face.
+        StepError: the budget can't be met.
+    """
+    from pipeline.steps.decimate import simplify
+
+    groups = ("terrain", "building", "vegetation") if params.vegetation else ("terrain", "building")
+    source = _joined(inputs, groups)
+    report(0.1, f"{len(source):,} triangles")
+    small, warnings = simplify(source, params.triangles), []
+    border_kept = len(small) <= params.triangles
+    if not border_kept:
+        warnings.append(f"collision: the borders alone need {len(small):,} triangles, so they were thinned too")
+        small = simplify(small, params.triangles, preserve_border=False)
+    if len(small) > params.triangles:
+        raise StepError(
+            "collision",
+            f"{len(small):,} triangles are left where {params.triangles:,} are allowed",
+            "Raise collision.triangles, or remove small islands",
+        )
+    report(0.7, "deviation")
+    deviation = _deviation(source, small, params.seed)
+    small.save(out / "collision.npz")
+    facts = {
+        "triangles_in": len(source),
+        "triangles": len(small),
+        "border_kept": border_kept,
+        "deviation_m": deviation,
+    }
+    return Done({"mesh": out / "collision.npz"}, facts, warnings)
+
+
+def _joined(inputs: Inputs, groups: tuple[str, ...]) -> Mesh:
+    """The meshes of `groups` that there are, as one."""
+    import numpy as np
+
+    from pipeline.types import Mesh
+
+    meshes = [mesh for group in groups if group in inputs and len(mesh := Mesh.load(inputs[group]))]
+    if not meshes:
+        raise DataError(
+            "collision",
+            f"there is no surface to collide with ({' and '.join(groups)} are empty)",
+            "Check the classes of the cloud, or set collision.vegetation=true",
+        )
+    first = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])
+    return Mesh(
+        meshes[0].frame,
+        np.concatenate([mesh.vertices for mesh in meshes]),
+        np.concatenate([mesh.faces + start for mesh, start in zip(meshes, first[:-1], strict=True)]).astype(np.int32),
+    )
+
+
+def _deviation(source: Mesh, small: Mesh, seed: int) -> dict[str, float]:
+    """Distances in metres from points of `source`, drawn evenly over its area, to `small`."""
+    import numpy as np
+    import open3d as o3d
+
+    rng = np.random.default_rng(seed)
+    area = source.face_area.astype(np.float64)
+    face = rng.choice(len(source), SAMPLES, p=area / area.sum())
+    r, s = np.sqrt(rng.random((SAMPLES, 1))), rng.random((SAMPLES, 1))
+    a, b, c = np.moveaxis(source.corners[face], 1, 0)
+    points = (1 - r) * a + r * (1 - s) * b + r * s * c  # uniform in a triangle: Osada et al. 2002
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(
+        o3d.core.Tensor.from_numpy(small.vertices), o3d.core.Tensor.from_numpy(small.faces.astype(np.uint32))
+    )
+    distance = scene.compute_distance(o3d.core.Tensor.from_numpy(points.astype(np.float32))).numpy()
+    return {
+        "mean": round(float(distance.mean()), 4),
+        "p95": round(float(np.percentile(distance, 95)), 4),
+        "max": round(float(distance.max()), 4),
+    }
+
+
+COLLISION = Step("collision", 1, collision, CollisionParams)

@@ -1,0 +1,61 @@
+"""Decimate: fewer triangles, each class to its own target (D3.2, section 4.2)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pydantic import Field
+
+from pipeline.step import Done, Inputs, Params, Report, Step
+
+if TYPE_CHECKING:
+    from pipeline.types import Mesh
+
+
+class DecimateParams(Params):
+    """How many triangles are left.
+
+    Attributes:
+        target: triangles; the mission's 100 K for terrain and buildings, 300 K for vegetation.
+    """
+
+    target: int = Field(100_000, ge=10_000, le=1_000_000)
+
+
+def decimate(inputs: Inputs, params: DecimateParams, out: Path, report: Report) -> Done:
+    """Collapse edges of `mesh` down to the target, borders kept (tiles and classes meet there).
+
+    Where the border alone is more than the target allows, the border is thinned as well, and a
+    warning says so.
+    """
+    from pipeline.types import Mesh
+
+    mesh = Mesh.load(inputs["mesh"])
+    small, warnings = simplify(mesh, params.target), []
+    border_kept = True
+    if len(small) > params.target * 1.05:
+        warnings.append(f"the border alone needs {len(small):,} triangles: thinned too, to {params.target:,}")
+        small, border_kept = simplify(small, params.target, preserve_border=False), False
+    small.save(out / "mesh.npz")
+    facts = {"faces_in": len(mesh), "faces": len(small), "target": params.target, "border_kept": border_kept}
+    return Done({"mesh": out / "mesh.npz"}, facts, warnings)
+
+
+def simplify(mesh: Mesh, target: int, *, preserve_border: bool = True) -> Mesh:
+    """Quadric edge collapse (Garland and Heckbert 1997) by pyfqmr, which refuses collapses that flip a face."""
+    import numpy as np
+    import pyfqmr
+
+    from pipeline.types import Mesh
+
+    if len(mesh) <= target:
+        return Mesh(mesh.frame, mesh.vertices, mesh.faces)
+    simplifier = pyfqmr.Simplify()
+    simplifier.setMesh(mesh.vertices.astype(np.float64), mesh.faces)
+    simplifier.simplify_mesh(target_count=target, aggressiveness=5, preserve_border=preserve_border, verbose=0)
+    vertices, faces, _ = simplifier.getMesh()
+    return Mesh(mesh.frame, vertices.astype(np.float32), faces.astype(np.int32)).keep(np.ones(len(faces), bool))
+
+
+DECIMATE = Step("decimate", 1, decimate, DecimateParams, {"vegetation": {"target": 300_000}})

@@ -1,0 +1,97 @@
+"""Geometry: how far the meshes are from the cloud, and from the true surface where it is known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pydantic import Field
+
+from pipeline.classes import GROUPS, group_of
+from pipeline.step import Done, Inputs, Params, Report, Step
+
+if TYPE_CHECKING:
+    from pipeline.types import F32, Mesh
+
+
+class GeometryParams(Params):
+    """How densely is measured.
+
+    Attributes:
+        samples: points a class, drawn from the cloud and from the mesh.
+    """
+
+    samples: int = Field(200_000, ge=1000)
+
+
+def geometry(inputs: Inputs, params: GeometryParams, out: Path, report: Report) -> Done:
+    """Measure `mesh.*` against `cloud.*`, and against `truth.mesh` where the tile is a generated one.
+
+    Facts, per class, in metres: `cloud_to_mesh_mean_m` and `cloud_to_mesh_p95_m` (from the points to
+    the nearest place on the mesh); `truth_mean_m` (from the mesh to the true surface of its class).
+    """
+    import numpy as np
+
+    from pipeline.types import Mesh, PointCloud
+
+    facts: dict[str, dict[str, Any]] = {}
+    truth = Mesh.load(inputs["truth.mesh"]) if "truth.mesh" in inputs else None
+    for i, group in enumerate(GROUPS):
+        if f"mesh.{group}" not in inputs:
+            continue
+        report(i / len(GROUPS), group)
+        mesh, cloud = Mesh.load(inputs[f"mesh.{group}"]), PointCloud.load(inputs[f"cloud.{group}"])
+        if len(mesh) == 0:
+            continue
+        points = cloud.xyz[:: max(1, len(cloud) // params.samples)]
+        distance = distances(points, mesh)
+        figures = {
+            "triangles": len(mesh),
+            "area_m2": float(mesh.face_area.sum()),
+            "cloud_to_mesh_mean_m": float(distance.mean()),
+            "cloud_to_mesh_p95_m": float(np.percentile(distance, 95)),
+        }
+        if truth is not None and truth.label is not None:
+            figures["truth_mean_m"] = truth_error(mesh, truth, group, params.samples)
+        facts[group] = {name: round(value, 4) for name, value in figures.items()}
+    return Done({}, facts)
+
+
+def truth_error(mesh: Mesh, truth: Mesh, group: str, samples: int) -> float:
+    """Mean distance in metres from points spread evenly on the mesh to the true surface of its class.
+
+    Samples outside the bounds of the true surface (a cloud reaches further than its street) don't count.
+    """
+    import numpy as np
+
+    assert truth.label is not None
+    same = truth.keep(group_of()[truth.label] == GROUPS.index(group))  # type: ignore[arg-type]
+    points = spread(mesh, samples)
+    low, high = same.vertices.min(axis=0)[:2], same.vertices.max(axis=0)[:2]
+    points = points[((points[:, :2] >= low) & (points[:, :2] <= high)).all(axis=1)]
+    return float(np.mean(distances(points, same)))
+
+
+def distances(points: F32, mesh: Mesh) -> F32:
+    """(N,) metres from points (N, 3) to the nearest place on the mesh."""
+    import numpy as np
+    import open3d as o3d
+
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(mesh.faces.astype(np.uint32)))
+    return scene.compute_distance(np.ascontiguousarray(points, np.float32)).numpy()
+
+
+def spread(mesh: Mesh, count: int, seed: int = 0) -> F32:
+    """(count, 3) points drawn evenly from the mesh's surface."""
+    import numpy as np
+
+    random = np.random.default_rng(seed)
+    area = np.cumsum(mesh.face_area, dtype=np.float64)
+    face = np.searchsorted(area, random.uniform(0, area[-1], count)).clip(max=len(mesh) - 1)
+    u, v = np.sqrt(random.uniform(size=(count, 1))), random.uniform(size=(count, 1))
+    a, b, c = np.moveaxis(mesh.corners[face], 1, 0)
+    return ((1 - u) * a + u * (1 - v) * b + u * v * c).astype(np.float32)
+
+
+GEOMETRY = Step("geometry", 1, geometry, GeometryParams)

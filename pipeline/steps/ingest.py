@@ -1,0 +1,63 @@
+"""Ingest: the tile's clouds as one, in local coordinates."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pipeline.errors import DataError
+from pipeline.step import Done, Inputs, Params, Report, Step
+
+MIN_POINTS = 1000
+
+
+class IngestParams(Params):
+    """Where the cloud is brought to; set by the recipe from the tile."""
+
+    crs: str = "local"
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    unit: float = 1.0
+
+
+def ingest(inputs: Inputs, params: IngestParams, out: Path, report: Report) -> Done:
+    """Read all clouds (`inputs` in order of name), drop points that aren't finite, join.
+
+    Attributes that only some of the clouds have are dropped, but for colours and classes, which
+    become grey and "unclassified" where they lack.
+
+    Raises:
+        DataError: fewer than 1000 points in all.
+    """
+    import numpy as np
+
+    from pipeline.io import clouds
+    from pipeline.types import Frame, PointCloud
+
+    frame = Frame(params.crs, params.origin, params.unit)
+    parts: list[PointCloud] = []
+    warnings = []
+    for i, name in enumerate(sorted(inputs)):
+        report(i / len(inputs), f"reading {inputs[name].name}")
+        cloud = clouds.read(inputs[name], frame)
+        finite = np.isfinite(cloud.xyz).all(axis=1)
+        if not finite.all():
+            warnings.append(f"{inputs[name].name}: {np.count_nonzero(~finite):,} points with NaN coordinates left out")
+            cloud = cloud.take(finite)
+        parts.append(cloud)
+    cloud = PointCloud.join(parts)
+    if len(cloud) < MIN_POINTS:
+        names = ", ".join(str(path) for path in inputs.values())
+        raise DataError(names, f"only {len(cloud):,} points in all", f"A tile needs {MIN_POINTS:,} points or more")
+    report(0.9, "writing")
+    cloud.save(out / "cloud.npz")
+    low, high = cloud.xyz.min(axis=0), cloud.xyz.max(axis=0)
+    facts = {
+        "points": len(cloud),
+        "extent_m": (high - low).round(2).tolist(),
+        "coloured": cloud.rgb is not None,
+        "classified": bool(cloud.label is not None and (cloud.label > 1).any()),
+        "timed": cloud.time is not None,
+    }
+    return Done({"cloud": out / "cloud.npz"}, facts, warnings)
+
+
+INGEST = Step("ingest", 1, ingest, IngestParams)

@@ -1,0 +1,36 @@
+"""Path: where the scanner was, for the orientation of normals."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pipeline.step import Done, Inputs, Params, Report, Step
+
+
+class PathParams(Params):
+    """The path, set by the recipe: the tile's trajectory, or else its cameras.
+
+    Attributes:
+        positions: (x, y, z) local metres.
+        times: GPS seconds, one a position; None where unknown.
+    """
+
+    positions: tuple[tuple[float, float, float], ...]
+    times: tuple[float, ...] | None = None
+
+
+def path(inputs: Inputs, params: PathParams, out: Path, report: Report) -> Done:
+    """Write the path as a `Trajectory`, ordered by time; times are NaN where unknown."""
+    import numpy as np
+
+    from pipeline.types import Trajectory
+
+    positions = np.array(params.positions, np.float64)
+    times = np.full(len(positions), np.nan) if params.times is None else np.array(params.times)
+    order = np.argsort(times, kind="stable")
+    Trajectory(times[order], positions[order]).save(out / "path.npz")
+    length = float(np.linalg.norm(np.diff(positions[order], axis=0), axis=1).sum()) if params.times else None
+    return Done({"path": out / "path.npz"}, {"positions": len(positions), "length_m": length})
+
+
+PATH = Step("path", 1, path, PathParams)

@@ -1,0 +1,271 @@
+"""Pictures: what a person looks at in the report, rendered without a screen."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from pydantic import Field
+
+from pipeline.classes import GROUPS, colour_of
+from pipeline.step import Done, Inputs, Params, Report, Step
+
+if TYPE_CHECKING:
+    from pipeline.render import Image
+    from pipeline.types import F64, U8, Camera, PointCloud
+
+GROUP_RGB = {"terrain": (176, 158, 138), "building": (206, 160, 132), "vegetation": (126, 172, 104)}
+SEEN_RGB = {255: (92, 160, 96), 128: (222, 170, 70), 64: (196, 84, 76)}
+EYE_HEIGHT = 1.6  # metres above the ground, a driver's
+MAP_ASPECT = 3.0  # a map is turned to lie along its longer side, and is at most this wide to its height
+
+
+class PicturesParams(Params):
+    """How large pictures are.
+
+    Attributes:
+        width: pixels.
+        compared: photos that the world is shown beside.
+    """
+
+    width: int = Field(1280, ge=160, le=4096)
+    compared: int = Field(3, ge=0)
+
+
+@dataclass
+class Album:
+    """Pictures with what the report says of them, in a folder with an index."""
+
+    folder: Path
+    index: list[dict[str, Any]] = field(default_factory=list)
+
+    def add(self, name: str, rgb: U8, role: str, title: str, caption: str, other: U8 | None = None) -> None:
+        """Keep a picture; `other` is what it is laid over in a comparison."""
+        entry = {"file": self._write(name, rgb), "role": role, "title": title, "caption": caption}
+        if other is not None:
+            entry["other"] = self._write(f"{name}_other", other)
+        self.index.append(entry)
+
+    def _write(self, name: str, rgb: U8) -> str:
+        import cv2
+
+        path = self.folder / f"{name}.jpg"
+        if not cv2.imwrite(str(path), np.ascontiguousarray(rgb[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 88]):
+            raise OSError(28, "No space left on device", str(path))
+        return path.name
+
+
+def pictures(inputs: Inputs, params: PicturesParams, out: Path, report: Report) -> Done:
+    """Render classes, meshes, triangles, the textured world from above and from a driver's eye, its pages,
+    what photos saw, and the world beside photos (held-out ones first).
+    """
+    from pipeline import render
+    from pipeline.io import views as views_io
+    from pipeline.types import Mesh, PointCloud, Trajectory
+
+    folder = out / "pictures"
+    folder.mkdir()
+    album = Album(folder)
+    cloud = PointCloud.load(inputs["cloud"])
+    path = Trajectory.load(inputs["path"]) if "path" in inputs else None
+    groups = [g for g in GROUPS if g in inputs]
+    plain = render.Renderer([render.Body(Mesh.load(inputs[f"decimate.{g}"]), colour=GROUP_RGB[g]) for g in groups])
+    world = render.Renderer([render.textured(inputs[g]) for g in groups])
+    low, high = bounds([body.mesh.vertices for body in world.bodies if len(body.mesh)] or [cloud.xyz])
+    camera = render.pinhole(params.width, params.width * 9 // 16, field=75)
+    eye = driver_pose(path.positions if path is not None else None, low, high, plain)
+
+    def above(renderer: render.Renderer, **how: Any) -> U8:
+        return lying(renderer.above(low, high, width=params.width, **how).rgb)
+
+    report(0.1, "driver's eye")
+    driver = world.view(camera, eye)
+    album.add("driver", driver.rgb, "hero", "From a driver's eye", "")
+    album.add(
+        "driver_eye", driver.rgb, "world", "From a driver's eye.", "The textured world as a robot's camera sees it."
+    )
+    album.add("above", above(world), "world", "From above.", f"{high[0] - low[0]:.0f} m by {high[1] - low[1]:.0f} m.")
+    report(0.3, "bird's eye")
+    album.add("bird", world.view(camera, bird_pose(low, high)).rgb, "world", "From a bird's eye.", "")
+    album.add(
+        "seen",
+        seen_colours(driver),
+        "world",
+        "Where colours come from.",
+        "Green: photos. Yellow: the cloud's points. Red: filled.",
+    )
+
+    report(0.4, "classes")
+    assert cloud.label is not None
+    album.add(
+        "classes",
+        points_from_above(cloud, low, high, params.width),
+        "step",
+        "Classes.",
+        f"{len(cloud):,} points by class.",
+    )
+    album.add(
+        "mesh",
+        plain.view(camera, eye, shaded=True).rgb,
+        "step",
+        "Mesh.",
+        "After Poisson, trimming and decimation, by class.",
+    )
+    lines = plain.view(camera, eye, shaded=True, wireframe=True)
+    total = sum(len(body.mesh) for body in plain.bodies)
+    album.add("wireframe", lines.rgb, "step", "Triangles.", f"{total:,} of them, each class to its own target.")
+    album.add("mesh_above", above(plain, shaded=True), "step", "Mesh from above.", "")
+
+    report(0.6, "pages")
+    for group, body in zip(groups, world.bodies, strict=True):
+        for i, page in enumerate(body.pages[:2]):
+            pages = f"page {i + 1} of {len(body.pages)}"
+            album.add(
+                f"atlas_{group}_{i}",
+                thumbnail(page, params.width // 2),
+                "atlas",
+                f"{group.capitalize()}.",
+                f"Texture {pages}.",
+            )
+
+    views, held = views_io.load(inputs["views"]), views_io.load_held_out(inputs["views"])
+    for i in _compared(held, params.compared):
+        report(0.7 + 0.3 * i / max(1, len(views)), views[i].name)
+        photo = read_photo(views[i].photo)
+        if photo is None:
+            continue
+        small = views[i].camera.scaled(min(1.0, params.width / views[i].camera.width))
+        shot = world.view(small, views[i].T_world_cam)
+        how = "held out of texturing" if held[i] else "one of those that the texture was made from"
+        album.add(
+            f"photo_{i}", resized(photo, small), "compare", views[i].name, f"({how}): drag to compare.", other=shot.rgb
+        )
+    (folder / "index.json").write_text(json.dumps(album.index, indent=1), encoding="utf-8")
+    return Done({"pictures": folder}, {"pictures": len(album.index)})
+
+
+def bounds(parts: list[Any]) -> tuple[F64, F64]:
+    """Low and high corner of nearly all points: stray ones at the far ends don't count."""
+    xyz = np.concatenate(parts)
+    low, high = np.percentile(xyz, 0.2, axis=0), np.percentile(xyz, 99.8, axis=0)
+    return low.astype(np.float64), high.astype(np.float64)
+
+
+def driver_pose(path: F64 | None, low: F64, high: F64, ground: Any) -> F64:
+    """(4, 4) pose of an eye on the path, an eighth of it in, looking along it; without a path, along the tile."""
+    from pipeline.render import look_at
+
+    if path is not None and len(path) > 1:
+        inside = path[((path[:, :2] > low[:2]) & (path[:, :2] < high[:2])).all(axis=1)]
+        path = inside if len(inside) > 1 else path
+        axis = np.linalg.svd(path - path.mean(axis=0))[2][0] if len(path) < 5000 else np.ptp(path, axis=0)
+        along = (path - path.mean(axis=0)) @ axis
+        ends = path[np.argsort(along)[[len(along) // 8, -1]]]
+        start, end = ends if (ends[1] - ends[0])[:2].any() else (path[0], path[-1])
+    else:
+        middle, size = (low + high) / 2, high - low
+        axis = np.array([1.0, 0, 0]) if size[0] >= size[1] else np.array([0, 1.0, 0])
+        start, end = middle - axis * size * 0.45, middle + axis * size * 0.45
+    start, end = start.copy(), end.copy()
+    for point in (start, end):
+        point[2] = ground_height(ground, point, low, high) + EYE_HEIGHT
+    if np.linalg.norm(end - start) < 0.5:
+        end = start + (1.0, 0, 0)
+    return look_at(start, end - (0, 0, 0.02 * np.linalg.norm(end - start)))
+
+
+def ground_height(renderer: Any, point: F64, low: F64, high: F64) -> float:
+    """Height of the lowest surface about a point, metres; of the tile's floor where there is none."""
+    corner = np.array([point[0] - 1, point[1] - 1, low[2] - 50]), np.array([point[0] + 1, point[1] + 1, high[2] + 50])
+    image = renderer.above(*corner, width=9)
+    if not image.hit.any():
+        return float(low[2])
+    return float(corner[1][2] + 1.0 - image.range[image.hit].max())
+
+
+def bird_pose(low: F64, high: F64) -> F64:
+    """(4, 4) pose of an eye above one end that overlooks the tile."""
+    from pipeline.render import look_at
+
+    size = high - low
+    along = 0 if size[0] >= size[1] else 1
+    across = 1 - along
+    reach = max(size[along] * 0.45, size[across] * 0.7, 10.0)
+    eye, target = (low + high) / 2, (low + high) / 2
+    eye[along] -= size[along] * 0.5 + reach * 0.25
+    eye[across] -= size[across] * 0.35
+    eye[2] = low[2] + reach
+    target[along] -= size[along] * 0.12
+    target[2] = low[2]
+    return look_at(eye, target)
+
+
+def points_from_above(cloud: PointCloud, low: F64, high: F64, width: int) -> U8:
+    """A map of the points by class, the highest of a pixel on top, its colour dimmed by depth."""
+    assert cloud.label is not None
+    width = min(width, 900) if len(cloud) < 2_000_000 else width
+    metre = max(float((high - low)[:2].max()) / width, 0.02)
+    size = np.maximum(np.ceil((high - low)[:2] / metre).astype(int), 1)
+    inside = ((cloud.xyz[:, :2] >= low[:2]) & (cloud.xyz[:, :2] < high[:2])).all(axis=1)
+    inside &= cloud.label != 18
+    xyz, label = cloud.xyz[inside], cloud.label[inside]
+    order = np.argsort(xyz[:, 2], kind="stable")
+    cell = ((xyz[order, :2] - low[:2]) / metre).astype(int).clip(max=size - 1)
+    picture = np.full((size[1], size[0], 3), 250, np.uint8)
+    light = np.clip(0.75 + 0.35 * (xyz[order, 2] - low[2]) / max(high[2] - low[2], 1e-3), 0.6, 1.15)
+    picture[size[1] - 1 - cell[:, 1], cell[:, 0]] = np.clip(colour_of()[label[order]] * light[:, None], 0, 255)
+    return lying(picture)
+
+
+def lying(picture: U8) -> U8:
+    """Turned so that its longer side is level."""
+    return np.ascontiguousarray(np.rot90(picture)) if picture.shape[0] > picture.shape[1] * 1.3 else picture
+
+
+def seen_colours(image: Image) -> U8:
+    """The picture tinted by where each texel's colour comes from."""
+    tint = np.full(image.rgb.shape, 230, np.uint8)
+    for value, rgb in SEEN_RGB.items():
+        tint[image.hit & (image.seen == value)] = rgb
+    grey = image.rgb.mean(axis=2, keepdims=True) / 255
+    return np.where(image.hit[..., None], tint * (0.45 + 0.6 * grey), 250).clip(0, 255).astype(np.uint8)
+
+
+def thumbnail(page: Path, width: int) -> U8:
+    """A texture page, at most `width` pixels wide."""
+    import cv2
+
+    image = cv2.imread(str(page), cv2.IMREAD_COLOR)
+    factor = min(1.0, width / max(image.shape[:2]))
+    return cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)[..., ::-1]
+
+
+def read_photo(path: Path) -> U8 | None:
+    """(H, W, 3) RGB, None where it can't be decoded (texturing has warned of it)."""
+    import cv2
+
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    return None if image is None else image[..., ::-1]
+
+
+def resized(photo: U8, camera: Camera) -> U8:
+    """The photo at a scaled camera's size."""
+    import cv2
+
+    return cv2.resize(np.ascontiguousarray(photo), (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+
+
+def _compared(held: list[bool], count: int) -> list[int]:
+    """Indices of views to compare: held-out ones first, spread evenly over those of a kind."""
+    out: list[int] = []
+    for kind in (True, False):
+        of_kind = [i for i, h in enumerate(held) if h == kind]
+        wanted = min(count - len(out), len(of_kind))
+        out += [of_kind[(2 * k + 1) * len(of_kind) // (2 * wanted)] for k in range(wanted)]
+    return out
+
+
+PICTURES = Step("pictures", 1, pictures, PicturesParams)

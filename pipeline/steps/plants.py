@@ -1,0 +1,117 @@
+"""Plants: where vegetation stands, instead of its mesh (D3.2, section 4.2, the mission's alternative)."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pydantic import Field
+
+from pipeline.step import Done, Inputs, Params, Report, Step
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from pipeline.types import F32
+
+CELL = 0.25  # metres, of the canopy raster
+
+
+class PlantsParams(Params):
+    """What counts as a plant.
+
+    Attributes:
+        min_height: metres above the ground.
+        min_distance: metres between two plants' tops.
+    """
+
+    min_height: float = Field(0.4, gt=0)
+    min_distance: float = Field(1.5, gt=0)
+
+
+def plants(inputs: Inputs, params: PlantsParams, out: Path, report: Report) -> Done:
+    """Find each plant's top in the canopy of `vegetation` above `terrain`; write GeoJSON and CSV.
+
+    Place and base are in the tile's CRS; height and crown radius (of the circle with the crown's
+    area) in metres. Crowns are grown from the tops by watershed (Vincent and Soille 1991).
+    """
+    import numpy as np
+
+    from pipeline.types import PointCloud
+
+    cloud, ground = PointCloud.load(inputs["vegetation"]), PointCloud.load(inputs["terrain"])
+    found = crowns(cloud.xyz, ground.xyz, params) if len(cloud) else np.empty((0, 5))
+    places = cloud.frame.to_crs(found[:, :3])
+    rows = [
+        {"x": round(x, 3), "y": round(y, 3), "z": round(z, 3), "height_m": round(h, 2), "crown_radius_m": round(r, 2)}
+        for (x, y, z), (h, r) in zip(places.tolist(), found[:, 3:].tolist(), strict=True)
+    ]
+    heading = "x,y,z,height_m,crown_radius_m"
+    text = "\n".join([heading, *(",".join(str(value) for value in row.values()) for row in rows)])
+    (out / "plants.csv").write_text(text + "\n", encoding="utf-8")
+    features = [
+        {
+            "type": "Feature",
+            "geometry": {"type": "Point", "coordinates": [row["x"], row["y"], row["z"]]},
+            "properties": {"height_m": row["height_m"], "crown_radius_m": row["crown_radius_m"]},
+        }
+        for row in rows
+    ]
+    body = {"type": "FeatureCollection", "crs": _geojson_crs(cloud.frame.crs), "features": features}
+    (out / "plants.geojson").write_text(json.dumps({k: v for k, v in body.items() if v}, indent=1), encoding="utf-8")
+    return Done(
+        {"geojson": out / "plants.geojson", "csv": out / "plants.csv"}, {"points": len(cloud), "plants": len(rows)}
+    )
+
+
+def crowns(xyz: F32, ground: F32, params: PlantsParams) -> npt.NDArray[np.float64]:
+    """(P, 5) x, y, z of the base, height, crown radius: metres, local."""
+    import numpy as np
+    from scipy import ndimage
+    from scipy.spatial import cKDTree
+
+    low = xyz[:, :2].min(axis=0)
+    cell = ((xyz[:, :2] - low) / CELL).astype(int)
+    canopy = np.full(cell.max(axis=0) + 1, -np.inf)
+    np.maximum.at(canopy, (cell[:, 0], cell[:, 1]), xyz[:, 2])
+    filled = np.isfinite(canopy)
+    centres = (np.argwhere(filled) + 0.5) * CELL + low
+    base = np.zeros_like(canopy)
+    if len(ground):
+        _, nearest = cKDTree(ground[:, :2]).query(centres, workers=-1)
+        base[filled] = ground[nearest, 2]
+    else:
+        base[filled] = xyz[:, 2].min()
+    height = np.where(filled, canopy - base, 0.0)
+    smooth = ndimage.gaussian_filter(height, params.min_distance / CELL / 4)
+    size = max(3, round(params.min_distance / CELL) | 1)
+    top = (smooth == ndimage.maximum_filter(smooth, size)) & (height > params.min_height)
+    markers, count = ndimage.label(top)
+    levels = np.clip((smooth.max() - smooth) / max(smooth.max(), 1e-6) * 65535, 0, 65535).astype(np.uint16)
+    background = ~filled
+    markers[background] = -1
+    grown = ndimage.watershed_ift(levels, markers.astype(np.int32)) if count else markers
+    result = []
+    for i in range(1, count + 1):
+        at = np.argwhere(top & (markers == i)).mean(axis=0)
+        crown = (grown == i) & filled
+        row, column = at.astype(int)
+        x, y = (at + 0.5) * CELL + low
+        tall = height[crown].max() if crown.any() else height[row, column]
+        result.append((x, y, base[row, column], tall, np.sqrt(max(crown.sum(), 1) * CELL**2 / np.pi)))
+    return np.array(result, np.float64).reshape(-1, 5)
+
+
+def _geojson_crs(crs: str) -> dict[str, object] | None:
+    """The (pre-RFC 7946) member by which GIS programs know a GeoJSON file's CRS."""
+    if crs == "local":
+        return None
+    from pyproj import CRS
+
+    code = CRS.from_user_input(crs).to_epsg()
+    return {"type": "name", "properties": {"name": f"urn:ogc:def:crs:EPSG::{code}"}} if code else None
+
+
+PLANTS = Step("plants", 1, plants, PlantsParams)

@@ -1,0 +1,132 @@
+"""Views: the tile's posed photos, checked, and which of them are held out of texturing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pydantic import Field
+
+from pipeline.errors import DataError, InputError
+from pipeline.step import Done, Inputs, Params, Report, Step
+
+if TYPE_CHECKING:
+    from pipeline.types import F32, View
+
+REACH = 100.0  # metres; a photo further than this from every point sees nothing of the tile
+SAMPLE = 50_000  # points that are looked for in the photos
+
+
+class ViewsParams(Params):
+    """What becomes of the photos.
+
+    Attributes:
+        hold_out: keeps every nth photo out of texturing, to score the texture against; 0: none.
+        poses: the views as JSON (`pipeline.io.views`), file names without folders; set by the recipe.
+    """
+
+    hold_out: int = Field(0, ge=0)
+    poses: tuple[dict[str, Any], ...] = ()
+
+
+def views(inputs: Inputs, params: ViewsParams, out: Path, report: Report) -> Done:
+    """Check that photos can be opened, have their camera's size, and meet the cloud; skip those that don't.
+
+    Inputs are `photo.N` and `mask.N` by the views' index, and the clouds `cloud.*`.
+
+    Raises:
+        InputError: a photo's size is not its camera's; no photo can be read at all.
+        DataError: no photo sees any point of the cloud.
+    """
+    from dataclasses import replace
+
+    import numpy as np
+
+    from pipeline.io import views as views_io
+    from pipeline.types import PointCloud
+
+    clouds = [PointCloud.load(path).xyz for name, path in inputs.items() if name.startswith("cloud.")]
+    points = np.concatenate(clouds)
+    points = points[:: max(1, len(points) // SAMPLE)]
+    kept: list[View] = []
+    warnings, sees_nothing = [], []
+    for i, entry in enumerate(params.poses):
+        report(i / len(params.poses), entry["name"])
+        mask = inputs.get(f"mask.{i}")
+        view = replace(views_io.from_json(entry), photo=inputs[f"photo.{i}"], mask=mask)
+        problem = _problem(view)
+        if problem:
+            warnings.append(f"{problem}: left out, its place is textured from other photos where they see it")
+        elif not _sees(view, points):
+            sees_nothing.append(view.name)
+        else:
+            kept.append(replace(view, photo=_linked(view.photo, out, i), mask=mask and _linked(mask, out, i)))
+    if sees_nothing and not kept:
+        raise DataError(
+            inputs["photo.0"].parent,
+            f"the cloud and the cameras never meet: none of {len(sees_nothing)} photos sees a point within {REACH:.0f} m",
+            "Check CRS, units and axes of the poses (camera to world; x right, y down, z forward)",
+        )
+    if params.poses and not kept:
+        raise InputError(inputs["photo.0"], "no photo of the tile can be read", "Put the photos back, or take them out")
+    if sees_nothing:
+        warnings.append(f"{len(sees_nothing)} photos see no point of the cloud: {', '.join(sees_nothing[:5])}")
+    held = [params.hold_out > 0 and i % params.hold_out == params.hold_out // 2 for i in range(len(kept))]
+    views_io.save(out / "views.json", kept, held)
+    # links: a moved tile breaks them, which rebuilds this step alone, not what was made from the photos
+    facts = {"photos": len(params.poses), "usable": len(kept), "held_out": sum(held)}
+    return Done({"views": out / "views.json"}, facts, warnings)
+
+
+def _linked(file: Path, out: Path, index: int) -> Path:
+    """A link below `out` to a photo or mask, relative to `out`."""
+    link = Path("photos") / f"{index:05d}_{file.name}"
+    (out / "photos").mkdir(exist_ok=True)
+    (out / link).symlink_to(file.resolve())
+    return link
+
+
+def _problem(view: View) -> str | None:
+    """Why the photo or its mask can't be used; None if it can.
+
+    Raises:
+        InputError: it opens, but is not of its camera's size.
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    for path in (view.photo, view.mask):
+        if path is None:
+            continue
+        try:
+            with Image.open(path) as image:
+                size = image.size
+        except FileNotFoundError:
+            return f"{path} is missing"
+        except (UnidentifiedImageError, OSError) as error:
+            return f"{path} can't be read ({error})"
+        if size != (view.camera.width, view.camera.height):
+            raise InputError(
+                path,
+                f"is {size[0]} x {size[1]} pixels, but its camera {view.camera.width} x {view.camera.height}",
+                "Mend the camera's `size` (and focal, centre), or resize the photo",
+            )
+    return None
+
+
+def _sees(view: View, points: F32) -> bool:
+    """Whether any of the points (N, 3) is inside the image and within reach."""
+    import numpy as np
+
+    from pipeline.cameras import project
+
+    T_cam_world = np.linalg.inv(view.T_world_cam)
+    local = points @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]
+    local = local[np.einsum("ij,ij->i", local, local) < REACH**2]
+    if len(local) == 0:
+        return False
+    uv, valid = project(view.camera, local)
+    inside = (uv > -0.5).all(axis=1) & (uv[:, 0] < view.camera.width - 0.5) & (uv[:, 1] < view.camera.height - 0.5)
+    return bool((inside & valid).any())
+
+
+VIEWS = Step("views", 1, views, ViewsParams)

@@ -1,0 +1,54 @@
+"""Visibility: a depth map for every photo, from the meshes and from what of the cloud they lack."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pydantic import Field
+
+from pipeline.step import Done, Inputs, Params, Report, Step
+
+
+class VisibilityParams(Params):
+    """How finely is looked.
+
+    Attributes:
+        pixels: depth maps are at most this large.
+        radius: of the discs that the cloud's points are drawn as, metres.
+        lacking: points further than this from every mesh hide by themselves (cars, people), metres.
+    """
+
+    pixels: int = Field(1_000_000, ge=10_000)
+    radius: float = Field(0.08, gt=0)
+    lacking: float = Field(0.2, gt=0)
+
+
+def visibility(inputs: Inputs, params: VisibilityParams, out: Path, report: Report) -> Done:
+    """Draw a depth map of the meshes `mesh.*` and clouds `cloud.*` for every view of `views`.
+
+    The maps are `depth/<view index>.npy`: (H, W) float32, metres along the pixel's ray.
+    """
+    import numpy as np
+
+    from pipeline import visibility as kernel
+    from pipeline.io import views as views_io
+    from pipeline.types import Mesh, PointCloud
+
+    folder = out / "depth"
+    folder.mkdir()
+    views = views_io.load(inputs["views"])
+    if not views:
+        return Done({"depth": folder}, {"views": 0})
+    meshes = [Mesh.load(path) for name, path in inputs.items() if name.startswith("mesh.")]
+    cloud = PointCloud.join([PointCloud.load(path) for name, path in inputs.items() if name.startswith("cloud.")])
+    hides = kernel.scene(meshes, cloud, radius=params.radius, lacking=params.lacking)
+    for i, view in enumerate(views):
+        report(i / len(views), view.name)
+        depth = kernel.depth_map(view.camera, view.T_world_cam, hides, pixels=params.pixels)
+        np.save(folder / f"{i}.npy", depth.range)
+    return Done(
+        {"depth": folder}, {"views": len(views), "triangles": len(hides.triangles), "discs": len(hides.centres)}
+    )
+
+
+VISIBILITY = Step("visibility", 1, visibility, VisibilityParams)

@@ -1,0 +1,278 @@
+"""The command as a user types it, on a small street: worlds, reports, resuming, and bad input."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.io import las
+from pipeline.types import Frame, PointCloud
+from tests.conftest import ROOT
+
+SMALL = ["--set", "unwrap.texel=0.05", "--set", "decimate.target=10000", "--set", "voxel.size=0.2"]
+
+
+def scan2sim(*arguments: object, timeout: float = 300) -> subprocess.CompletedProcess[str]:
+    """Run the command."""
+    return subprocess.run(
+        [sys.executable, "-m", "flows.cli", *map(str, arguments)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=timeout,
+        env=dict(os.environ, COLUMNS="200"),
+    )
+
+
+def good(result: subprocess.CompletedProcess[str]) -> str:
+    assert result.returncode == 0, result.stderr + result.stdout
+    return result.stdout
+
+
+def bad(result: subprocess.CompletedProcess[str], code: int, *parts: str) -> None:
+    """The command failed with an exit code and one message that holds all parts, without a traceback."""
+    assert result.returncode == code, (result.returncode, result.stderr, result.stdout)
+    for part in parts:
+        assert part in result.stderr, result.stderr
+    assert "Traceback" not in result.stderr + result.stdout
+    assert len(result.stderr.strip().splitlines()) == 2, result.stderr
+
+
+@pytest.fixture(scope="module")
+def street(small_street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the small street that tests may damage copies of."""
+    copy = tmp_path_factory.mktemp("street") / "tile"
+    shutil.copytree(small_street, copy)
+    return copy
+
+
+@pytest.fixture(scope="module")
+def world(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run of the small street."""
+    out = tmp_path_factory.mktemp("world")
+    good(scan2sim("run", street, "--out", out, "--hold-out", 4, *SMALL))
+    return out
+
+
+@pytest.fixture
+def damaged(street: Path, tmp_path: Path) -> Path:
+    """A copy of the street to damage."""
+    shutil.copytree(street, tmp_path / "tile")
+    return tmp_path / "tile"
+
+
+def edit(tile: Path, old: str, new: str, count: int = 1) -> None:
+    text = (tile / "tile.toml").read_text()
+    assert old in text
+    (tile / "tile.toml").write_text(text.replace(old, new, count))
+
+
+def test_version_and_help() -> None:
+    assert good(scan2sim("--version")).startswith("scan2sim 0.")
+    text = good(scan2sim("--help"))
+    assert all(command in text for command in ("run", "plan", "inspect", "import", "sample"))
+
+
+def test_a_street_becomes_a_world_with_its_report(world: Path) -> None:
+    assert len(list((world / "world").glob("*.sdf"))) == 1
+    report = json.loads((world / "report.json").read_text())
+    for group in ("terrain", "building", "vegetation"):
+        assert report["geometry"]["cloud_to_mesh_mean_m"][group] < 0.1
+        assert report["geometry"]["truth_mean_m"][group] < 0.2
+    assert 0.3 < report["texture"]["coverage"] <= 1
+    assert report["texture"]["psnr_db"] > 12 and report["texture"]["psnr_gain_db"] >= report["texture"]["psnr_db"] - 0.5
+    assert 0 < report["texture"]["ssim"] < 1 and report["texture"]["truth_psnr_db"] > 12
+    assert report["steps"]["poisson.terrain"]["seconds"] > 0 and report["steps"]["poisson.terrain"]["peak_mb"] > 50
+    page = (world / "report.html").read_text()
+    assert page.count("data:image/") >= 8 and "http" not in page.split("<main>")[1]
+
+
+def test_running_again_does_nothing_and_a_deleted_page_comes_back(street: Path, world: Path) -> None:
+    command = ("run", street, "--out", world, "--hold-out", 4, *SMALL)
+    before = {p: p.stat().st_mtime_ns for p in (world / "steps").rglob("*") if p.is_file()}
+    assert "nothing to do" in good(scan2sim(*command))
+    assert before == {p: p.stat().st_mtime_ns for p in (world / "steps").rglob("*") if p.is_file()}
+    next((world / "steps" / "texture.building").rglob("page_0.png")).unlink()
+    plan = good(scan2sim("plan", *command[1:]))
+    assert [line.split()[0] for line in plan.splitlines() if " yes " in line] == ["texture.building"]
+    good(scan2sim(*command))
+    after = {p: p.stat().st_mtime_ns for p in (world / "steps").rglob("*") if p.is_file()}
+    assert {p.parts[-3] for p in before if before[p] != after.get(p)} <= {"texture.building"} | {
+        p.parts[-3] for p in before if "texture.building" in str(p)
+    }
+
+
+def test_plan_says_what_a_setting_changes(street: Path, world: Path) -> None:
+    text = good(
+        scan2sim("plan", street, "--out", world, "--hold-out", 4, *SMALL, "--set", "trim.building.max_edge=0.3")
+    )
+    again = {line.split()[0] for line in text.splitlines() if " yes " in line}
+    assert "trim.building" in again and "texture.terrain" in again  # buildings hide what is behind them
+    assert not again & {"ingest", "poisson.building", "trim.terrain", "unwrap.terrain"}
+
+
+def test_inspect_tells_of_cloud_tile_mesh_and_world(street: Path, world: Path) -> None:
+    assert "EPSG" in good(scan2sim("inspect", street / "cloud.laz"))
+    assert "photos" in good(scan2sim("inspect", street))
+    assert "triangles" in good(scan2sim("inspect", next((world / "world").rglob("terrain*.obj"))))
+    assert "place" in good(scan2sim("inspect", world))
+    bad(scan2sim("inspect", street / "nothing.laz"), 3, "nothing.laz", "is missing")
+
+
+def test_plants_as_places(street: Path, tmp_path: Path) -> None:
+    good(scan2sim("run", street, "--out", tmp_path, *SMALL, "--set", "split.vegetation=locations"))
+    assert not list((tmp_path / "world").rglob("vegetation*.obj"))
+    features = json.loads(next((tmp_path / "world").rglob("plants.geojson")).read_text())["features"]
+    assert features and all(f["properties"]["height_m"] > 0 for f in features)
+
+
+def test_a_cloud_alone_without_colours_or_classes(street: Path, tmp_path: Path) -> None:
+    frame = Frame("EPSG:32633", (500000.0, 5400000.0, 200.0))
+    cloud = las.read(street / "cloud.laz", las_frame(street))
+    las.write(tmp_path / "plain.laz", PointCloud(frame, cloud.xyz))
+    good(scan2sim("import", "las", tmp_path / "plain.laz", "--out", tmp_path / "tile"))
+    good(scan2sim("run", tmp_path / "tile", "--out", tmp_path / "out", *SMALL))
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["texture"]["coverage"] == 0 and report["steps"]["segment"]["facts"]["source"] == "geometry"
+
+
+def las_frame(tile: Path) -> Frame:
+    from pipeline.io.tile import read_tile
+
+    return read_tile(tile).frame
+
+
+def test_truncated_cloud(damaged: Path, tmp_path: Path) -> None:
+    data = (damaged / "cloud.laz").read_bytes()
+    (damaged / "cloud.laz").write_bytes(data[: len(data) // 2])
+    bad(scan2sim("run", damaged, "--out", tmp_path / "out"), 3, "cloud.laz", "Copy it again")
+
+
+def test_no_crs(damaged: Path, tmp_path: Path) -> None:
+    cloud = las.read(damaged / "cloud.laz", las_frame(damaged))
+    las.write(damaged / "cloud.laz", PointCloud(Frame(), cloud.xyz))
+    text = (damaged / "tile.toml").read_text()
+    (damaged / "tile.toml").write_text("\n".join(line for line in text.splitlines() if not line.startswith("crs")))
+    bad(scan2sim("run", damaged, "--out", tmp_path / "out"), 3, "cloud.laz", "no CRS", 'crs = "local"')
+
+
+def test_two_crs(damaged: Path, tmp_path: Path) -> None:
+    cloud = las.read(damaged / "cloud.laz", las_frame(damaged))
+    las.write(damaged / "other.laz", PointCloud(Frame("EPSG:2154", (600000.0, 6000000.0, 0.0)), cloud.xyz[:5000]))
+    edit(damaged, '"cloud.laz"', '"cloud.laz", "other.laz"')
+    bad(scan2sim("run", damaged, "--out", tmp_path / "out"), 3, "other.laz", "EPSG:2154", "one CRS")
+
+
+def test_cloud_and_cameras_that_never_meet(damaged: Path, tmp_path: Path) -> None:
+    lines = (damaged / "tile.toml").read_text().splitlines()
+    inside = False
+    for i, line in enumerate(lines):
+        if line.startswith("position"):
+            inside = True
+        elif inside and line.strip(" ,").replace(".", "").replace("-", "").isdigit():
+            lines[i] = "    12345.0,"
+        elif line.startswith("]"):
+            inside = False
+        if line.startswith("position") and line.endswith("]"):
+            lines[i], inside = "position = [12345.0, 12345.0, 12345.0]", False
+    (damaged / "tile.toml").write_text("\n".join(lines))
+    bad(scan2sim("run", damaged, "--out", tmp_path / "out", *SMALL), 4, "never meet", "CRS, units and axes")
+
+
+def test_missing_and_unreadable_photos_are_skipped(damaged: Path, tmp_path: Path) -> None:
+    photos = sorted((damaged / "photos").rglob("*.jpg"))
+    photos[0].unlink()
+    photos[1].write_bytes(b"no photo")
+    data = photos[2].read_bytes()
+    photos[2].write_bytes(data[: len(data) // 3])
+    out = good(scan2sim("run", damaged, "--out", tmp_path / "out", *SMALL))
+    for photo in photos[:3]:
+        assert photo.name in out, out
+
+
+def test_all_photos_gone(damaged: Path, tmp_path: Path) -> None:
+    shutil.rmtree(damaged / "photos")
+    bad(scan2sim("run", damaged, "--out", tmp_path / "out", *SMALL), 3, "no photo of the tile can be read")
+
+
+def test_nan_pose_and_no_rotation(damaged: Path, tmp_path: Path) -> None:
+    text = (damaged / "tile.toml").read_text()
+    head, tail = text.split("rotation", 1)
+    (damaged / "tile.toml").write_text(head + "rotation = [[1,0,0],[0,2,0],[0,0,1]]\n#" + _one_line(tail))
+    bad(scan2sim("run", damaged, "--out", tmp_path / "out"), 3, "tile.toml", "is no rotation")
+    head, tail = text.split("position", 1)
+    (damaged / "tile.toml").write_text(head + "position = [nan, 0.0, 0.0]\n#" + _one_line(tail))
+    bad(scan2sim("run", damaged, "--out", tmp_path / "out"), 3, "tile.toml", "NaN")
+
+
+def _one_line(rest: str) -> str:
+    """A TOML value's remainder with the value commented out, whether on one line or several."""
+    depth, i = 0, rest.index("[")
+    for i in range(i, len(rest)):
+        depth += {"[": 1, "]": -1}.get(rest[i], 0)
+        if depth == 0:
+            break
+    return rest[: i + 1].replace("\n", " ") + rest[i + 1 :]
+
+
+def test_bad_input_leaves_earlier_results(street: Path, world: Path, tmp_path: Path) -> None:
+    shutil.copytree(world, tmp_path / "out", symlinks=True)
+    shutil.copytree(street, tmp_path / "tile")
+    data = (tmp_path / "tile" / "cloud.laz").read_bytes()
+    (tmp_path / "tile" / "cloud.laz").write_bytes(data[:-1000])
+    before = {p.relative_to(tmp_path): p.stat().st_size for p in (tmp_path / "out" / "world").rglob("*") if p.is_file()}
+    assert scan2sim("run", tmp_path / "tile", "--out", tmp_path / "out", *SMALL).returncode == 3
+    assert before == {
+        p.relative_to(tmp_path): p.stat().st_size for p in (tmp_path / "out" / "world").rglob("*") if p.is_file()
+    }
+    assert list((tmp_path / "out" / "steps" / "poisson.terrain").glob("*/mesh.npz"))
+
+
+def test_a_full_disk(street: Path, tmp_path: Path) -> None:
+    mount = tmp_path / "small_disk"
+    mount.mkdir()
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=6m", "tmpfs", str(mount)], capture_output=True).returncode:
+        pytest.skip("a small file system can't be mounted here (not root)")
+    try:
+        bad(scan2sim("run", street, "--out", mount / "out", *SMALL), 6, "no space left", "Free some space")
+    finally:
+        subprocess.run(["umount", str(mount)], check=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "step", ["ingest", "poisson.terrain", "unwrap.building", "texture.terrain", "export", "pictures"]
+)
+def test_kill_9_at_any_step_then_resume(street: Path, tmp_path: Path, step: str) -> None:
+    command = [sys.executable, "-m", "flows.cli", "run", str(street), "--out", str(tmp_path / "out"), *SMALL]
+    child = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    folder = tmp_path / "out" / "steps" / step
+    while child.poll() is None and not folder.exists():
+        time.sleep(0.02)
+    child.send_signal(signal.SIGKILL)
+    child.wait()
+    time.sleep(1)
+    finished = {p.parent.name for p in (tmp_path / "out" / "steps").glob("*/*") if not p.name.startswith(".tmp-")}
+    out = good(scan2sim(*command[3:]))
+    again = {line.split()[1] for line in out.splitlines() if line.startswith("✓")}
+    assert not finished & again, "what was finished is kept"
+    assert (tmp_path / "out" / "report.html").is_file()
+    assert not list((tmp_path / "out" / "steps").rglob(".tmp-*"))
+
+
+def test_results_repeat_bit_for_bit(street: Path, world: Path, tmp_path: Path) -> None:
+    good(scan2sim("run", street, "--out", tmp_path / "out", "--hold-out", 4, *SMALL))
+    for path in sorted((world / "world").rglob("*.png")):
+        twin = tmp_path / "out" / path.relative_to(world)
+        assert np.array_equal(np.frombuffer(path.read_bytes(), np.uint8), np.frombuffer(twin.read_bytes(), np.uint8)), (
+            path
+        )

@@ -1,0 +1,163 @@
+"""Planning and execution: what runs again and what doesn't, and that nothing is lost on failures."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from flows.execute import execute, locked, plan
+from pipeline.errors import DataError, StepError, UnavailableError
+from pipeline.store import Manifest, Store
+from tests.conftest import ROOT
+from tests.flows.toy import chain
+
+Run = Callable[..., dict[str, Manifest]]
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    path = tmp_path / "source.txt"
+    path.write_text("1")
+    return path
+
+
+@pytest.fixture
+def run(tmp_path: Path, source: Path) -> Run:
+    """Run the toy chain; keyword arguments by node, or of `plan`."""
+
+    def go(force: bool = False, start: str | None = None, **changes: dict[str, object]) -> dict[str, Manifest]:
+        store = Store(tmp_path / "store")
+        nodes = chain(source, tmp_path / "log", **changes)
+        return execute(plan(nodes, store, force=force, start=start), store, jobs=2, watch=lambda *_: None)
+
+    return go
+
+
+@pytest.fixture
+def ran(tmp_path: Path) -> Callable[[], str]:
+    """Names of the nodes that ran since the last call, sorted."""
+
+    def take() -> str:
+        log = tmp_path / "log"
+        text = "".join(sorted(log.read_text().split())) if log.exists() else ""
+        log.unlink(missing_ok=True)
+        return text
+
+    return take
+
+
+def test_runs_all_once_then_nothing(run: Run, ran: Callable[[], str]) -> None:
+    assert run()["d"].facts == {"total": 2}
+    assert ran() == "abcd"
+    assert run()["d"].facts == {"total": 2}
+    assert ran() == ""
+
+
+def test_changes_rerun_what_depends_on_them_alone(run: Run, ran: Callable[[], str], source: Path) -> None:
+    run()
+    ran()
+    run(c={"value": 5})
+    assert ran() == "cd"
+    source.write_text("7")
+    run(c={"value": 5})
+    assert ran() == "abcd"
+
+
+def test_touching_a_source_without_changing_it_reruns_nothing(run: Run, ran: Callable[[], str], source: Path) -> None:
+    run()
+    ran()
+    os.utime(source, (0, 0))
+    run()
+    assert ran() == ""
+
+
+def test_a_deleted_output_is_rebuilt_and_nothing_else(run: Run, ran: Callable[[], str], tmp_path: Path) -> None:
+    run()
+    ran()
+    next((tmp_path / "store" / "b").rglob("number.txt")).unlink()
+    run()
+    assert ran() == "b"
+
+
+def test_from_a_step_reruns_it_and_what_follows(run: Run, ran: Callable[[], str]) -> None:
+    run()
+    ran()
+    run(start="c")
+    assert ran() == "cd"
+    run(force=True)
+    assert ran() == "abcd"
+
+
+def test_a_failing_step_keeps_what_was_done(run: Run, ran: Callable[[], str], tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="told to fail"):
+        run(d={"does": "fail"})
+    ran()
+    assert not list((tmp_path / "store" / "d").glob("*"))
+    run()
+    assert ran() == "d"
+
+
+def test_a_bug_and_a_killed_process_become_step_errors(run: Run) -> None:
+    with pytest.raises(StepError, match="a bug"):
+        run(b={"does": "bug"})
+    with pytest.raises(StepError, match="killed"):
+        run(b={"does": "die"})
+
+
+def test_plan_says_why(tmp_path: Path, source: Path, run: Run) -> None:
+    run()
+    store = Store(tmp_path / "store")
+
+    def reasons(**changes: dict[str, object]) -> dict[str, str | None]:
+        return {p.node.label: p.reason for p in plan(chain(source, tmp_path / "log", **changes), store)}
+
+    assert set(reasons().values()) == {None}
+    changed = reasons(b={"value": 1})
+    assert changed["a"] is None and changed["c"] is None
+    assert "changed" in (changed["b"] or "")
+
+
+def test_two_runs_do_not_share_a_folder(tmp_path: Path) -> None:
+    with locked(tmp_path / "out"), pytest.raises(UnavailableError, match="another run"), locked(tmp_path / "out"):
+        pass
+
+
+def test_kill_9_leaves_nothing_half_made_and_no_process_behind(tmp_path: Path, source: Path, run: Run) -> None:
+    script = (
+        "from pathlib import Path; from flows.execute import *; from tests.flows.toy import chain\n"
+        f"p = Path({str(tmp_path)!r}); s = Store(p / 'store')\n"
+        "execute(plan(chain(p / 'source.txt', p / 'log', b={'does': 'hang'}), s), s, jobs=1, watch=lambda *_: None)\n"
+    )
+    child = subprocess.Popen([sys.executable, "-c", script], cwd=ROOT)
+    log = tmp_path / "log"
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline and (not log.exists() or "b" not in log.read_text()):
+        time.sleep(0.05)
+    child.send_signal(signal.SIGKILL)
+    child.wait()
+    store = Store(tmp_path / "store")
+    kept = {p.node.label: p.reason for p in plan(chain(source, log), store)}
+    assert kept["a"] is None and kept["b"] is not None
+    assert run()["d"].facts == {"total": 2}
+    while time.monotonic() < deadline and _hangs(str(tmp_path)):
+        time.sleep(0.1)
+    assert not _hangs(str(tmp_path))
+
+
+def _hangs(folder: str) -> bool:
+    """Whether a process still has a file or argument in `folder`."""
+    me = str(os.getpid())
+    for process in Path("/proc").glob("[0-9]*"):
+        try:
+            if process.name != me and folder in (process / "cmdline").read_text():
+                return True
+        except OSError:
+            continue
+    return False

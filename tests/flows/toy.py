@@ -1,0 +1,57 @@
+"""A toy recipe for tests of planning and execution; steps count their runs in a file."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+from typing import Literal
+
+from flows.recipe import Node, Output
+from pipeline.errors import DataError
+from pipeline.step import Done, Inputs, Params, Report, Step
+
+
+class ToyParams(Params):
+    """What the toy does: nothing, fail, die, hang or fill the disk; `log` counts its runs."""
+
+    log: Path
+    name: str
+    does: Literal["work", "fail", "bug", "die", "hang"] = "work"
+    value: int = 0
+
+
+def toy(inputs: Inputs, params: ToyParams, out: Path, report: Report) -> Done:
+    """Write the sum of all inputs and the value."""
+    with open(params.log, "a") as file:
+        file.write(params.name + "\n")
+    total = params.value + sum(int(path.read_text()) for path in inputs.values())
+    (out / "number.txt").write_text(str(total))
+    if params.does == "fail":
+        raise DataError("toy", "was told to fail", "Tell it otherwise")
+    if params.does == "bug":
+        raise ZeroDivisionError("a bug")
+    if params.does == "die":
+        os.kill(os.getpid(), signal.SIGKILL)
+    if params.does == "hang":
+        time.sleep(60)
+    report(1.0, "done")
+    return Done({"number": out / "number.txt"}, {"total": total})
+
+
+TOY = Step("toy", 1, toy, ToyParams)
+
+
+def chain(source: Path, log: Path, **changes: dict[str, object]) -> list[Node]:
+    """source -> a -> b -> d, a -> c -> d; `changes` by node name."""
+
+    def node(name: str, inputs: dict[str, Path | Output]) -> Node:
+        return Node(name, Step(name, 1, toy, ToyParams), ToyParams(log=log, name=name, **changes.get(name, {})), inputs)  # type: ignore[arg-type]
+
+    return [
+        node("a", {"source": source}),
+        node("b", {"a": Output("a", "number")}),
+        node("c", {"a": Output("a", "number")}),
+        node("d", {"b": Output("b", "number"), "c": Output("c", "number")}),
+    ]

@@ -1,0 +1,118 @@
+"""Gazebo's own readers and physics take what the export writes, and refuse what is broken."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from pipeline.io import crs
+from pipeline.types import Frame
+from tests.gazebo.checker import Refused, check_world
+from tests.pipeline import made_up
+
+BOX = 0.2  # half the edge of the dropped box, metres
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Path:
+    return made_up.world(tmp_path).files["world"] / "street.sdf"
+
+
+def test_every_mesh_and_texture_loads(world: Path) -> None:
+    seen = check_world(world, (0, 0, 2))
+    roles = {Path(mesh["file"]).name: mesh["role"] for mesh in seen["meshes"]}
+    assert roles == {
+        "terrain.obj": "visual",
+        "building.obj": "visual",
+        "collision.obj": "collision",
+        "terrain.dae": "spare",
+        "building.dae": "spare",
+    }
+    for mesh in seen["meshes"]:
+        group = Path(mesh["file"]).stem
+        if group == "collision":
+            continue
+        assert mesh["textures"] == [f"{group}_0.png", f"{group}_1.png"]
+        low, high = ((-10, -10), (10, 10)) if group == "terrain" else ((4, 2, -0.5), (7, 4, 4.5))
+        assert mesh["low"][: len(low)] == pytest.approx(low, abs=1e-3)
+        assert mesh["high"][: len(high)] == pytest.approx(high, abs=1e-3)
+
+
+def test_a_box_comes_to_rest_on_the_ground(world: Path) -> None:
+    seen = check_world(world, (-4.7, 0.3, 1.5))  # over a hollow
+    x, y, z = seen["rest"]
+    ground = made_up.height(x, y)
+    assert seen["speed"] < 0.05
+    assert ground + BOX - 0.05 < z < ground + BOX + 0.1
+
+
+def test_a_box_comes_to_rest_on_the_roof(world: Path) -> None:
+    x, y = made_up.HOUSE
+    assert check_world(world, (x + 1.5, y + 1, 6))["rest"] == pytest.approx([x + 1.5, y + 1, 4.5 + BOX], abs=0.02)
+
+
+def test_positions_in_gazebo_are_positions_on_the_map(world: Path) -> None:
+    place = check_world(world, (0, 0, 2))["spherical"]
+    assert [place["latitude"], place["longitude"]] == pytest.approx(crs.to_wgs84(made_up.UTM)[:2], abs=1e-8)
+    there = crs.to_wgs84(made_up.UTM, (0, 100, 0))
+    assert place["at_y_100"] == pytest.approx(there[:2], abs=1e-6)  # a decimetre: the grid's scale is not quite 1
+
+
+def test_a_tile_away_from_the_worlds_origin(tmp_path: Path) -> None:
+    x, y, z = made_up.UTM.origin
+    world = made_up.world(tmp_path, world_origin=(x - 100, y, z - 20)).files["world"] / "street.sdf"
+    rest = check_world(world, (100 + made_up.HOUSE[0] + 1.5, made_up.HOUSE[1] + 1, 26))["rest"]
+    assert rest[2] == pytest.approx(20 + 4.5 + BOX, abs=0.02)
+
+
+def test_a_split_local_world_with_collada_visuals(tmp_path: Path) -> None:
+    done = made_up.world(tmp_path, frame=Frame(), obj=False, max_visual_triangles=1000)
+    seen = check_world(done.files["world"] / "street.sdf", (0, 0, 2))
+    assert seen["spherical"] is None
+    assert sum(mesh["triangles"] for mesh in seen["meshes"] if "terrain" in mesh["file"]) == 3200
+
+
+def _edit(path: Path, old: str, new: str) -> None:
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+
+
+def test_a_missing_texture_is_refused(world: Path) -> None:
+    (world.parent / "models/street/meshes/terrain_1.png").unlink()
+    with pytest.raises(Refused, match="terrain_1"):
+        check_world(world, (0, 0, 2))
+
+
+def test_a_missing_or_broken_mesh_is_refused(world: Path) -> None:
+    meshes = world.parent / "models/street/meshes"
+    whole = (meshes / "building.dae").read_text()
+    (meshes / "building.dae").write_text(whole[: len(whole) // 2])
+    with pytest.raises(Refused, match=r"building\.dae"):
+        check_world(world, (0, 0, 2))
+    (meshes / "building.obj").unlink()
+    with pytest.raises(Refused, match=r"building\.obj is missing"):
+        check_world(world, (0, 0, 2))
+
+
+def test_a_dropped_triangle_is_refused(world: Path) -> None:
+    path = world.parent / "models/street/meshes/terrain.obj"
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join(lines[:-1]) + "\n")
+    with pytest.raises(Refused, match="3199 triangles where 3200 are expected"):
+        check_world(world, (0, 0, 2))
+
+
+def test_unknown_elements_are_refused(world: Path) -> None:
+    _edit(world, "<gravity>", "<gravty>1</gravty><gravity>")
+    with pytest.raises(Refused, match="gravty"):
+        check_world(world, (0, 0, 2))
+
+
+def test_a_collision_mesh_that_physics_would_ignore_is_refused(world: Path) -> None:
+    path = world.parent / "models/street/meshes/collision.obj"
+    lines = [line for line in path.read_text().splitlines() if not line.startswith("vn ")]
+    path.write_text("\n".join(" ".join(p.split("//")[0] for p in line.split(" ")) for line in lines) + "\n")
+    with pytest.raises(Refused, match="normal count"):
+        check_world(world, (0, 0, 2))

@@ -1,0 +1,135 @@
+"""COLMAP models: text and binary give the same tile, and points land on their observations."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from pipeline.cameras import project
+from pipeline.errors import InputError, SettingError
+from pipeline.io import clouds
+from pipeline.io.colmap import camera_of, import_colmap
+from pipeline.io.tile import read_tile
+
+pycolmap = pytest.importorskip("pycolmap")
+
+CAMERAS = {
+    "SIMPLE_PINHOLE": [500, 320.5, 240],
+    "PINHOLE": [500, 510, 320.5, 240],
+    "SIMPLE_RADIAL": [500, 320.5, 240, -0.05],
+    "RADIAL": [500, 320.5, 240, -0.05, 0.01],
+    "OPENCV": [500, 510, 320.5, 240, -0.05, 0.01, 0.001, -0.002],
+    "FULL_OPENCV": [500, 510, 320.5, 240, -0.05, 0.01, 0.001, -0.002, 0.003, 0.01, 0.002, 0.001],
+    "SIMPLE_FISHEYE": [300, 320.5, 240],
+    "FISHEYE": [300, 310, 320.5, 240],
+    "SIMPLE_RADIAL_FISHEYE": [300, 320.5, 240, 0.01],
+    "RADIAL_FISHEYE": [300, 320.5, 240, 0.01, -0.002],
+    "OPENCV_FISHEYE": [300, 310, 320.5, 240, 0.01, -0.002, 0.001, 0.0005],
+    "EQUIRECTANGULAR": [640, 480],
+}
+
+
+def make_model(folder: Path, kinds: list[str], n: int = 40) -> tuple[object, dict[str, np.ndarray]]:
+    """A reconstruction with a camera and a photo of each kind, and COLMAP's own projections of its points."""
+    rng = np.random.default_rng(1)
+    model = pycolmap.Reconstruction()
+    points = rng.uniform([97, 48, 4], [103, 52, 9], (n, 3))
+    for point in points:
+        model.add_point3D(point, pycolmap.Track(), rng.integers(0, 256, 3).astype(np.uint8))
+    pixels = {}
+    (folder / "images" / "cam").mkdir(parents=True)
+    for i, kind in enumerate(kinds, start=1):
+        camera = pycolmap.Camera(camera_id=i, model=kind, width=640, height=480, params=CAMERAS[kind])
+        model.add_camera_with_trivial_rig(camera)
+        image = pycolmap.Image(name=f"cam/{i:03d}.png", camera_id=i, image_id=i)
+        turn = pycolmap.Rotation3d(np.array([0.02 * i, -0.1, 0.05]))
+        centre = np.array([100.0 + 0.3 * i, 50.1, 0.2])
+        pose = pycolmap.Rigid3d(turn, -turn.matrix() @ centre)
+        model.add_image_with_trivial_frame(image, pose)
+        local = points @ pose.rotation.matrix().T + pose.translation
+        pixels[f"cam/{i:03d}"] = np.array([camera.img_from_cam(point) for point in local])
+        cv2.imwrite(str(folder / "images" / f"cam/{i:03d}.png"), np.full((480, 640, 3), i, np.uint8))
+    for form in ("bin", "txt"):
+        (folder / form).mkdir()
+    model.write_binary(folder / "bin")
+    model.write_text(folder / "txt")
+    return model, pixels
+
+
+@pytest.mark.parametrize("form", ["bin", "txt"])
+def test_points_project_onto_their_observations(tmp_path: Path, form: str) -> None:
+    model, pixels = make_model(tmp_path, list(CAMERAS))
+    tile = read_tile(import_colmap(tmp_path / form, tmp_path / "images", tmp_path / "tile"))
+    points = tile.frame.to_local([point.xyz for _, point in sorted(model.points3D.items())])
+    assert len(tile.views) == len(CAMERAS)
+    for view in tile.views:
+        local = (points - view.centre) @ view.T_world_cam[:3, :3]
+        uv, _ = project(view.camera, local)
+        expected = pixels[view.name.removeprefix("photos/")] - 0.5  # centre of the top left pixel at (0, 0)
+        assert np.abs(uv - expected).max() < 1e-3, view.camera
+
+
+def test_text_and_binary_give_the_same_tile(tmp_path: Path) -> None:
+    make_model(tmp_path, ["OPENCV", "PINHOLE"])
+    tiles = [import_colmap(tmp_path / f, tmp_path / "images", tmp_path / f"t_{f}", name="t") for f in ("bin", "txt")]
+    assert tiles[0].read_text() == tiles[1].read_text()
+    first, second = (read_tile(tile) for tile in tiles)
+    a, b = (clouds.read(tile.clouds[0], tile.frame) for tile in (first, second))
+    assert np.array_equal(a.xyz, b.xyz) and np.array_equal(a.rgb, b.rgb)
+
+
+def test_sparse_points_keep_place_and_colour(tmp_path: Path) -> None:
+    model, _ = make_model(tmp_path, ["PINHOLE"])
+    tile = read_tile(import_colmap(tmp_path / "bin", tmp_path / "images", tmp_path / "tile"))
+    cloud = clouds.read(tile.clouds[0], tile.frame)
+    points = [point for _, point in sorted(model.points3D.items())]
+    assert np.abs(tile.frame.to_crs(cloud.xyz) - [p.xyz for p in points]).max() < 1e-3
+    assert np.array_equal(cloud.rgb, [p.color for p in points])
+
+
+def test_up_and_scale_turn_photos_and_points_together(tmp_path: Path) -> None:
+    make_model(tmp_path, ["PINHOLE"])
+    plain = read_tile(import_colmap(tmp_path / "bin", tmp_path / "images", tmp_path / "a"))
+    turned = read_tile(import_colmap(tmp_path / "bin", tmp_path / "images", tmp_path / "b", up="photos", scale=2.0))
+    up = -turned.views[0].T_world_cam[:3, 1]
+    assert np.allclose(up, [0, 0, 1], atol=1e-6)
+    distances = [
+        np.linalg.norm(clouds.read(tile.clouds[0], tile.frame).xyz - tile.views[0].centre, axis=1)
+        for tile in (plain, turned)
+    ]
+    assert np.allclose(2 * distances[0], distances[1], atol=5e-3)
+
+
+def test_a_cloud_of_its_own_is_taken(tmp_path: Path) -> None:
+    make_model(tmp_path, ["PINHOLE"])
+    first = import_colmap(tmp_path / "bin", tmp_path / "images", tmp_path / "a")
+    tile = read_tile(
+        import_colmap(tmp_path / "bin", tmp_path / "images", tmp_path / "b", cloud=first.parent / "cloud.laz")
+    )
+    assert tile.clouds[0].read_bytes() == (first.parent / "cloud.laz").read_bytes()
+    with pytest.raises(SettingError, match="Align model and cloud first"):
+        import_colmap(tmp_path / "bin", tmp_path / "images", tmp_path / "c", cloud=tile.clouds[0], scale=2.0)
+
+
+def test_an_unsupported_camera_model_is_named_with_a_remedy(tmp_path: Path) -> None:
+    camera = pycolmap.Camera.create_from_model_name(3, "FOV", 500.0, 640, 480)
+    with pytest.raises(InputError, match=r"model_folder: camera 3 has the model FOV.*image_undistorter"):
+        camera_of(Path("model_folder"), camera)
+
+
+def test_no_model_a_damaged_one_and_a_missing_photo_leave_nothing(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match=r"empty: holds no COLMAP model.*sparse/0"):
+        import_colmap(tmp_path / "empty", tmp_path, tmp_path / "tile")
+    make_model(tmp_path, ["PINHOLE", "OPENCV"])
+    (tmp_path / "images/cam/002.png").unlink()
+    with pytest.raises(InputError, match=r"002\.png: is missing"):
+        import_colmap(tmp_path / "bin", tmp_path / "images", tmp_path / "tile")
+    cameras = tmp_path / "bin" / "cameras.bin"
+    cameras.write_bytes(cameras.read_bytes()[:20])
+    with pytest.raises(InputError, match="is no readable COLMAP model"):
+        import_colmap(tmp_path / "bin", tmp_path / "images", tmp_path / "tile")
+    assert not (tmp_path / "tile").exists() and not list(tmp_path.glob(".tile*"))

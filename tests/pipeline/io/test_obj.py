@@ -1,0 +1,58 @@
+"""OBJ: what a reader gets is what was written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.io import obj, textured
+from tests.pipeline import made_up
+
+
+@pytest.mark.parametrize("make", [made_up.ground, made_up.house])
+def test_triangles_uv_and_pages_survive(tmp_path: Path, make) -> None:
+    import trimesh
+
+    mesh = make()
+    surface = textured.read(made_up.textured(tmp_path / "in", mesh))
+    obj.write(tmp_path / "a.obj", surface, ["m_0", "m_1"], "a.mtl")
+    obj.write_mtl(tmp_path / "a.mtl", {"m_0": "m_0.png", "m_1": "m_1.png"})
+    for page in (0, 1):
+        (tmp_path / f"m_{page}.png").write_bytes(surface.pages[page].read_bytes())
+    read = trimesh.load(tmp_path / "a.obj", process=False, force="scene")
+    for page, (corners, uv) in made_up.by_page(mesh).items():
+        part = next(g for g in read.geometry.values() if g.visual.material.name == f"m_{page}")
+        np.testing.assert_allclose(part.vertices[part.faces], corners, atol=1e-4)
+        np.testing.assert_allclose(part.visual.uv[part.faces], uv, atol=1e-6)
+        assert part.visual.material.image.size == (256, 256)
+
+
+def test_texture_coordinates_are_said_once_and_v_goes_up(tmp_path: Path) -> None:
+    surface = textured.read(made_up.textured(tmp_path / "in", made_up.house()))
+    obj.write(tmp_path / "a.obj", surface, ["m_0", "m_1"], "a.mtl")
+    lines = (tmp_path / "a.obj").read_text().splitlines()
+    vt = [line for line in lines if line.startswith("vt ")]
+    assert len(vt) == len(set(vt)) == 10
+    v = [tuple(map(float, line.split()[1:])) for line in lines if line.startswith("v ")]
+    first = next(line for line in lines if line.startswith("f ")).split()[1:]  # a wall: two feet and a top
+    for corner in first:
+        at, t, _ = (int(index) - 1 for index in corner.split("/"))
+        assert (v[at][2] > 0) == (float(vt[t].split()[2]) == 1.0)
+
+
+def test_normals_point_outwards(tmp_path: Path) -> None:
+    surface = textured.read(made_up.textured(tmp_path / "in", made_up.ground()))
+    assert surface.normal[:, 2].min() > 0.9
+    np.testing.assert_allclose(np.linalg.norm(surface.normal, axis=1), 1, atol=1e-5)
+
+
+def test_parts_are_small_and_lose_nothing(tmp_path: Path) -> None:
+    mesh = made_up.ground()
+    parts = textured.read(made_up.textured(tmp_path / "in", mesh)).parts(1000)
+    assert max(map(len, parts)) <= 1000
+    assert sum(map(len, parts)) == len(mesh)
+    assert sum(part.mesh.face_area.sum() for part in parts) == pytest.approx(mesh.face_area.sum(), rel=1e-5)
+    spans = [np.ptp(part.mesh.vertices[:, :2], axis=0).max() for part in parts]
+    assert max(spans) < 15  # of 20 m: compact, not scattered over the tile

@@ -1,0 +1,60 @@
+"""SDF: the world stands where the CRS says."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from pipeline.io import sdf
+from pipeline.types import Frame
+from tests.pipeline import made_up
+
+
+def _world(path: Path, place: sdf.Georeference | None, offset: tuple[float, float, float] = (0.0, 0.0, 0.0)):
+    sdf.write_world(path, "street", place, offset)
+    root = ET.parse(path).getroot()
+    assert root.get("version") == "1.9"
+    return root.find("world")
+
+
+def test_spherical_coordinates_are_those_of_the_origin(tmp_path: Path) -> None:
+    from pyproj import Transformer
+
+    world = _world(tmp_path / "a.sdf", sdf.Georeference.of(made_up.UTM))
+    x, y, z = made_up.UTM.origin
+    lon, lat = Transformer.from_crs("EPSG:32632", "EPSG:4326", always_xy=True).transform(x, y)
+    place = world.find("spherical_coordinates")
+    assert float(place.findtext("latitude_deg")) == pytest.approx(lat, abs=1e-8)
+    assert float(place.findtext("longitude_deg")) == pytest.approx(lon, abs=1e-8)
+    assert float(place.findtext("elevation")) == z
+    assert place.findtext("surface_model") == "EARTH_WGS84"
+    assert place.findtext("world_frame_orientation") == "ENU"
+
+
+def test_heading_is_minus_the_convergence(tmp_path: Path) -> None:
+    # east of the central meridian, north of the equator, grid north lies east of true north:
+    # the world is turned clockwise, which SDF counts as negative
+    assert sdf.Georeference.of(made_up.UTM).heading == pytest.approx(-1.90, abs=0.01)
+    west = replace(made_up.UTM, origin=(310_000.0, 5_335_000.0, 500.0))
+    assert sdf.Georeference.of(west).heading == pytest.approx(1.90, abs=0.01)
+
+
+def test_feet_are_brought_to_metres() -> None:
+    feet = Frame("EPSG:2263", (300_000.0, 60_000.0, 30.0), 1200 / 3937)  # New York, US survey feet
+    place = sdf.Georeference.of(feet)
+    assert (place.latitude, place.longitude) == pytest.approx((40.7, -74.0), abs=0.1)
+    assert place.elevation == pytest.approx(30.0)
+
+
+def test_a_local_frame_has_no_georeference(tmp_path: Path) -> None:
+    assert sdf.Georeference.of(Frame()) is None
+    assert _world(tmp_path / "a.sdf", None).find("spherical_coordinates") is None
+
+
+def test_the_offset_is_in_the_pose(tmp_path: Path) -> None:
+    world = _world(tmp_path / "a.sdf", None, (100.25, -3.0, 1e-3))
+    assert world.findtext("include/uri") == "model://street"
+    assert world.findtext("include/pose") == "100.25 -3 0.001 0 0 0"

@@ -1,0 +1,158 @@
+"""`tile.toml`: what is read from it, and what is said about bad ones."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tomli_w
+
+from pipeline.errors import InputError
+from pipeline.io import clouds, las
+from pipeline.io.tile import read_tile, write_tile
+from pipeline.types import Camera, Frame, PointCloud
+
+FT_CRS = "EPSG:2994"  # Oregon Lambert, international feet
+
+
+def cloud(path: Path, crs: str = "EPSG:32632", unit: float = 1.0, n: int = 100) -> Path:
+    frame = Frame(crs, (500_000.0, 5_400_000.0, 100.0), unit)
+    xyz = np.random.default_rng(0).uniform(0, 20, (n, 3)).astype(np.float32)
+    las.write(path, PointCloud(frame, xyz, label=np.full(n, 2, np.uint8)))
+    return path
+
+
+def body(folder: Path, **changes: object) -> dict:
+    """A tile that is right, but for `changes`; `photo` changes its photo, `camera` its camera."""
+    cloud(folder / "cloud.laz")
+    camera = {"id": "front", "model": "pinhole", "size": [64, 48], "focal": [50.0, 50.0], "centre": [31.5, 23.5]}
+    photo = {
+        "file": "1.jpg",
+        "camera": "front",
+        "position": [500_010.0, 5_400_010.0, 102.0],
+        "rotation": [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
+    }
+    photo |= changes.pop("photo", {})  # type: ignore[arg-type]
+    camera |= changes.pop("camera", {})  # type: ignore[arg-type]
+    return {"name": "t", "clouds": ["cloud.laz"], "cameras": [camera], "photos": [photo]} | changes
+
+
+def save(folder: Path, content: dict) -> Path:
+    (folder / "tile.toml").write_text(tomli_w.dumps(content))
+    return folder
+
+
+def test_a_tile_says_what_was_written_and_photos_may_be_missing_still(tmp_path: Path) -> None:
+    tile = read_tile(save(tmp_path, body(tmp_path)))
+    assert (tile.name, tile.frame.crs, tile.frame.unit) == ("t", read_tile(tmp_path).frame.crs, 1.0)
+    assert np.allclose(tile.frame.to_crs(tile.views[0].centre), [500_010, 5_400_010, 102])
+    assert not tile.views[0].photo.exists()
+    xyz = clouds.read(tile.clouds[0], tile.frame).xyz
+    assert np.abs(xyz).max() < 30  # local: near the origin
+
+
+def test_what_write_tile_writes_read_tile_reads(tmp_path: Path) -> None:
+    cloud(tmp_path / "cloud.laz")
+    (tmp_path / "path.csv").write_text("time,x,y,z\n2,500001,5400000,101\n1,500000,5400000,101\n")
+    camera = Camera("opencv", 64, 48, 50.0, 51.0, 31.0, 23.0, (0.1, 0.0, 0.0, 0.0))
+    rotation = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+    position = np.array([500_001.0, 5_400_002.0, 103.0])
+    photo = {"file": "a/1.jpg", "camera": "c", "position": position, "rotation": rotation, "time": 3.0}
+    written = write_tile(
+        tmp_path,
+        name="t",
+        crs="EPSG:32632",
+        clouds=["cloud.laz"],
+        cameras={"c": camera},
+        photos=[photo],
+        trajectory="path.csv",
+    )
+    tile = read_tile(written)
+    view = tile.views[0]
+    assert (view.camera, view.name, view.time, view.mask) == (camera, "a/1", 3.0, None)
+    assert np.allclose(view.T_world_cam[:3, :3], rotation)
+    assert np.allclose(tile.frame.to_crs(view.centre), position)
+    assert tile.trajectory is not None and tile.trajectory.times.tolist() == [1, 2]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"photo": {"position": [float("nan"), 0, 0]}}, r"photo 0 \(1\.jpg\): its pose holds NaN.*leave the photo out"),
+        ({"photo": {"rotation": [[2, 0, 0], [0, 1, 0], [0, 0, 1]]}}, r"1\.jpg.*is no rotation.*camera-to-world"),
+        ({"photo": {"rotation": [[-1, 0, 0], [0, 1, 0], [0, 0, 1]]}}, r"1\.jpg.*is no rotation.*determinant"),
+        ({"photo": {"camera": "back"}}, r"1\.jpg.*there is no camera `back`.*Cameras are: front"),
+        ({"photo": {"postion": [0, 0, 0]}}, r"field `photos\.0\.postion`.*docs/formats\.md"),
+        ({"camera": {"model": "pinhole", "distortion": [0.1]}}, r"camera `front`: 1 distortion coef.*takes 0"),
+        ({"camera": {"focal": [0.0, 0.0]}}, r"camera `front`: focal .* is not positive.*fx and fy"),
+        ({"camera": {"model": "fish"}}, r"field `cameras\.0\.model`"),
+        ({"units": "yards"}, r"field `units`.*docs/formats\.md"),
+        ({"crs": "EPSG:99999"}, r"EPSG:99999.* is not a CRS.*EPSG:32633"),
+        ({"crs": "EPSG:2154"}, r"cloud\.laz: is in EPSG:32632, but tile\.toml says EPSG:2154.*Mend `crs`"),
+        ({"crs": "EPSG:4326", "clouds": ["bare.laz"]}, r"is not projected.*UTM"),
+        ({"clouds": ["none.laz"]}, r"none\.laz: is missing.*Put it there, or mend the name"),
+        ({"clouds": ["bare.laz"]}, r'bare\.laz: has no CRS, and the tile names none.*crs = "local"'),
+        ({"clouds": ["cloud.laz", "lambert.laz"]}, r"lambert\.laz: is in EPSG:2154, but cloud\.laz is in EPSG:32632"),
+        ({"clouds": ["cloud.xyz"]}, r"cloud\.xyz: is no known cloud format.*LAS, LAZ, COPC or PLY"),
+        ({"clouds": ["text.laz"]}, r"text\.laz: is no readable LAS file.*again"),
+        ({"trajectory": "bad.csv"}, r"bad\.csv: is no trajectory.*time,x,y,z"),
+    ],
+)
+def test_bad_tiles_are_refused_by_name(tmp_path: Path, changes: dict, message: str) -> None:
+    cloud(tmp_path / "bare.laz", crs="local")
+    cloud(tmp_path / "lambert.laz", crs="EPSG:2154")
+    (tmp_path / "cloud.xyz").write_text("0 0 0")
+    (tmp_path / "text.laz").write_text("no cloud")
+    (tmp_path / "bad.csv").write_text("time,x,y,z\n1,2\n")
+    with pytest.raises(InputError, match=message):
+        read_tile(save(tmp_path, body(tmp_path, **changes)))
+
+
+def test_no_tile_and_bad_toml(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"tile\.toml: there is no tile here.*scan2sim import"):
+        read_tile(tmp_path)
+    (tmp_path / "tile.toml").write_text("name = \n")
+    with pytest.raises(InputError, match=r"tile\.toml: is not valid TOML \(.*line 1.*Mend the line"):
+        read_tile(tmp_path)
+
+
+@pytest.mark.parametrize("kept", [0.3, 0.6, 0.95])
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_a_truncated_cloud_is_named_before_or_while_it_is_read(tmp_path: Path, suffix: str, kept: float) -> None:
+    path = cloud(tmp_path / f"cloud{suffix}", n=20_000)
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * kept)])
+    (tmp_path / "tile.toml").write_text(f'name = "t"\nclouds = ["{path.name}"]\n')
+    with pytest.raises(InputError, match=rf"cloud{suffix}: is .*again"):
+        clouds.read(path, read_tile(tmp_path).frame)
+
+
+def test_feet_become_metres(tmp_path: Path) -> None:
+    frame = Frame(FT_CRS, (200_000.0, 250_000.0, 100.0), 0.3048)
+    xyz = np.array([[0, 0, 0], [30.48, 60.96, 3.048]], np.float32)
+    las.write(tmp_path / "feet.laz", PointCloud(frame, xyz))
+    (tmp_path / "tile.toml").write_text('name = "t"\nclouds = ["feet.laz"]\n')
+    tile = read_tile(tmp_path)
+    read = clouds.read(tile.clouds[0], tile.frame).xyz
+    assert tile.frame.unit == pytest.approx(0.3048)
+    assert np.allclose(read[1] - read[0], [30.48, 60.96, 3.048], atol=2e-3)
+    header = clouds.read_header(tile.clouds[0])
+    assert np.allclose(header.high - header.low, [100, 200, 10], atol=0.01)  # the file itself is in feet
+
+
+def test_a_local_tile_may_be_in_feet(tmp_path: Path) -> None:
+    cloud(tmp_path / "bare.las", crs="local")
+    (tmp_path / "tile.toml").write_text('name = "t"\ncrs = "local"\nunits = "ft"\nclouds = ["bare.las"]\n')
+    tile = read_tile(tmp_path)
+    assert tile.frame.unit == 0.3048
+    assert np.ptp(clouds.read(tile.clouds[0], tile.frame).xyz[:, 0]) < 20 * 0.31
+
+
+def test_a_real_survey_in_feet_has_metric_size(real_data: Path, tmp_path: Path) -> None:
+    (tmp_path / "autzen.laz").write_bytes((real_data / "las" / "autzen_trim.laz").read_bytes())
+    (tmp_path / "tile.toml").write_text('name = "autzen"\nclouds = ["autzen.laz"]\n')
+    tile = read_tile(tmp_path)
+    xyz = clouds.read(tile.clouds[0], tile.frame).xyz
+    assert tile.frame.unit == pytest.approx(0.3048)
+    assert np.allclose(np.ptp(xyz, axis=0)[:2], np.array([1178.46, 562.7]) * 0.3048, atol=0.5)

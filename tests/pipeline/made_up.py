@@ -1,0 +1,93 @@
+"""A made-up textured tile: bumpy ground (two pages) and a house (two pages)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from pipeline.step import Done, silent
+from pipeline.steps.collision import COLLISION, CollisionParams
+from pipeline.steps.export import EXPORT, ExportParams
+from pipeline.types import Frame, Mesh
+
+UTM = Frame("EPSG:32632", (690_000.0, 5_335_000.0, 500.0))
+HOUSE = (4.0, 2.0)  # its corner of least x and y; it measures 3 x 2 x 5 m
+
+
+def height(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Of the ground, metres."""
+    return 0.3 * np.sin(x / 3) * np.cos(y / 4)
+
+
+def ground(cells: int = 40, frame: Frame = UTM) -> Mesh:
+    """20 x 20 m around the origin; u follows x, v follows y; the east half lies on page 1."""
+    side = np.linspace(-10, 10, cells + 1)
+    x, y = np.meshgrid(side, side, indexing="ij")
+    vertices = np.stack([x, y, height(x, y)], axis=2).reshape(-1, 3).astype(np.float32)
+    i, j = np.meshgrid(np.arange(cells), np.arange(cells), indexing="ij")
+    a = (i * (cells + 1) + j).ravel()
+    b, c, d = a + cells + 1, a + cells + 2, a + 1
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]).astype(np.int32)
+    page = (vertices[faces][:, :, 0].mean(axis=1) > 0).astype(np.int16)
+    uv = np.stack([vertices[faces][..., 0] / 10 + np.where(page == 0, 1, 0)[:, None],
+                   vertices[faces][..., 1] / 20 + 0.5], axis=2)  # fmt: skip
+    return Mesh(frame, vertices, faces, uv=uv.astype(np.float32), page=page)
+
+
+def house(frame: Frame = UTM) -> Mesh:
+    """A box without a floor: walls on page 0 (v goes up), roof on page 1."""
+    x0, y0 = HOUSE
+    corners = [(x0, y0), (x0 + 3, y0), (x0 + 3, y0 + 2), (x0, y0 + 2)]
+    vertices = np.array([(x, y, z) for z in (-0.5, 4.5) for x, y in corners], np.float32)
+    faces, uv, page = [], [], []
+    for k in range(4):
+        m = (k + 1) % 4
+        faces += [(k, m, m + 4), (k, m + 4, k + 4)]
+        left, right = k / 4, (k + 1) / 4
+        uv += [[(left, 0), (right, 0), (right, 1)], [(left, 0), (right, 1), (left, 1)]]
+        page += [0, 0]
+    faces += [(4, 5, 6), (4, 6, 7)]
+    uv += [[(0, 0), (1, 0), (1, 1)], [(0, 0), (1, 1), (0, 1)]]
+    page += [1, 1]
+    return Mesh(frame, vertices, np.array(faces, np.int32), uv=np.array(uv, np.float32), page=np.array(page, np.int16))
+
+
+def picture(size: int = 256) -> np.ndarray:
+    """(size, size, 3) RGB: red top left, green top right, blue bottom left, white bottom right."""
+    image = np.empty((size, size, 3), np.uint8)
+    half = size // 2
+    image[:half, :half], image[:half, half:] = (220, 40, 40), (40, 200, 40)
+    image[half:, :half], image[half:, half:] = (40, 40, 220), (240, 240, 240)
+    return image
+
+
+def textured(folder: Path, mesh: Mesh) -> Path:
+    """Write a textured mesh as the `texture` step does."""
+    folder.mkdir(parents=True)
+    mesh.save(folder / "mesh.npz")
+    pages = 0 if mesh.page is None or not len(mesh) else int(mesh.page.max()) + 1
+    for page in range(pages):
+        cv2.imwrite(str(folder / f"page_{page}.png"), picture()[:, :, ::-1])
+        cv2.imwrite(str(folder / f"page_{page}_seen.png"), np.full((256, 256), 255, np.uint8))
+    return folder
+
+
+def world(folder: Path, frame: Frame = UTM, **params: object) -> Done:
+    """The made-up tile, collision made and exported below `folder`."""
+    meshes = {"terrain": ground(frame=frame), "building": house(frame)}
+    inputs = {group: textured(folder / group, mesh) for group, mesh in meshes.items()}
+    solid = folder / "collision"
+    solid.mkdir()
+    sources = {group: path / "mesh.npz" for group, path in inputs.items()}
+    made = COLLISION.run(sources, CollisionParams(triangles=1000), solid, silent)
+    out = folder / "export"
+    out.mkdir()
+    return EXPORT.run({**inputs, "collision": made.files["mesh"]}, ExportParams(name="street", **params), out, silent)
+
+
+def by_page(mesh: Mesh) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+    """Page to the corners (F, 3, 3) and texture coordinates (F, 3, 2) of its faces, in order."""
+    assert mesh.uv is not None and mesh.page is not None
+    return {int(p): (mesh.corners[mesh.page == p], mesh.uv[mesh.page == p]) for p in np.unique(mesh.page)}

@@ -1,0 +1,225 @@
+"""The geometry steps, each against what is known of a made-up cloud."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline import isolate
+from pipeline.classes import CODE
+from pipeline.errors import DataError, StepError
+from pipeline.io import las
+from pipeline.step import Done, Step, silent
+from pipeline.steps.decimate import DECIMATE, simplify
+from pipeline.steps.geometry import distances
+from pipeline.steps.ingest import INGEST
+from pipeline.steps.islands import ISLANDS
+from pipeline.steps.plants import PLANTS
+from pipeline.steps.poisson import POISSON, octree
+from pipeline.steps.split import SPLIT
+from pipeline.steps.trim import TRIM
+from pipeline.steps.voxel import VOXEL, sample
+from pipeline.types import Frame, Mesh, PointCloud, Trajectory
+
+FRAME = Frame("EPSG:32633", (500000.0, 5400000.0, 200.0))
+
+
+def go(step: Step, out: Path, inputs: dict[str, Path], **params: Any) -> Done:
+    out.mkdir(parents=True, exist_ok=True)
+    return step.run(inputs, step.params(**params), out, silent)
+
+
+def bumpy(n: int = 120_000, size: float = 12.0, seed: int = 0) -> PointCloud:
+    """A gently waving ground of `size` metres square, scanned with 5 mm of noise."""
+    random = np.random.default_rng(seed)
+    xy = random.uniform(-size / 2, size / 2, (n, 2))
+    z = 0.3 * np.sin(xy[:, 0]) * np.cos(xy[:, 1]) + random.normal(0, 0.005, n)
+    xyz = np.column_stack([xy, z]).astype(np.float32)
+    rgb = np.full((n, 3), (90, 100, 110), np.uint8)
+    return PointCloud(FRAME, xyz, rgb, label=np.full(n, CODE["road"], np.uint8))
+
+
+@pytest.fixture(scope="module")
+def ground(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Voxels and Poisson's mesh of the bumpy ground."""
+    out = tmp_path_factory.mktemp("ground")
+    bumpy().save(out / "cloud.npz")
+    cloud = go(VOXEL, out / "voxel", {"cloud": out / "cloud.npz"}).files["cloud"]
+    mesh = go(POISSON, out / "poisson", {"cloud": cloud}).files["mesh"]
+    return {"cloud": cloud, "mesh": mesh}
+
+
+def edges(mesh: Mesh) -> tuple[int, int]:
+    """Number of border edges, and of edges with more than two faces."""
+    pairs = np.sort(np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]]), axis=1)
+    _, counts = np.unique(pairs, axis=0, return_counts=True)
+    return int((counts == 1).sum()), int((counts > 2).sum())
+
+
+def test_ingest_keeps_millimetres_at_utm_coordinates(tmp_path: Path) -> None:
+    cloud = bumpy(5000)
+    las.write(tmp_path / "a.laz", cloud.take(slice(0, 3000)))
+    las.write(tmp_path / "b.laz", cloud.take(slice(3000, None)))
+    inputs = {"cloud.0": tmp_path / "a.laz", "cloud.1": tmp_path / "b.laz"}
+    done = go(INGEST, tmp_path / "out", inputs, crs=FRAME.crs, origin=FRAME.origin)
+    read = PointCloud.load(done.files["cloud"])
+    assert np.abs(read.xyz - cloud.xyz).max() < 0.002
+    assert read.rgb is not None and cloud.rgb is not None and (read.rgb == cloud.rgb).all()
+
+
+def test_ingest_refuses_fifty_points(tmp_path: Path) -> None:
+    las.write(tmp_path / "few.laz", bumpy(50))
+    with pytest.raises(DataError, match=r"few\.laz: only 50 points"):
+        go(INGEST, tmp_path / "out", {"cloud.0": tmp_path / "few.laz"}, crs=FRAME.crs, origin=FRAME.origin)
+
+
+def test_split_puts_signs_with_buildings_and_leaves_vehicles_out(tmp_path: Path) -> None:
+    cloud = bumpy(700)
+    names = ("road", "terrain", "building", "road_sign", "high_vegetation", "vehicle", "unclassified")
+    label = np.repeat([CODE[n] for n in names], 100).astype(np.uint8)
+    replace(cloud, label=label).save(tmp_path / "cloud.npz")
+    done = go(SPLIT, tmp_path / "out", {"cloud": tmp_path / "cloud.npz"})
+    assert done.facts["points"] == {"terrain": 200, "building": 200, "vegetation": 100, "rest": 200}
+
+
+def test_split_warns_of_an_empty_class_and_refuses_when_all_are(tmp_path: Path) -> None:
+    bumpy(300).save(tmp_path / "cloud.npz")
+    done = go(SPLIT, tmp_path / "out", {"cloud": tmp_path / "cloud.npz"})
+    assert any("building" in w for w in done.warnings)
+    replace(bumpy(300), label=np.full(300, CODE["vehicle"], np.uint8)).save(tmp_path / "cars.npz")
+    with pytest.raises(DataError, match="no point belongs to"):
+        go(SPLIT, tmp_path / "out2", {"cloud": tmp_path / "cars.npz"})
+
+
+def test_voxel_matches_a_plain_implementation() -> None:
+    cloud = bumpy(3000)
+    thin = sample(cloud, 0.5)
+    cells: dict[tuple[int, ...], list[int]] = {}
+    for i, key in enumerate(np.floor((cloud.xyz - cloud.xyz.min(axis=0)) / 0.5).astype(int).tolist()):
+        cells.setdefault(tuple(key), []).append(i)
+    expected = np.array([cloud.xyz[members].mean(axis=0) for members in cells.values()])
+    assert len(thin) == len(cells)
+    order, other = np.lexsort(thin.xyz.T), np.lexsort(expected.T)
+    assert np.abs(thin.xyz[order] - expected[other]).max() < 1e-3
+
+
+def test_normals_look_to_the_scanner_even_under_a_bridge(tmp_path: Path) -> None:
+    floor = bumpy(20_000)
+    ceiling = replace(floor, xyz=floor.xyz + np.float32([0, 0, 4]))
+    PointCloud.join([floor, ceiling]).save(tmp_path / "cloud.npz")
+    Trajectory(np.array([np.nan]), np.array([[0.0, 0.0, 2.0]])).save(tmp_path / "path.npz")
+    done = go(VOXEL, tmp_path / "out", {"cloud": tmp_path / "cloud.npz", "path": tmp_path / "path.npz"})
+    thin = PointCloud.load(done.files["cloud"])
+    assert thin.normal is not None
+    below = thin.xyz[:, 2] < 2
+    assert (thin.normal[below, 2] > 0).mean() > 0.999 and (thin.normal[~below, 2] < 0).mean() > 0.999
+
+
+def test_normals_of_an_airborne_cloud_look_up_and_out(tmp_path: Path) -> None:
+    random = np.random.default_rng(1)
+    wall = random.uniform(0, 1, (20_000, 3)) * (4, 0, 3)  # a wall to the south of its roof
+    roof = random.uniform(0, 1, (20_000, 3)) * (4, 4, 0) + (0, 0, 3)
+    xyz = np.concatenate([wall, roof]).astype(np.float32)
+    PointCloud(FRAME, xyz, label=np.full(len(xyz), 6, np.uint8)).save(tmp_path / "cloud.npz")
+    thin = PointCloud.load(go(VOXEL, tmp_path / "out", {"cloud": tmp_path / "cloud.npz"}).files["cloud"])
+    assert thin.normal is not None
+    on_roof = thin.xyz[:, 1] > 0.3
+    on_wall = (thin.xyz[:, 2] > 0.5) & (thin.xyz[:, 2] < 2.5)
+    assert (thin.normal[on_roof, 2] > 0.9).mean() > 0.99
+    assert (thin.normal[on_wall, 1] < -0.9).mean() > 0.95
+
+
+@pytest.mark.parametrize("length", [30.0, 100.0, 330.0, 1000.0])
+def test_octree_cell_is_the_same_at_any_length(length: float) -> None:
+    depth, scale = octree(length, 0.05)
+    assert scale >= 1.02
+    assert scale * length / 2**depth == pytest.approx(0.05)
+    assert octree(100.0, 0.05)[0] == 11
+
+
+def test_poisson_follows_the_ground(ground: dict[str, Path]) -> None:
+    mesh, cloud = Mesh.load(ground["mesh"]), PointCloud.load(ground["cloud"])
+    assert distances(cloud.xyz, mesh).mean() < 0.01
+
+
+def test_poisson_falls_back_when_the_child_dies(
+    ground: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = []
+    real = isolate.call
+
+    def flaky(*args: Any, threads: int | None = None, **kwargs: Any) -> Any:
+        calls.append(threads)
+        if len(calls) < 3:
+            raise StepError("poisson", "crashed (exit status -11)", "")
+        return real(*args, threads=threads, **kwargs)
+
+    monkeypatch.setattr(isolate, "call", flaky)
+    done = go(POISSON, tmp_path, {"cloud": ground["cloud"]}, depth=8)
+    assert calls == [None, 1, 1]
+    assert done.facts["depth"] == 7 and len(done.warnings) == 2
+
+
+def test_trim_removes_what_no_point_bears_out(ground: dict[str, Path], tmp_path: Path) -> None:
+    done = go(TRIM, tmp_path, ground, max_edge=0.25)
+    mesh, cloud = Mesh.load(done.files["mesh"]), PointCloud.load(ground["cloud"])
+    side = np.linalg.norm(mesh.corners - np.roll(mesh.corners, 1, axis=1), axis=2)
+    assert side.max() <= 0.25 * done.facts["widened"] + 1e-6
+    low, high = cloud.xyz.min(axis=0) - 0.3, cloud.xyz.max(axis=0) + 0.3
+    assert ((mesh.vertices >= low) & (mesh.vertices <= high)).all()
+    assert 12**2 <= mesh.face_area.sum() <= 12.5**2 * 1.03  # waves make it 2 to 3 % larger than its plan
+
+
+def test_islands_go_by_area(tmp_path: Path) -> None:
+    square = np.float32([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    faces = np.int32([[0, 1, 2], [0, 2, 3]])
+    vertices = np.concatenate([square, square * 0.5 + 5, square * 3 + 10])
+    Mesh(FRAME, vertices, np.concatenate([faces, faces + 4, faces + 8])).save(tmp_path / "mesh.npz")
+    done = go(ISLANDS, tmp_path / "out", {"mesh": tmp_path / "mesh.npz"}, min_area=0.5)
+    assert Mesh.load(done.files["mesh"]).face_area.sum() == pytest.approx(10.0)
+    assert done.facts["islands_removed"] == 1
+
+
+def test_decimate_keeps_the_border_and_turns_no_face_over(ground: dict[str, Path], tmp_path: Path) -> None:
+    trimmed = go(TRIM, tmp_path / "trim", ground, max_edge=0.5)
+    full = Mesh.load(trimmed.files["mesh"])
+    done = go(DECIMATE, tmp_path / "out", {"mesh": trimmed.files["mesh"]}, target=10_000)
+    small = Mesh.load(done.files["mesh"])
+    assert len(small) <= 10_000 and done.facts["border_kept"]
+    assert edges(small)[0] == edges(full)[0], "border edges are kept, and no new ones torn"
+    assert edges(small)[1] == 0
+    assert (small.face_normal[small.face_area > 1e-6, 2] > -0.01).all()
+    assert distances(full.vertices, small).mean() < 0.01
+
+
+def test_decimate_reaches_its_target_even_where_borders_are_long() -> None:
+    random = np.random.default_rng(0)
+    corners = random.uniform(0, 50, (30_000, 1, 3)) + random.uniform(-0.1, 0.1, (30_000, 3, 3))
+    mesh = Mesh(FRAME, corners.reshape(-1, 3).astype(np.float32), np.arange(90_000, dtype=np.int32).reshape(-1, 3))
+    assert len(simplify(mesh, 10_000)) == 30_000  # nothing but borders
+
+
+def test_plants_are_found_where_they_stand(tmp_path: Path) -> None:
+    random = np.random.default_rng(3)
+    trees = [(2.0, 3.0, 6.0, 1.5), (9.0, 3.0, 8.0, 2.0), (5.0, 10.0, 3.0, 1.0)]
+    points = []
+    for x, y, height, radius in trees:
+        ball = random.normal(size=(4000, 3))
+        ball *= radius / np.linalg.norm(ball, axis=1, keepdims=True)
+        points.append(ball + (x, y, height - radius))
+    xyz = np.concatenate(points).astype(np.float32)
+    PointCloud(FRAME, xyz).save(tmp_path / "v.npz")
+    flat = np.column_stack([random.uniform(0, 12, (5000, 2)), np.zeros(5000)]).astype(np.float32)
+    PointCloud(FRAME, flat).save(tmp_path / "t.npz")
+    done = go(PLANTS, tmp_path / "out", {"vegetation": tmp_path / "v.npz", "terrain": tmp_path / "t.npz"})
+    rows = np.loadtxt(done.files["csv"], delimiter=",", skiprows=1, ndmin=2)
+    assert len(rows) == 3
+    rows[:, :3] = FRAME.to_local(rows[:, :3])
+    for x, y, height, radius in trees:
+        found = rows[np.hypot(rows[:, 0] - x, rows[:, 1] - y).argmin()]
+        assert np.hypot(found[0] - x, found[1] - y) < 0.6
+        assert abs(found[2]) < 0.1 and abs(found[3] - height) < 0.2 and abs(found[4] - radius) < 0.4

@@ -1,0 +1,67 @@
+"""Collision: light, close to what is seen, and honest about it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.errors import DataError
+from pipeline.step import Done, silent
+from pipeline.steps.collision import COLLISION, CollisionParams
+from pipeline.types import Mesh
+from tests.pipeline import made_up
+
+
+def _run(folder: Path, meshes: dict[str, Mesh], **params: object) -> tuple[Mesh, Done]:
+    inputs = {}
+    for group, mesh in meshes.items():
+        inputs[group] = folder / f"{group}.npz"
+        mesh.save(inputs[group])
+    done = COLLISION.run(inputs, CollisionParams(**params), folder, silent)
+    return Mesh.load(done.files["mesh"]), done
+
+
+def test_the_budget_holds_and_the_deviation_is_told(tmp_path: Path) -> None:
+    ground = made_up.ground(100)
+    mesh, done = _run(tmp_path, {"terrain": ground, "building": made_up.house()}, triangles=1000)
+    assert len(mesh) <= 1000 and mesh.uv is None and mesh.frame == made_up.UTM
+    deviation = done.facts["deviation_m"]
+    assert 0 < deviation["mean"] <= deviation["p95"] <= deviation["max"] < 0.05
+    # the reported figure bears a check by the surface's formula
+    gap = np.abs(mesh.vertices[:, 2] - made_up.height(mesh.vertices[:, 0], mesh.vertices[:, 1]))
+    on_ground = (mesh.vertices[:, 2] < 0.4) & ~_in_house(mesh.vertices)
+    assert np.percentile(gap[on_ground], 95) < 0.03
+
+
+def test_the_house_keeps_its_shape(tmp_path: Path) -> None:
+    mesh, _ = _run(tmp_path, {"terrain": made_up.ground(100), "building": made_up.house()}, triangles=500)
+    inside = _in_house(mesh.vertices)
+    assert mesh.vertices[inside, 2].max() == pytest.approx(4.5, abs=0.01)
+
+
+def test_a_border_that_busts_the_budget_is_thinned_with_a_warning(tmp_path: Path) -> None:
+    ground = made_up.ground(40)
+    patches = ground.keep(np.arange(len(ground)) % 3 == 0)  # nearly all of it is border
+    mesh, done = _run(tmp_path, {"terrain": patches}, triangles=300)
+    assert len(mesh) <= 300
+    assert done.warnings and not done.facts["border_kept"]
+
+
+def test_plants_are_solid_only_when_asked(tmp_path: Path) -> None:
+    meshes = {"terrain": made_up.ground(10), "vegetation": made_up.house()}
+    assert _run(tmp_path, meshes)[0].vertices[:, 2].max() < 1
+    assert _run(tmp_path, meshes, vegetation=True)[0].vertices[:, 2].max() > 4
+
+
+def test_nothing_solid_is_refused(tmp_path: Path) -> None:
+    none = replace(made_up.house(), faces=np.zeros((0, 3), np.int32), uv=None, page=None)
+    with pytest.raises(DataError, match=r"terrain and building are empty.*vegetation=true"):
+        _run(tmp_path, {"terrain": none, "vegetation": made_up.house()})
+
+
+def _in_house(xyz: np.ndarray) -> np.ndarray:
+    x, y = made_up.HOUSE
+    return (abs(xyz[:, 0] - x - 1.5) <= 1.501) & (abs(xyz[:, 1] - y - 1) <= 1.001)

@@ -1,0 +1,170 @@
+"""Export: a world's folder that a user can open, move and trust."""
+
+from __future__ import annotations
+
+import json
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.errors import DataError, InputError, SettingError
+from pipeline.step import silent
+from pipeline.steps.export import EXPORT, ExportParams
+from pipeline.types import Frame, Mesh
+from tests.pipeline import made_up
+
+
+def _files(world: Path) -> set[str]:
+    return {path.relative_to(world).as_posix() for path in world.rglob("*") if path.is_file()}
+
+
+def _inputs(folder: Path, **meshes: Mesh) -> dict[str, Path]:
+    solid = folder / "collision.npz"
+    Mesh(made_up.UTM, made_up.house().vertices, made_up.house().faces).save(solid)
+    return {group: made_up.textured(folder / group, mesh) for group, mesh in meshes.items()} | {"collision": solid}
+
+
+def test_layout(tmp_path: Path) -> None:
+    world = made_up.world(tmp_path).files["world"]
+    meshes = "models/street/meshes"
+    groups = {
+        f"{meshes}/{group}{end}"
+        for group in ("terrain", "building")
+        for end in (".obj", ".mtl", ".dae", "_0.png", "_1.png")
+    }
+    assert _files(world) == groups | {
+        "street.sdf",
+        "street.glb",
+        "metadata.json",
+        "models/street/model.sdf",
+        "models/street/model.config",
+        f"{meshes}/collision.obj",
+    }
+
+
+def test_model_names_files_that_exist(tmp_path: Path) -> None:
+    world = made_up.world(tmp_path, friction=0.7).files["world"]
+    model = ET.parse(world / "models/street/model.sdf").getroot().find("model")
+    assert model.findtext("static") == "true"
+    uris = [uri.text for uri in model.iter("uri")]
+    assert len(uris) == 3
+    for uri in uris:
+        assert (world / uri.replace("model://", "models/")).is_file()
+    friction = model.find("link/collision/surface/friction")
+    assert {value.text for value in friction.iter() if value.tag.startswith(("mu", "friction")) and not len(value)} == {
+        "0.7"
+    }
+    config = ET.parse(world / "models/street/model.config").getroot()
+    assert config.findtext("name") == "street" and config.findtext("sdf") == "model.sdf"
+
+
+def test_a_large_group_is_split_and_nothing_is_lost(tmp_path: Path) -> None:
+    world = made_up.world(tmp_path, max_visual_triangles=1000).files["world"]
+    counts = json.loads((world / "metadata.json").read_text())["triangles_by_file"]
+    for suffix in (".obj", ".dae"):
+        parts = [n for file, n in counts.items() if "terrain_part" in file and file.endswith(suffix)]
+        assert len(parts) == 4 and max(parts) <= 1000 and sum(parts) == 3200
+    model = ET.parse(world / "models/street/model.sdf").getroot()
+    names = [visual.get("name") for visual in model.iter("visual")]
+    assert names == ["terrain_part1", "terrain_part2", "terrain_part3", "terrain_part4", "building"]
+    assert len(list(world.rglob("terrain_*.png"))) == 2  # pages are shared by the parts
+
+
+def test_metadata_puts_the_tile_on_the_map(tmp_path: Path) -> None:
+    world = made_up.world(tmp_path).files["world"]
+    metadata = json.loads((world / "metadata.json").read_text())
+    assert metadata["crs"] == "EPSG:32632" and metadata["unit_m"] == 1.0
+    assert metadata["origin_m"] == list(made_up.UTM.origin)
+    assert metadata["wgs84"]["latitude_deg"] == pytest.approx(48.13986, abs=1e-5)
+    assert metadata["wgs84"]["longitude_deg"] == pytest.approx(11.55407, abs=1e-5)
+    assert metadata["groups"]["terrain"]["triangles"] == 3200
+    assert metadata["groups"]["building"]["high_m"] == [7.0, 4.0, 4.5]
+
+
+def test_tiles_share_a_georeference_through_the_pose_alone(tmp_path: Path) -> None:
+    x, y, z = made_up.UTM.origin
+    alone = made_up.world(tmp_path / "a").files["world"]
+    placed = made_up.world(tmp_path / "b", world_origin=(x - 100, y + 50, z)).files["world"]
+    assert ET.parse(placed / "street.sdf").getroot().findtext("world/include/pose") == "100 -50 0 0 0 0"
+    meshes = "models/street/meshes"
+    assert (alone / meshes / "terrain.obj").read_bytes() == (placed / meshes / "terrain.obj").read_bytes()
+    latitude = [
+        float(ET.parse(w / "street.sdf").getroot().findtext("world/spherical_coordinates/latitude_deg"))
+        for w in (alone, placed)
+    ]
+    assert latitude[1] > latitude[0]
+
+
+def test_a_local_tile_has_no_georeference(tmp_path: Path) -> None:
+    world = made_up.world(tmp_path, frame=Frame()).files["world"]
+    assert "spherical_coordinates" not in (world / "street.sdf").read_text()
+    metadata = json.loads((world / "metadata.json").read_text())
+    assert metadata["crs"] == "local" and metadata["wgs84"] is None
+
+
+def test_formats_are_chosen(tmp_path: Path) -> None:
+    world = made_up.world(tmp_path, obj=False, glb=False).files["world"]
+    assert not list(world.rglob("*.glb")) and [p.name for p in world.rglob("*.obj")] == ["collision.obj"]
+    assert "terrain.dae" in (world / "models/street/model.sdf").read_text()
+    with pytest.raises(SettingError, match=r"export.obj=true"):
+        EXPORT.run({}, ExportParams(obj=False, collada=False), tmp_path, silent)
+
+
+def test_an_empty_group_is_left_out_and_nothing_at_all_is_refused(tmp_path: Path) -> None:
+    house = made_up.house()
+    none = replace(house, faces=house.faces[:0], uv=None, page=None)
+    inputs = _inputs(tmp_path, terrain=none, building=house)
+    done = EXPORT.run(inputs, ExportParams(), tmp_path / "out", silent)
+    assert set(done.facts["triangles"]) == {"building"}
+    del inputs["building"]
+    with pytest.raises(DataError, match="every surface is empty"):
+        EXPORT.run(inputs, ExportParams(), tmp_path / "none", silent)
+
+
+def test_lists_of_plants_are_put_beside_the_world(tmp_path: Path) -> None:
+    inputs = _inputs(tmp_path, building=made_up.house())
+    for key, file in {"plants": "a.geojson", "plants_csv": "b.csv"}.items():
+        inputs[key] = tmp_path / file
+        inputs[key].write_text(key)
+    world = EXPORT.run(inputs, ExportParams(), tmp_path / "out", silent).files["world"]
+    assert (world / "plants.geojson").read_text() == "plants"
+    assert (world / "plants.csv").read_text() == "plants_csv"
+
+
+def test_what_does_not_fit_together_is_refused(tmp_path: Path) -> None:
+    inputs = _inputs(tmp_path, building=made_up.house(Frame("EPSG:32632", (1.0, 2.0, 3.0))))
+    with pytest.raises(InputError, match="origin"):
+        EXPORT.run(inputs, ExportParams(), tmp_path / "a", silent)
+    inputs = _inputs(tmp_path, terrain=made_up.ground())
+    (inputs["terrain"] / "page_1.png").unlink()
+    with pytest.raises(InputError, match=r"page_1.png: is missing"):
+        EXPORT.run(inputs, ExportParams(), tmp_path / "b", silent)
+    bare = replace(made_up.house(), uv=None, page=None)
+    bare.save(inputs["terrain"] / "mesh.npz")
+    with pytest.raises(InputError, match="no texture coordinates"):
+        EXPORT.run(inputs, ExportParams(), tmp_path / "c", silent)
+
+
+def test_the_same_input_gives_the_same_bytes(tmp_path: Path) -> None:
+    a, b = (made_up.world(tmp_path / name).files["world"] for name in "ab")
+    for file in _files(a) - {f for f in _files(a) if f.endswith(".dae")}:  # Collada says when it was written
+        assert (a / file).read_bytes() == (b / file).read_bytes(), file
+
+
+def test_pictures_are_copied_as_they_are(tmp_path: Path) -> None:
+    world = made_up.world(tmp_path).files["world"]
+    for page in (0, 1):
+        copy = world / f"models/street/meshes/terrain_{page}.png"
+        assert copy.read_bytes() == (tmp_path / f"terrain/page_{page}.png").read_bytes()
+        assert copy.stat().st_ino != (tmp_path / f"terrain/page_{page}.png").stat().st_ino  # may be edited freely
+
+
+def test_normals_and_uv_have_no_nan(tmp_path: Path) -> None:
+    house = made_up.house()
+    flat = replace(house, faces=np.concatenate([house.faces, [[0, 0, 1]]]).astype(np.int32),
+                   uv=np.concatenate([house.uv, house.uv[:1]]), page=np.append(house.page, np.int16(0)))  # fmt: skip
+    EXPORT.run(_inputs(tmp_path, building=flat), ExportParams(), tmp_path / "out", silent)
+    assert not [p for p in (tmp_path / "out").rglob("*.obj") if "nan" in p.read_text()]

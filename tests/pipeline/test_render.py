@@ -1,0 +1,87 @@
+"""Rendered pictures: known textures come back, maps are to scale, edges and light are drawn."""
+
+import cv2
+import numpy as np
+import pytest
+
+from pipeline.cameras import project
+from pipeline.errors import InputError
+from pipeline.render import Body, Renderer, look_at, pinhole
+from pipeline.types import Camera, Frame, Mesh
+
+
+def square(size=4.0, z=0.0):
+    half = size / 2
+    vertices = np.float32([[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]])
+    uv = np.float32([[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]]])
+    return Mesh(Frame(), vertices, np.int32([[0, 1, 2], [0, 2, 3]]), uv=uv, page=np.zeros(2, np.int16))
+
+
+@pytest.fixture
+def painted(tmp_path):
+    """A square whose texture is red in the north west, green north east, blue south west, white south east."""
+    page = np.zeros((64, 64, 3), np.uint8)
+    page[:32, :32], page[:32, 32:] = (255, 0, 0), (0, 255, 0)
+    page[32:, :32], page[32:, 32:] = (0, 0, 255), (255, 255, 255)
+    mask = np.full((64, 64), 255, np.uint8)
+    mask[:32] = 128
+    cv2.imwrite(str(tmp_path / "page_0.png"), page[..., ::-1])
+    cv2.imwrite(str(tmp_path / "page_0_seen.png"), mask)
+    return Body(square(), (tmp_path / "page_0.png",))
+
+
+def test_map_shows_the_texture_the_right_way_round(painted):
+    image = Renderer([painted]).above((-4, -4, 0), (4, 4, 1), width=80)
+    assert image.rgb.shape == (80, 80, 3)
+    assert image.rgb[30, 30].tolist() == [255, 0, 0]
+    assert image.rgb[30, 50].tolist() == [0, 255, 0]
+    assert image.rgb[50, 30].tolist() == [0, 0, 255]
+    assert image.hit.sum() == 40 * 40
+    assert (image.rgb[~image.hit] == 255).all()
+    assert image.seen[30, 30] == 128 and image.seen[50, 30] == 255 and image.seen[0, 0] == 0
+
+
+@pytest.mark.parametrize(
+    "camera", [pinhole(160, 120), Camera("fisheye", 120, 120, 60, 60, 59.5, 59.5), Camera("equirectangular", 200, 100)]
+)
+def test_a_camera_sees_colours_where_it_projects_them(painted, camera):
+    pose = look_at((0, -3, 3), (0, 0, 0))
+    image = Renderer([painted]).view(camera, pose, background=(1, 2, 3))
+    points = np.array([[-1.0, 1, 0], [1, 1, 0], [-1, -1, 0], [1, -1, 0]])
+    uv, valid = project(camera, (points - pose[:3, 3]) @ pose[:3, :3])
+    assert valid.all()
+    at = np.round(uv).astype(int)
+    colours = image.rgb[at[:, 1], at[:, 0]].tolist()
+    assert colours == [[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 255]]
+    distance = np.linalg.norm(points - pose[:3, 3], axis=1)
+    np.testing.assert_allclose(image.range[at[:, 1], at[:, 0]], distance, rtol=0.03)
+
+
+def test_nearest_body_is_in_front_and_faces_are_told_apart(painted):
+    cover = Body(square(1.0, 1.0), colour=np.uint8([[10, 20, 30], [40, 50, 60]]))
+    image = Renderer([painted, Body(square(0.5, 5.0).keep(np.zeros(2, bool))), cover]).above(
+        (-2, -2, 0), (2, 2, 2), width=80
+    )
+    assert set(np.unique(image.body)) == {0, 2}
+    assert sorted(map(tuple, np.unique(image.rgb[image.body == 2], axis=0).tolist())) == [(10, 20, 30), (40, 50, 60)]
+
+
+def test_wireframe_and_light(painted):
+    plain = Body(square(), colour=(200, 200, 200))
+    camera, pose = pinhole(160, 120), look_at((0, -3, 3), (0, 0, 0))
+    lit = Renderer([plain]).view(camera, pose, shaded=True)
+    lines = Renderer([plain]).view(camera, pose, wireframe=True)
+    assert len(np.unique(lit.rgb[lit.hit], axis=0)) == 1
+    assert (lit.rgb[lit.hit] != 200).all()
+    assert 0 < (lines.rgb[lines.hit] < 100).all(axis=1).mean() < 0.2
+
+
+def test_nothing_to_render_is_background():
+    image = Renderer([]).view(pinhole(20, 10), np.eye(4), background=(9, 9, 9))
+    assert (image.rgb == 9).all() and not image.hit.any()
+
+
+def test_an_unreadable_page_is_named(tmp_path):
+    (tmp_path / "page_0.png").write_bytes(b"no image")
+    with pytest.raises(InputError, match="page_0.png"):
+        Renderer([Body(square(), (tmp_path / "page_0.png",))]).above((-1, -1, 0), (1, 1, 1), width=10)

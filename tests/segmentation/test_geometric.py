@@ -1,0 +1,147 @@
+"""Classes from shape, on a made-up street whose classes are known, and on real ones where present."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.classes import CODE
+from pipeline.io import clouds
+from pipeline.io.las_csv import import_las
+from pipeline.io.tile import read_tile
+from pipeline.step import silent
+from pipeline.types import Frame, PointCloud
+from segmentation.geometric import classify, split_ground
+from segmentation.segment import SEGMENT, SegmentParams, segment
+
+GROUPS = {2: "ground", 3: "plant", 4: "plant", 5: "plant", 6: "building", 68: "building", 65: "pole", 66: "vehicle"}
+
+
+def plane(rng: np.random.Generator, n: int, corner: list[float], a: list[float], b: list[float]) -> np.ndarray:
+    s, t = rng.uniform(size=(2, n, 1))
+    return np.array(corner) + s * np.array(a) + t * np.array(b) + rng.normal(0, 0.01, (n, 3))
+
+
+def box(rng: np.random.Generator, n: int, low: list[float], size: list[float]) -> np.ndarray:
+    """Points on the sides and the top of a box."""
+    x, y, z = (np.eye(3) * size).tolist()
+    corner, far = np.array(low), np.array(low) + size
+    sides = [(corner, x, z), (corner, y, z), (far, [-v for v in x], [-v for v in z])]
+    sides += [(far, [-v for v in y], [-v for v in z]), (far, [-v for v in x], [-v for v in y])]
+    area = np.array([np.linalg.norm(np.cross(a, b)) for _, a, b in sides])
+    shares = (n * area / area.sum()).astype(int)
+    return np.concatenate([plane(rng, m, c, a, b) for m, (c, a, b) in zip(shares, sides, strict=True)])
+
+
+def blob(rng: np.random.Generator, n: int, centre: list[float], radius: float) -> np.ndarray:
+    way = rng.normal(size=(n, 3))
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    return np.array(centre) + way * radius * rng.uniform(0.2, 1, (n, 1)) ** (1 / 3)
+
+
+def street(slope: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """A street of 40 x 30 m: ground, a house, a garden wall, two trees, a hedge, two cars, two poles."""
+    rng = np.random.default_rng(5)
+    parts = [
+        (2, plane(rng, 60_000, [0, 0, 0], [40, 0, 0], [0, 30, 0])),
+        (6, box(rng, 30_000, [5, 20, 0], [20, 8, 7])),
+        (68, plane(rng, 5_000, [28, 22, 0], [10, 0, 0], [0, 0, 1.6])),
+        (5, blob(rng, 6_000, [32, 6, 5], 2.5)),
+        (5, blob(rng, 6_000, [8, 4, 4.5], 2.0)),
+        (4, blob(rng, 4_000, [20, 3, 0.9], 0.9)),
+        *[(66, box(rng, 3_000, [x, 10, 0.25], [4.2, 1.7, 0.7])) for x in (6, 14)],
+        *[(66, box(rng, 1_500, [x + 1, 10.15, 0.9], [2.2, 1.4, 0.6])) for x in (6, 14)],
+    ]
+    for x in (12.0, 25.0):
+        turn, up = rng.uniform(0, 2 * np.pi, 1500), rng.uniform(0, 5, 1500)
+        parts.append((65, np.stack([x + 0.08 * np.cos(turn), 15 + 0.08 * np.sin(turn), up], axis=1)))
+    xyz = np.concatenate([points for _, points in parts])
+    xyz[:, 2] += slope * xyz[:, 0]
+    return xyz.astype(np.float32), np.concatenate([np.full(len(points), code) for code, points in parts])
+
+
+def recalls(label: np.ndarray, truth: np.ndarray) -> dict[str, float]:
+    told, true = (np.array([GROUPS.get(code, "none") for code in codes.tolist()]) for codes in (label, truth))
+    return {group: float(np.mean(told[true == group] == group)) for group in set(GROUPS.values())}
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.06])
+def test_a_street_is_told_apart(slope: float) -> None:
+    xyz, truth = street(slope)
+    label = classify(PointCloud(Frame(), xyz))
+    recall = recalls(label, truth)
+    bars = {"ground": 0.98, "building": 0.95, "plant": 0.9, "vehicle": 0.8, "pole": 0.8}
+    assert all(recall[group] >= bar for group, bar in bars.items()), recall
+    told = recalls(truth, label)  # the other way round: precision
+    assert all(told[group] >= 0.8 for group in bars), told
+
+
+def test_plants_are_classed_by_their_height() -> None:
+    xyz, truth = street()
+    label = classify(PointCloud(Frame(), xyz))
+    tall, hedge = label[(truth == 5) & (xyz[:, 2] > 3)], label[(truth == 4) & (xyz[:, 2] > 0.7)]
+    assert np.mean(tall == CODE["high_vegetation"]) > 0.9
+    assert np.mean(hedge == CODE["mid_vegetation"]) > 0.8
+
+
+def test_the_same_cloud_gets_the_same_classes() -> None:
+    cloud = PointCloud(Frame(), street()[0])
+    assert np.array_equal(classify(cloud), classify(cloud))
+
+
+def test_a_roof_with_nothing_around_it_is_no_ground() -> None:
+    rng = np.random.default_rng(0)
+    ground = plane(rng, 8_000, [0, 0, 0], [10, 0, 0], [0, 40, 0])
+    roof = plane(rng, 20_000, [25, 0, 9], [40, 0, 0], [0, 40, 0])
+    height, is_ground = split_ground(np.concatenate([ground, roof]).astype(np.float32))
+    assert is_ground[:8_000].mean() > 0.98 and is_ground[8_000:].mean() < 0.02
+    assert abs(np.median(height[8_000:]) - 9) < 0.5
+
+
+@pytest.mark.parametrize("n", [0, 1, 5, 50, 300])
+def test_tiny_clouds_get_classes_of_some_kind(n: int) -> None:
+    rng = np.random.default_rng(n)
+    for spread in ([5, 5, 5], [5, 5, 0], [0, 0, 5], [0, 0, 0]):
+        xyz = (rng.uniform(size=(n, 3)) * spread).astype(np.float32)
+        assert classify(PointCloud(Frame(), xyz)).shape == (n,)
+
+
+def test_a_cloud_keeps_its_own_classes_unless_told_otherwise(tmp_path: Path) -> None:
+    xyz, truth = street()
+    cloud = PointCloud(Frame(), xyz, label=truth.astype(np.uint8), time=np.arange(len(xyz), dtype=np.float64))
+    cloud.save(tmp_path / "in.npz")
+    inputs = {"cloud": tmp_path / "in.npz"}
+
+    def run(name: str, **params: object) -> tuple[PointCloud, dict]:
+        (tmp_path / name).mkdir()
+        done = segment(inputs, SegmentParams(**params), tmp_path / name, silent)  # type: ignore[arg-type]
+        return PointCloud.load(done.files["cloud"]), done.facts
+
+    kept, facts = run("kept")
+    assert np.array_equal(kept.label, truth) and facts["source"] == "cloud"
+    assert facts["points"]["terrain"] == int((truth == 2).sum())
+    anew, facts = run("anew", overwrite=True)
+    assert facts["source"] == "geometry" and not np.array_equal(anew.label, truth)
+    assert np.array_equal(anew.time, cloud.time) and np.array_equal(anew.xyz, xyz)
+
+    replace(cloud, label=np.where(np.arange(len(xyz)) % 10 == 0, truth, 1).astype(np.uint8)).save(inputs["cloud"])
+    assert run("few")[1]["source"] == "geometry"  # a tenth of the points is too little
+    assert run("enough", min_classified=0.05)[1]["source"] == "cloud"
+    replace(cloud, label=None).save(inputs["cloud"])
+    assert run("none", min_classified=0.0)[1]["source"] == "geometry"
+    assert SEGMENT.name == "segment"
+
+
+def test_an_airborne_survey_agrees_with_its_own_classes(real_data: Path, tmp_path: Path) -> None:
+    tile = read_tile(import_las(sorted((real_data / "las").glob("ign_77*.laz")), tmp_path / "tile"))
+    cloud = PointCloud.join([clouds.read(path, tile.frame) for path in tile.clouds])
+    assert cloud.label is not None
+    known = np.isin(cloud.label, (2, 3, 4, 5, 6))
+    label, truth = classify(cloud)[known], cloud.label[known]
+    for group, bar in (("ground", 0.97), ("plant", 0.72), ("building", 0.76)):
+        codes = [code for code, name in GROUPS.items() if name == group]
+        told, true = np.isin(label, codes), np.isin(truth, codes)
+        assert (told & true).sum() / (told | true).sum() > bar, group

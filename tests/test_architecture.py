@@ -1,0 +1,91 @@
+"""The shape of the house: imports run one way, the command starts light, the docs name what exists."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import ROOT
+
+ROOMS = {
+    "pipeline": set(),
+    "segmentation": {"pipeline"},
+    "texturing": {"pipeline"},
+    "slam": {"pipeline"},
+    "services": {"pipeline", "segmentation", "slam"},
+    "data_samples": {"pipeline"},
+    "flows": {"pipeline", "segmentation", "texturing", "slam", "services", "data_samples"},
+}
+HEAVY = ("open3d", "torch", "prefect", "numba", "cv2", "scipy", "trimesh", "pyproj", "pycolmap", "pymeshlab", "numpy")
+
+
+def imported(file: Path) -> set[str]:
+    """Top-level names of all modules that a file imports, anywhere in it."""
+    names = set()
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+            names.add(node.module.split(".")[0])
+    return names
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_imports_run_one_way(room: str) -> None:
+    for file in (ROOT / room).rglob("*.py"):
+        foreign = (imported(file) & set(ROOMS)) - {room} - ROOMS[room]
+        assert not foreign, f"{file.relative_to(ROOT)} imports {foreign}"
+
+
+def test_prefect_is_known_to_its_flows_alone() -> None:
+    for room in ROOMS:
+        for file in (ROOT / room).rglob("*.py"):
+            if "prefect" in imported(file):
+                assert file.relative_to(ROOT).as_posix() in ("flows/tile.py", "flows/survey.py", "flows/reprocess.py")
+
+
+def loaded_by(code: str) -> set[str]:
+    """Which heavy modules a fresh interpreter has loaded after running `code`."""
+    script = f"import sys\n{code}\nprint(*[m for m in {HEAVY!r} if m in sys.modules])"
+    return set(
+        subprocess.run(
+            [sys.executable, "-c", script], cwd=ROOT, check=True, capture_output=True, text=True
+        ).stdout.split()
+    )
+
+
+def test_the_command_starts_without_anything_heavy() -> None:
+    assert loaded_by("import flows.cli") == set()
+
+
+def test_the_recipe_is_planned_without_anything_heavy() -> None:
+    assert loaded_by("import flows.recipe") <= {"numpy"}
+
+
+def test_every_setting_is_documented() -> None:
+    from flows.recipe import STEPS
+
+    text = (ROOT / "docs" / "settings.md").read_text()
+    for step in STEPS:
+        for param in step.params.model_fields:
+            assert f"`{step.name}.{param}`" in text, f"docs/settings.md lacks {step.name}.{param}"
+
+
+def test_every_exit_code_is_documented() -> None:
+    from pipeline.errors import EXIT_CODES
+
+    text = (ROOT / "docs" / "formats.md").read_text()
+    for code, _, meaning in EXIT_CODES.values():
+        assert f"| {code} |" in text and meaning in text
+
+
+def test_architecture_names_every_file_of_the_core() -> None:
+    text = (ROOT / "docs" / "architecture.md").read_text()
+    for room in ("pipeline", "flows"):
+        for file in (ROOT / room).glob("*.py"):
+            if file.name != "__init__.py":
+                assert file.name in text, f"docs/architecture.md doesn't name {room}/{file.name}"

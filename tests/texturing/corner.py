@@ -1,0 +1,126 @@
+"""A made-up street corner: ground and a box with a known paint, photographed by any camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from pipeline.io import views as views_io
+from pipeline.render import Body, Renderer, look_at, pinhole
+from pipeline.step import silent
+from pipeline.types import Camera, Frame, Mesh, PointCloud, View
+from pipeline.visibility import depth_map, scene
+from texturing.texture import TextureParams, texture
+from texturing.unwrap import UnwrapParams, unwrap
+
+
+def grid(corner, along, up, n=12):
+    """A rectangle from `corner`, spanned by two vectors, of n x n cells; its front is where along x up points."""
+    s, t = np.meshgrid(np.linspace(0, 1, n + 1), np.linspace(0, 1, n + 1), indexing="ij")
+    vertices = np.asarray(corner) + s.reshape(-1, 1) * np.asarray(along) + t.reshape(-1, 1) * np.asarray(up)
+    i, j = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
+    a = (i * (n + 1) + j).ravel()
+    faces = np.concatenate([np.column_stack([a, a + n + 1, a + n + 2]), np.column_stack([a, a + n + 2, a + 1])])
+    return vertices, faces
+
+
+def join(*parts):
+    at, vertices, faces = 0, [], []
+    for v, f in parts:
+        vertices.append(v)
+        faces.append(f + at)
+        at += len(v)
+    return Mesh(Frame(), np.concatenate(vertices).astype(np.float32), np.concatenate(faces).astype(np.int32))
+
+
+GROUND = join(grid((-5, -5, 0), (10, 0, 0), (0, 10, 0), 24))
+BOX = join(
+    grid((0, -1, 0), (0, 0, 2), (0, 2, 0)),  # facing -x, where cameras are
+    grid((1, -1, 0), (0, 2, 0), (0, 0, 2)),
+    grid((0, -1, 0), (1, 0, 0), (0, 0, 2)),
+    grid((0, 1, 0), (0, 0, 2), (1, 0, 0)),
+    grid((0, -1, 2), (1, 0, 0), (0, 2, 0)),
+)
+
+
+def paint(xyz):
+    """(N, 3) colour of the surface: soft stripes; the box is red all over."""
+    x, y, z = np.moveaxis(np.asarray(xyz, float), -1, 0)
+    ground = np.stack([60 + 40 * np.sin(3 * x), 120 + 50 * np.sin(2.5 * y + x), 130 + 60 * np.cos(2 * x - y)], axis=-1)
+    red = np.stack([220 + 20 * np.sin(4 * z + y), 40 + 20 * np.sin(3 * y + x), 40 + 0 * z], axis=-1)
+    return np.where((z > 0.01)[..., None], red, ground)
+
+
+def photograph(camera, pose, meshes=(GROUND, BOX), gain=1.0):
+    """(H, W, 3) uint8: the paint as a camera sees it."""
+    from pipeline.cameras import pixel_rays
+
+    image = Renderer([Body(mesh) for mesh in meshes]).view(camera, pose)
+    hit = pose[:3, 3] + (pixel_rays(camera) @ pose[:3, :3].T) * np.where(image.hit, image.range, 0)[..., None]
+    rgb = np.where(image.hit[..., None], paint(hit) * gain, [200, 214, 230])
+    return np.clip(np.round(rgb), 0, 255).astype(np.uint8)
+
+
+CAMERAS = {
+    "pinhole": pinhole(640, 480, field=80),
+    "opencv": Camera("opencv", 640, 480, 380.0, 380.0, 319.5, 239.5, (-0.15, 0.03, 0.0005, -0.0005)),
+    "fisheye": Camera("fisheye", 640, 640, 220.0, 220.0, 319.5, 319.5, (0.02, -0.003, 0.0, 0.0)),
+    "equirectangular": Camera("equirectangular", 1600, 800),
+}
+POSES = [look_at((-4, y, 1.8), (0, y / 2, 0.6)) for y in (-3.0, -1.0, 1.0, 3.0)]
+
+
+@dataclass
+class Street:
+    """Everything that the step `texture` reads, in a folder; fields may be changed before `run`."""
+
+    folder: Path
+    mesh: Mesh = GROUND
+    occluders: tuple[Mesh, ...] = (GROUND, BOX)
+    views: list[View] = field(default_factory=list)
+    held_out: tuple[bool, ...] = ()
+    clouds: dict[str, PointCloud] = field(default_factory=dict)
+    texel: float = 0.02
+    runs: int = 0
+
+    def add(self, camera, pose, image=None, mask=None):
+        """Take a photo (or put `image` in its place)."""
+        name = f"photo{len(self.views)}"
+        path = self.folder / f"{name}.png"
+        cv2.imwrite(str(path), (photograph(camera, pose) if image is None else image)[..., ::-1])
+        view = View(name, camera, pose, path)
+        if mask is not None:
+            view = replace(view, mask=self.folder / f"{name}_mask.png")
+            cv2.imwrite(str(view.mask), mask)
+        self.views.append(view)
+        return view
+
+    def run(self, **params):
+        """Unwrap and texture; returns (folder of the textured mesh, what the step said)."""
+        out = self.folder / f"run{self.runs}"
+        self.runs += 1
+        (out / "depth").mkdir(parents=True)
+        self.mesh.save(out / "in.npz")
+        flat = unwrap({"mesh": out / "in.npz"}, UnwrapParams(backend="xatlas", texel=self.texel), out, silent)
+        hides = scene(self.occluders)
+        for i, view in enumerate(self.views):
+            np.save(out / "depth" / f"{i}.npy", depth_map(view.camera, view.T_world_cam, hides).range)
+        views_io.save(out / "views.json", self.views, self.held_out)
+        inputs = {**flat.files, "views": out / "views.json", "depth": out / "depth"}
+        for name, cloud in self.clouds.items():
+            cloud.save(out / f"{name}.npz")
+            inputs[f"cloud.{name}"] = out / f"{name}.npz"
+        done = texture(inputs, TextureParams(**params), out, silent)
+        return done.files["textured"], done
+
+
+def points(colour=True, n=40_000, rgb=None):
+    """Points all over the ground with its paint (or one colour)."""
+    rng = np.random.default_rng(0)
+    xyz = np.column_stack([rng.uniform(-5, 5, (n, 2)), np.zeros(n)]).astype(np.float32)
+    colours = np.clip(paint(xyz), 0, 255).astype(np.uint8) if rgb is None else np.tile(np.uint8(rgb), (n, 1))
+    normal = np.tile(np.float32([0, 0, 1]), (n, 1))
+    return PointCloud(Frame(), xyz, colours if colour else None, normal, np.full(n, 11, np.uint8))

@@ -1,0 +1,220 @@
+"""Textures of a made-up street corner against its known paint."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from pipeline.io import views as views_io
+from pipeline.render import Renderer, look_at, textured
+from pipeline.types import Frame, Mesh
+from tests.texturing.corner import BOX, CAMERAS, GROUND, POSES, paint, photograph, points
+
+LOW, HIGH = (-5, -5, 0), (5, 5, 3)
+
+
+def from_above(folder, width=200):
+    """The ground as textured, where it is, and its true paint: (H, W, 3), seen (H, W), (H, W, 3)."""
+    image = Renderer([textured(folder)]).above(LOW, HIGH, width=width)
+    x, y = np.meshgrid(-5 + (np.arange(width) + 0.5) * 10 / width, 5 - (np.arange(width) + 0.5) * 10 / width)
+    return image.rgb.astype(float), image.seen, np.clip(paint(np.stack([x, y, 0 * x], axis=-1)), 0, 255), x, y
+
+
+def psnr(a, b):
+    return 10 * np.log10(255**2 / ((a - b) ** 2).mean())
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_photos_come_back_as_texture(street, name):
+    for pose in POSES:
+        street.add(CAMERAS[name], pose)
+    street.clouds["terrain"] = points()
+    folder, done = street.run()
+    rgb, seen, truth, x, _ = from_above(folder)
+    near = (seen == 255) & (x < 1)
+    assert near.mean() > 0.2
+    assert psnr(rgb[near], truth[near]) > 30
+    assert done.facts["photos"] == 4
+    assert done.facts["seen_m2"] == pytest.approx(100 * done.facts["coverage"], rel=0.02)
+
+
+def test_what_the_box_hides_is_not_painted_with_the_box(street):
+    street.add(CAMERAS["pinhole"], look_at((-4, 0, 1.2), (0, 0, 0.6)))
+    street.clouds["terrain"] = points(rgb=(0, 255, 0))
+    folder, done = street.run()
+    rgb, seen, _, x, y = from_above(folder)
+    behind = (x > 1.2) & (x < 4) & (abs(y) < 1)
+    assert (seen[behind] == 128).mean() > 0.99
+    assert (rgb[behind] == [0, 255, 0]).all(axis=-1).mean() > 0.99
+    red = (rgb[..., 0] > 170) & (rgb[..., 1] < 90)
+    under = (x > -0.1) & (x < 1.1) & (abs(y) < 1.1)  # the ground under the box is nobody's
+    assert red[~under].mean() < 0.003
+    assert 0 < done.facts["coverage"] < 1
+
+
+def test_the_wall_is_painted_from_the_front_only(street):
+    street.mesh = BOX
+    for pose in POSES:
+        street.add(CAMERAS["pinhole"], pose)
+    folder, _ = street.run()
+    image = Renderer([textured(folder)]).view(CAMERAS["pinhole"], look_at((-4, 0.3, 1.0), (0, 0, 1)))
+    truth = photograph(CAMERAS["pinhole"], look_at((-4, 0.3, 1.0), (0, 0, 1)), meshes=(BOX,))
+    assert (image.seen[image.hit] == 255).mean() > 0.95
+    assert psnr(image.rgb[image.hit].astype(float), truth[image.hit].astype(float)) > 28
+    back = Renderer([textured(folder)]).view(CAMERAS["pinhole"], look_at((5, 0, 1.0), (0, 0, 1)))
+    assert (back.seen[back.hit] != 255).mean() > 0.9
+
+
+def test_the_nearer_photo_counts_more(street):
+    camera = CAMERAS["pinhole"]
+    white, black = np.full((480, 640, 3), 255, np.uint8), np.zeros((480, 640, 3), np.uint8)
+    street.occluders = (GROUND,)
+    street.add(camera, look_at((-4.5, 0, 2), (-2, 0, 0)), white)
+    street.add(camera, look_at((4.5, 0, 2), (2, 0, 0)), black)
+    rgb, _, _, x, y = from_above(street.run(feather=0.001)[0])
+    lit = abs(y) < 0.5
+    assert rgb[lit & (x > -3) & (x < -1.5)].mean() > 225
+    assert rgb[lit & (x < 3) & (x > 1.5)].mean() < 30
+    assert 60 < rgb[lit & (abs(x) < 0.1)].mean() < 195
+
+
+def test_more_power_is_sharper(street):
+    camera = CAMERAS["pinhole"]
+    street.occluders = (GROUND,)
+    street.add(camera, look_at((-4.5, 0, 2), (-2, 0, 0)), np.full((480, 640, 3), 255, np.uint8))
+    street.add(camera, look_at((4.5, 0, 2), (2, 0, 0)), np.zeros((480, 640, 3), np.uint8))
+    soft, sharp = (from_above(street.run(power=p)[0])[0][100, 60] for p in (0.5, 4.0))
+    assert sharp.mean() > soft.mean() + 10
+
+
+def test_unseen_texels_get_the_colours_of_the_points(street):
+    street.clouds["terrain"] = points()
+    folder, done = street.run()
+    rgb, seen, truth, _, _ = from_above(folder)
+    assert (seen == 128).all()
+    assert psnr(rgb, truth) > 25  # of points 5 cm apart
+    assert done.facts["coverage"] == 0 and done.facts["coloured_m2"] == pytest.approx(100, rel=0.02)
+
+
+def test_the_classes_left_out_lend_no_colours(street):
+    street.clouds["terrain"], street.clouds["rest"] = points(rgb=(10, 200, 10)), points(rgb=(255, 0, 0))
+    rgb, *_ = from_above(street.run()[0])
+    assert (rgb == [10, 200, 10]).all()
+
+
+def test_points_without_colours_give_their_classes(street):
+    street.clouds["terrain"] = points(colour=False)
+    folder, done = street.run()
+    rgb, seen, *_ = from_above(folder)
+    assert (seen == 64).all()
+    assert len(np.unique(rgb.reshape(-1, 3), axis=0)) == 1 and rgb[0, 0].tolist() == pytest.approx(
+        [110, 110, 118], abs=4
+    )
+    assert done.facts["filled_m2"] == pytest.approx(100, rel=0.02)
+
+
+def test_without_coloured_points_what_is_unseen_takes_after_its_seen_neighbours(street):
+    street.add(CAMERAS["pinhole"], POSES[1], np.full((480, 640, 3), (20, 90, 200), np.uint8))
+    street.clouds["terrain"] = points(colour=False)
+    rgb, seen, *_ = from_above(street.run()[0])
+    assert (seen == 64).any() and (seen == 255).any()
+    assert (rgb[seen == 64] == [20, 90, 200]).all(axis=1).mean() > 0.95
+
+
+def test_nothing_at_all_is_grey(street):
+    rgb, seen, *_ = from_above(street.run()[0])
+    assert (rgb == 128).all() and (seen == 64).all()
+
+
+def test_masked_pixels_are_not_used(street):
+    camera, pose = CAMERAS["pinhole"], POSES[1]
+    image = photograph(camera, pose)
+    image[240:, :320] = (255, 0, 255)  # the recording car
+    mask = np.full((480, 640), 255, np.uint8)
+    mask[240:, :320] = 0
+    street.add(camera, pose, image, mask)
+    street.clouds["terrain"] = points()
+    rgb, seen, *_ = from_above(street.run()[0])
+    assert (seen == 255).any()
+    magenta = (rgb[..., 0] > 200) & (rgb[..., 1] < 60) & (rgb[..., 2] > 200)
+    assert magenta.sum() == 0
+
+
+def test_an_unreadable_photo_is_skipped_and_named(street):
+    for pose in POSES:
+        street.add(CAMERAS["pinhole"], pose)
+    street.views[1].photo.write_bytes(b"broken")
+    cv2.imwrite(str(street.views[2].photo), np.zeros((10, 10, 3), np.uint8))
+    street.clouds["terrain"] = points()
+    folder, done = street.run()
+    assert any("photo1.png" in warning for warning in done.warnings)
+    assert any("photo2.png" in warning and "10 x 10" in warning for warning in done.warnings)
+    assert done.facts["photos"] == 2
+    rgb, seen, truth, x, _ = from_above(folder)
+    near = (seen == 255) & (x < 1)
+    assert psnr(rgb[near], truth[near]) > 30
+
+
+def test_held_out_photos_are_never_used(street):
+    street.add(CAMERAS["pinhole"], POSES[1])
+    street.add(CAMERAS["pinhole"], POSES[2], np.full((480, 640, 3), (255, 0, 255), np.uint8))
+    street.held_out = (False, True)
+    street.clouds["terrain"] = points()
+    folder, done = street.run()
+    rgb, *_ = from_above(folder)
+    assert not ((rgb[..., 0] > 200) & (rgb[..., 1] < 60)).any()
+    assert list(done.facts["texels_by_photo"]) == ["photo0"]
+
+
+def test_grey_and_sixteen_bit_photos_are_read(street):
+    view = street.add(CAMERAS["pinhole"], POSES[1])
+    grey = cv2.imread(str(view.photo), cv2.IMREAD_GRAYSCALE)
+    cv2.imwrite(str(view.photo), grey.astype(np.uint16) * 257)
+    rgb, seen, *_ = from_above(street.run()[0])
+    assert (seen == 255).any()
+    assert np.ptp(rgb[seen == 255], axis=1).max() <= 1
+
+
+def test_the_same_again_byte_for_byte(street):
+    for pose in POSES:
+        street.add(CAMERAS["pinhole"], pose)
+    street.clouds["terrain"] = points()
+    one, two = street.run()[0], street.run()[0]
+    for name in ("page_0.png", "page_0_seen.png"):
+        assert (one / name).read_bytes() == (two / name).read_bytes()
+
+
+def test_room_between_charts_carries_their_colours(street):
+    street.mesh, street.clouds["terrain"] = BOX, points(rgb=(200, 10, 10))
+    folder, _ = street.run()
+    page = cv2.imread(str(folder / "page_0.png"))[..., ::-1]
+    seen = cv2.imread(str(folder / "page_0_seen.png"), cv2.IMREAD_GRAYSCALE)
+    assert (seen == 0).any()
+    assert (abs(page.astype(int) - [200, 10, 10]) <= 1).all()
+
+
+def test_a_mesh_without_faces_passes(street):
+    street.mesh = Mesh(Frame(), np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
+    folder, done = street.run()
+    assert len(Mesh.load(folder / "mesh.npz")) == 0
+    assert done.facts["area_m2"] == 0
+
+
+def test_several_pages_meet_without_a_seam(street):
+    street.clouds["terrain"] = points()
+    street.texel = 0.005
+    folder, done = street.run()
+    assert done.facts["pages"] >= 1 and all((folder / f"page_{k}.png").is_file() for k in range(done.facts["pages"]))
+    rgb, _, truth, *_ = from_above(folder)
+    assert psnr(rgb, truth) > 25
+
+
+def test_views_survive_their_json(street, tmp_path):
+    view = street.add(CAMERAS["opencv"], POSES[0], mask=np.zeros((480, 640), np.uint8))
+    views_io.save(tmp_path / "v.json", [view], [True])
+    (read,) = views_io.load(tmp_path / "v.json")
+    assert read.camera == view.camera and read.photo == view.photo and read.mask == view.mask
+    np.testing.assert_array_equal(read.T_world_cam, view.T_world_cam)
+    assert views_io.load_held_out(tmp_path / "v.json") == (True,)
+    assert json.loads(json.dumps(views_io.to_json(view, with_paths=False)))["photo"] == view.photo.name

@@ -1,0 +1,122 @@
+"""Unwrapping: charts don't overlap, density is as asked, pages are bounded, and the other backend steps in."""
+
+import json
+
+import numpy as np
+import pytest
+
+from pipeline.step import silent
+from pipeline.types import Frame, Mesh
+from texturing import unwrap as unwrap_module
+from texturing.atlas import manifold
+from texturing.unwrap import UNWRAP, UnwrapParams, unwrap
+
+
+def hills(n=24, cell=0.25, seed=0):
+    """Uneven ground of n x n cells."""
+    rng = np.random.default_rng(seed)
+    x, y = np.meshgrid(np.arange(n + 1) * cell, np.arange(n + 1) * cell, indexing="ij")
+    z = 0.3 * np.sin(x) + rng.normal(0, 0.02, x.shape)
+    i, j = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
+    a = (i * (n + 1) + j).ravel()
+    faces = np.concatenate([np.column_stack([a, a + n + 1, a + n + 2]), np.column_stack([a, a + n + 2, a + 1])])
+    return Mesh(Frame(), np.stack([x, y, z], -1).reshape(-1, 3).astype(np.float32), faces.astype(np.int32))
+
+
+def with_fin(mesh):
+    """The mesh with a face standing on an inner edge (three faces there), a repeated face, and an empty one."""
+    a, b, c = mesh.faces[len(mesh) // 2]
+    top = mesh.vertices[[a, b]].mean(axis=0) + np.float32([0, 0, 0.4])
+    vertices = np.concatenate([mesh.vertices, top[None]])
+    faces = np.concatenate([mesh.faces, [[a, b, len(vertices) - 1], [a, b, c], [a, a, b]]])
+    return Mesh(mesh.frame, vertices, faces.astype(np.int32))
+
+
+def run(mesh, tmp_path, **params):
+    mesh.save(tmp_path / "in.npz")
+    done = unwrap({"mesh": tmp_path / "in.npz"}, UnwrapParams(**params), tmp_path, silent)
+    return Mesh.load(done.files["mesh"]), json.loads(done.files["pages"].read_text()), done
+
+
+def owners(mesh, pages, k):
+    """How many faces cover every texel centre of page k."""
+    size = np.array([pages[k]["width"], pages[k]["height"]])
+    count = np.zeros(size[::-1], int)
+    for corner in mesh.uv[mesh.page == k] * size - 0.5:
+        low, high = np.ceil(corner.min(0)).astype(int), np.floor(corner.max(0)).astype(int)
+        u, v = np.meshgrid(np.arange(low[0], high[0] + 1), np.arange(low[1], high[1] + 1))
+        a, b, c = corner
+        det = (b[0] - a[0]) * (c[1] - a[1]) - (c[0] - a[0]) * (b[1] - a[1])
+        if abs(det) < 1e-6:
+            continue
+        s = ((u - a[0]) * (c[1] - a[1]) - (c[0] - a[0]) * (v - a[1])) / det
+        t = ((b[0] - a[0]) * (v - a[1]) - (u - a[0]) * (b[1] - a[1])) / det
+        inside = (s > 1e-3) & (t > 1e-3) & (s + t < 1 - 1e-3)
+        count[v[inside], u[inside]] += 1
+    return count
+
+
+@pytest.mark.parametrize("backend", ["uvatlas", "xatlas"])
+def test_charts_do_not_overlap_and_density_is_as_asked(backend, tmp_path):
+    mesh, pages, done = run(hills(), tmp_path, backend=backend, texel=0.02)
+    assert mesh.uv.min() >= 0 and mesh.uv.max() <= 1
+    assert owners(mesh, pages, 0).max() == 1
+    assert done.facts["texel_m"] == pytest.approx(0.02, rel=0.1)
+    assert done.facts["stretch_median"] < 1.2
+    assert done.facts["utilisation"] > 0.3
+    assert not done.warnings
+
+
+@pytest.mark.parametrize("backend", ["uvatlas", "xatlas"])
+def test_pages_stay_within_their_size_and_blocks_are_compact(backend, tmp_path):
+    mesh, pages, _ = run(hills(), tmp_path, backend=backend, texel=0.02, page_size=256)
+    assert len(pages) > 1 and sorted(set(mesh.page.tolist())) == list(range(len(pages)))
+    assert all(max(p.values()) <= 256 for p in pages)
+    assert all(owners(mesh, pages, k).max() == 1 for k in range(len(pages)))
+    spread = [np.ptp(mesh.corners[mesh.page == k].reshape(-1, 3), axis=0)[:2].max() for k in range(len(pages))]
+    assert np.median(spread) < 5  # of 6 m
+
+
+def test_a_mesh_that_is_no_manifold_is_mended_for_uvatlas(tmp_path):
+    mesh, _, done = run(with_fin(hills()), tmp_path, backend="uvatlas", texel=0.02)
+    assert done.facts["fallbacks"] == 0
+    flat = mesh.uv[:-1]
+    area = np.abs(np.cross(*(np.pad(flat[:, k] - flat[:, 0], ((0, 0), (0, 1))) for k in (1, 2))))[:, 2]
+    assert (area > 0).all()
+
+
+def test_cutting_leaves_every_edge_to_two_faces_at_most():
+    faces, old = manifold(with_fin(hills()).faces[:-1])
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    assert np.unique(edges, axis=0, return_counts=True)[1].max() <= 2
+    np.testing.assert_array_equal(old[faces], with_fin(hills()).faces[:-1])
+    whole, same = manifold(hills().faces)
+    assert len(same) == len(hills().vertices)  # a manifold stays in one piece
+
+
+def test_the_other_backend_steps_in(tmp_path, monkeypatch):
+    real = unwrap_module._in_child
+
+    def refuse(mesh, blocks, backend, params):
+        return ["refused"] * len(blocks) if backend == "uvatlas" else real(mesh, blocks, backend, params)
+
+    monkeypatch.setattr(unwrap_module, "_in_child", refuse)
+    _, _, done = run(hills(), tmp_path, backend="uvatlas", texel=0.02)
+    assert done.facts["fallbacks"] == 1
+    assert "xatlas" in done.warnings[0]
+
+
+def test_a_mesh_without_faces_passes(tmp_path):
+    mesh, pages, done = run(hills().keep(np.zeros(1152, bool)), tmp_path)
+    assert len(mesh) == 0 and mesh.uv.shape == (0, 3, 2) and pages == []
+    assert done.facts["pages"] == 0
+
+
+def test_the_same_again(tmp_path):
+    first, _, _ = run(hills(), tmp_path, backend="xatlas", texel=0.02)
+    again, _, _ = run(hills(), tmp_path, backend="xatlas", texel=0.02)
+    np.testing.assert_array_equal(first.uv, again.uv)
+
+
+def test_vegetation_goes_to_xatlas_at_three_centimetres():
+    assert UNWRAP.per_class["vegetation"] == {"backend": "xatlas", "texel": 0.03}

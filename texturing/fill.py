@@ -1,0 +1,188 @@
+"""What no photo saw: colours from the points around, and the room between charts. Import late: it loads numba.
+
+Points are about 10 cm apart and texels 1 cm: colours are asked for on a coarse lattice of texels on each
+face's plane, and interpolated in between.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit, prange
+
+from pipeline.types import F32, I32, U8
+from texturing.blend import _box, frame
+
+LATTICE = 0.08
+"""Metres between the places where points are asked for their colour."""
+NEIGHBOURS = 4
+REACH = 1.0
+"""Metres beyond which a point's colour is no longer called the surface's own."""
+FROM_POINTS, FILLED = 128, 64
+
+
+class Colours:
+    """Coloured points that can be asked for the colour at a place.
+
+    Args:
+        xyz: (N, 3) local metres, N > 0.
+        rgb: (N, 3) uint8.
+        mark: what texels coloured by them are marked with (`FROM_POINTS` or `FILLED`).
+    """
+
+    def __init__(self, xyz: F32, rgb: U8, mark: int = FROM_POINTS) -> None:
+        from scipy.spatial import cKDTree
+
+        self._tree = cKDTree(xyz, balanced_tree=False, compact_nodes=False)
+        self._rgb = rgb.astype(np.float32)
+        self.mark = mark
+
+    def at(self, places: F32) -> tuple[F32, F32]:
+        """(M, 3) colours, the inverse-square mean of the nearest points, and (M,) distance to the nearest (m)."""
+        k = min(NEIGHBOURS, self._tree.n)
+        distance, index = self._tree.query(places, k=k, workers=-1)
+        distance, index = distance.reshape(len(places), k), index.reshape(len(places), k)
+        weight = (1.0 / (distance**2 + 1e-4)).astype(np.float32)
+        colour = np.einsum("mk,mkc->mc", weight, self._rgb[index]) / weight.sum(axis=1, keepdims=True)
+        return colour.astype(np.float32), distance[:, 0].astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Page:
+    """A page while it is painted: `rgb` (H, W, 3), `seen` (H, W), `owner` (H, W), and its faces."""
+
+    rgb: U8
+    seen: U8
+    owner: I32
+    flat: F32
+    corners: F32
+
+
+def fill(page: Page, colours: Colours, texel: float) -> None:
+    """Colour the texels of faces that have no colour yet (`seen` 0), in place; far from any point they are marked filled.
+
+    Args:
+        page: to be filled.
+        colours: of the points around.
+        texel: metres a texel spans.
+    """
+    step = max(1, round(LATTICE / texel))
+    shape = _lattice(page.owner, page.seen, page.flat, step)
+    start = np.concatenate([[0], np.cumsum(shape[:, 0].astype(np.int64) * shape[:, 1])])
+    if start[-1] == 0:
+        return
+    colour, distance = colours.at(_places(page.flat, page.corners, shape, start, step, page.owner.shape))
+    _interpolate(page.rgb, page.seen, page.owner, page.flat, shape, start, step, colour, distance, colours.mark)
+
+
+def seen_points(page: Page, every: int) -> tuple[F32, U8]:
+    """Places (N, 3) and colours (N, 3) of every n-th texel each way that a photo saw."""
+    rows, columns = np.nonzero(page.seen[::every, ::every] == 255)
+    rows, columns = rows * every, columns * every
+    return _texel_places(page.owner, page.flat, page.corners, rows, columns), page.rgb[rows, columns]
+
+
+def pad(rgb: U8, seen: U8, reach: int) -> None:
+    """Carry colours outwards into the room between charts, `reach` texels far; beyond is their mean. In place.
+
+    So neither bilinear lookups nor mip-maps draw the background into the surface.
+    """
+    import cv2
+
+    painted = seen > 0
+    if not painted.any():
+        rgb[:] = 128
+        return
+    distance, label = cv2.distanceTransformWithLabels(
+        (~painted).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    nearest = np.zeros(int(label.max()) + 1, np.int64)
+    at = np.flatnonzero(painted)
+    nearest[label.ravel()[at]] = at
+    flat = rgb.reshape(-1, 3)
+    mean = flat[at[:: max(1, len(at) // 100_000)]].mean(axis=0)
+    near = np.flatnonzero(~painted.ravel() & (distance.ravel() <= reach))
+    beyond = np.flatnonzero(distance.ravel() > reach)
+    flat[near] = flat[nearest[label.ravel()[near]]]
+    flat[beyond] = np.round(mean).astype(np.uint8)
+
+
+@njit(cache=True, parallel=True)
+def _lattice(owner, seen, flat, step):  # type: ignore[no-untyped-def]
+    """(F, 2) int32 lattice nodes in x and y over every face that has an unseen texel; zero for the others."""
+    height, width = owner.shape
+    shape = np.zeros((len(flat), 2), np.int32)
+    for f in prange(len(flat)):
+        x0, y0, x1, y1 = _box(flat, f, width, height)
+        wanting = False
+        for y in range(y0, y1 + 1):
+            for x in range(x0, x1 + 1):
+                if owner[y, x] == f and seen[y, x] == 0:
+                    wanting = True
+                    break
+            if wanting:
+                break
+        if wanting:
+            shape[f, 0], shape[f, 1] = (x1 - x0) // step + 2, (y1 - y0) // step + 2
+    return shape
+
+
+@njit(cache=True, parallel=True)
+def _places(flat, corners, shape, start, step, size):  # type: ignore[no-untyped-def]
+    out = np.empty((start[-1], 3), np.float32)
+    for f in prange(len(flat)):
+        if shape[f, 0] == 0:
+            continue
+        origin, per_x, per_y, _ = frame(flat, corners, f)
+        x0, y0, _, _ = _box(flat, f, size[1], size[0])
+        for j in range(shape[f, 1]):
+            for i in range(shape[f, 0]):
+                x, y = x0 + i * step, y0 + j * step
+                for k in range(3):
+                    out[start[f] + j * shape[f, 0] + i, k] = origin[k] + x * per_x[k] + y * per_y[k]
+    return out
+
+
+@njit(cache=True, parallel=True)
+def _interpolate(rgb, seen, owner, flat, shape, start, step, colour, distance, mark):  # type: ignore[no-untyped-def]
+    height, width = owner.shape
+    for f in prange(len(flat)):
+        if shape[f, 0] == 0:
+            continue
+        x0, y0, x1, y1 = _box(flat, f, width, height)
+        for y in range(y0, y1 + 1):
+            for x in range(x0, x1 + 1):
+                if owner[y, x] != f or seen[y, x] != 0:
+                    continue
+                i, j = (x - x0) // step, (y - y0) // step
+                fx, fy = (x - x0) / step - i, (y - y0) / step - j
+                a = start[f] + j * shape[f, 0] + i
+                b = a + shape[f, 0]
+                for k in range(3):
+                    upper = colour[a, k] * (1 - fx) + colour[a + 1, k] * fx
+                    lower = colour[b, k] * (1 - fx) + colour[b + 1, k] * fx
+                    rgb[y, x, k] = min(255.0, upper * (1 - fy) + lower * fy + 0.5)
+                seen[y, x] = mark if distance[a] <= REACH else FILLED
+
+
+@njit(cache=True, parallel=True)
+def _texel_places(owner, flat, corners, rows, columns):  # type: ignore[no-untyped-def]
+    out = np.empty((len(rows), 3), np.float32)
+    for i in prange(len(rows)):
+        f = owner[rows[i], columns[i]]
+        origin, per_x, per_y, _ = frame(flat, corners, f)
+        for k in range(3):
+            out[i, k] = origin[k] + columns[i] * per_x[k] + rows[i] * per_y[k]
+    return out
+
+
+def shaded(label: U8, normal: npt.NDArray[np.floating] | None) -> U8:
+    """(N, 3) display colours of classes (N,), a little darker where normals (N, 3) turn from above."""
+    from pipeline.classes import colour_of
+
+    rgb = colour_of()[label].astype(np.float32)
+    if normal is not None:
+        rgb *= (0.75 + 0.25 * np.clip(normal @ np.float32([0.3, 0.2, 0.93]), 0, 1))[:, None]
+    return rgb.astype(np.uint8)

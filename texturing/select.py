@@ -1,0 +1,114 @@
+"""Which photos texture a face: the best few of those that see it. Import late: it loads numba."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit, prange
+
+from pipeline.cameras import MODEL_ID, parameters, pixel_angle
+from pipeline.range_image import is_visible
+from pipeline.types import F32, U8
+from pipeline.visibility import DepthMap
+
+# where a face is looked at (barycentric): its middle, near its corners, near the middles of its edges
+_SAMPLES = np.array(
+    [[1 / 3, 1 / 3, 1 / 3], [0.9, 0.05, 0.05], [0.05, 0.9, 0.05], [0.05, 0.05, 0.9],
+     [0.48, 0.48, 0.04], [0.04, 0.48, 0.48], [0.48, 0.04, 0.48]]
+)  # fmt: skip
+
+
+class Choice:
+    """The best views of every face, found view by view in bounded memory.
+
+    Args:
+        corners: (F, 3, 3) local metres.
+        normals: (F, 3) unit.
+        count: views kept for a face.
+
+    Attributes:
+        view: (F, count) int32 indices of views, best first, -1 where fewer see the face.
+        quality: (F, count) float32 of each; 0 where there is none.
+    """
+
+    def __init__(self, corners: F32, normals: F32, count: int) -> None:
+        self._corners, self._normals = corners, normals
+        self.view = np.full((len(corners), count), -1, np.int32)
+        self.quality = np.zeros((len(corners), count), np.float32)
+
+    def offer(
+        self, index: int, depth: DepthMap, *, bias: float, max_distance: float, min_cos: float, mask: U8 | None = None
+    ) -> int:
+        """Let a view compete for every face; returns the number of faces that it sees.
+
+        Args:
+            index: of the view.
+            depth: its depth map.
+            bias: metres, of the visibility test.
+            max_distance: metres, faces farther away are left to others.
+            min_cos: of the angle between the face's normal and the ray; below it the face is left to others.
+            mask: (H, W) of any size, 0 where the photo must not be used.
+        """
+        image = depth.range
+        if mask is not None:
+            import cv2
+
+            small = cv2.resize(mask, image.shape[::-1], interpolation=cv2.INTER_NEAREST)
+            image = np.where(small > 0, image, np.float32(-1e9))  # nothing is seen there
+        rated = _rate(
+            self._corners, self._normals, image, MODEL_ID[depth.camera.model], parameters(depth.camera),
+            np.linalg.inv(depth.T_world_cam), pixel_angle(depth.camera), bias, max_distance, min_cos, _SAMPLES,
+        )  # fmt: skip
+        _insert(rated, index, self.view, self.quality)
+        return int((rated > 0).sum())
+
+    def users(self, faces: npt.NDArray[np.int64]) -> dict[int, npt.NDArray[np.int64]]:
+        """View index to those of the given faces that it is to texture, ascending."""
+        chosen = self.view[faces]
+        return {int(v): faces[(chosen == v).any(axis=1)] for v in np.unique(chosen) if v >= 0}
+
+
+@njit(cache=True, parallel=True)
+def _rate(corners, normals, depth, model, p, T, pixel, bias, max_distance, min_cos, samples):  # type: ignore[no-untyped-def]
+    """(F,) float32: cos / distance^2 (1/m2), meaned over the face's samples, 0 for those not seen."""
+    quality = np.zeros(len(corners), np.float32)
+    for f in prange(len(corners)):
+        nx = T[0, 0] * normals[f, 0] + T[0, 1] * normals[f, 1] + T[0, 2] * normals[f, 2]
+        ny = T[1, 0] * normals[f, 0] + T[1, 1] * normals[f, 1] + T[1, 2] * normals[f, 2]
+        nz = T[2, 0] * normals[f, 0] + T[2, 1] * normals[f, 1] + T[2, 2] * normals[f, 2]
+        total = 0.0
+        for s in range(len(samples)):
+            wx = wy = wz = 0.0
+            for k in range(3):
+                wx += samples[s, k] * corners[f, k, 0]
+                wy += samples[s, k] * corners[f, k, 1]
+                wz += samples[s, k] * corners[f, k, 2]
+            x = T[0, 0] * wx + T[0, 1] * wy + T[0, 2] * wz + T[0, 3]
+            y = T[1, 0] * wx + T[1, 1] * wy + T[1, 2] * wz + T[1, 3]
+            z = T[2, 0] * wx + T[2, 1] * wy + T[2, 2] * wz + T[2, 3]
+            d2 = x * x + y * y + z * z
+            if d2 > max_distance * max_distance or d2 < 1e-6:
+                continue
+            cos = -(x * nx + y * ny + z * nz) / math.sqrt(d2)
+            if cos < min_cos:
+                continue
+            if is_visible(depth, model, p, pixel, bias, x, y, z, nx, ny, nz):
+                total += cos / d2
+        quality[f] = total / len(samples)
+    return quality
+
+
+@njit(cache=True, parallel=True)
+def _insert(rated, index, view, quality):  # type: ignore[no-untyped-def]
+    """Insert a view into every face's list, kept in descending quality; ties stay with the earlier view."""
+    count = view.shape[1]
+    for f in prange(len(rated)):
+        if rated[f] <= quality[f, count - 1]:
+            continue
+        k = count - 1
+        while k > 0 and quality[f, k - 1] < rated[f]:
+            quality[f, k], view[f, k] = quality[f, k - 1], view[f, k - 1]
+            k -= 1
+        quality[f, k], view[f, k] = rated[f], index

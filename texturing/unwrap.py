@@ -1,0 +1,216 @@
+"""Unwrap: texture coordinates, on as many pages as the texel density asks for.
+
+A mesh is split in space into blocks, each of which fills one page; every block is unwrapped by itself in a
+child process with a time limit. One that the chosen backend refuses goes to the other one.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pydantic import Field
+
+from pipeline.errors import StepError
+from pipeline.step import Done, Inputs, Params, Report, Step
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from pipeline.types import Mesh
+    from texturing.atlas import Backend, Chartered
+
+    Index = npt.NDArray[np.int64]
+
+UTILISATION = 0.6
+"""Share of a page that charts are expected to cover, when blocks are cut to pages."""
+
+
+class UnwrapParams(Params):
+    """How the surface is laid flat.
+
+    Attributes:
+        backend: "uvatlas" (few charts) or "xatlas" (fast on foliage); each is the other's fallback.
+        texel: metres a texel spans; 1 cm, vegetation 3 cm.
+        page_size: pages are at most this wide and high, texels.
+        gutter: texels between charts.
+        block_faces: triangles unwrapped at once.
+        timeout: seconds that the unwrapping of one block may take, per 10 000 triangles and at least once.
+    """
+
+    backend: str = Field("uvatlas", pattern="^(uvatlas|xatlas)$")
+    texel: float = Field(0.01, gt=0)
+    page_size: int = Field(4096, ge=64, le=8192)
+    gutter: int = Field(4, ge=1, le=64)
+    block_faces: int = Field(60_000, ge=100)
+    timeout: float = Field(60.0, gt=0)
+
+
+def unwrap(inputs: Inputs, params: UnwrapParams, out: Path, report: Report) -> Done:
+    """Give every face of `mesh` its place on a page.
+
+    Files: `mesh`, with `uv` and `page`; `pages`, JSON list of {"width", "height"} in texels.
+
+    Raises:
+        StepError: neither backend can unwrap a block.
+    """
+    import numpy as np
+
+    from pipeline.types import Mesh
+
+    mesh = Mesh.load(inputs["mesh"])
+    uv = np.zeros((len(mesh), 3, 2), np.float32)
+    page = np.zeros(len(mesh), np.int16)
+    pages: list[dict[str, int]] = []
+    charts, fallbacks = 0, 0
+    waiting = split(mesh, params) if len(mesh) else []
+    while waiting:
+        report(float((page >= 0).mean()) if pages else 0.0, f"{len(waiting)} blocks")
+        again: list[Index] = []
+        for block, flat in zip(waiting, _unwrap_all(mesh, waiting, params), strict=True):
+            if max(flat.width, flat.height) > params.page_size and len(block) > 1:
+                again += halves(mesh, block)  # charts left more room between them than was expected
+                continue
+            page[block] = len(pages)
+            uv[block] = flat.uv
+            pages.append({k: min(getattr(flat, k), params.page_size) for k in ("width", "height")})
+            charts += flat.charts
+            fallbacks += flat.backend != params.backend
+        waiting = again
+    (out / "pages.json").write_text(json.dumps(pages), encoding="utf-8")
+    done = Mesh(mesh.frame, mesh.vertices, mesh.faces, mesh.density, uv, page, mesh.label)
+    done.save(out / "mesh.npz")
+    warnings = []
+    if fallbacks:
+        other = "xatlas" if params.backend == "uvatlas" else "uvatlas"
+        warnings.append(f"{fallbacks} of {len(pages)} blocks were unwrapped by {other}: {params.backend} refused them")
+    facts = _facts(done, pages) | {"charts": charts, "backend": params.backend, "fallbacks": fallbacks}
+    return Done({"mesh": out / "mesh.npz", "pages": out / "pages.json"}, facts, warnings)
+
+
+def split(mesh: Mesh, params: UnwrapParams) -> list[Index]:
+    """Compact blocks of faces (indices), each of which should fill one page at the asked density."""
+    import numpy as np
+
+    area = mesh.face_area
+    limit = UTILISATION * (params.page_size * params.texel) ** 2
+
+    def cut(block: Index) -> list[Index]:
+        if len(block) < 2 or (area[block].sum() <= limit and len(block) <= params.block_faces):
+            return [block]
+        return [part for half in halves(mesh, block) for part in cut(half)]
+
+    return cut(np.arange(len(mesh)))
+
+
+def halves(mesh: Mesh, block: Index) -> list[Index]:
+    """A block cut across its longest side into two of about equal area; indices stay ascending."""
+    import numpy as np
+
+    centre = mesh.vertices[mesh.faces[block]].mean(axis=1)
+    order = np.argsort(centre[:, np.ptp(centre, axis=0).argmax()], kind="stable")
+    area = np.cumsum(mesh.face_area[block][order], dtype=np.float64)
+    middle = int(np.clip(np.searchsorted(area, area[-1] / 2), 1, len(block) - 1))
+    return [np.sort(block[order[:middle]]), np.sort(block[order[middle:]])]
+
+
+def _unwrap_all(mesh: Mesh, blocks: list[Index], params: UnwrapParams) -> list[Chartered]:
+    """Unwrap blocks on all cores, a child process a core; what fails is tried alone, then by the other backend."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    workers = max(1, min(os.cpu_count() or 1, len(blocks)))
+    by_size = sorted(range(len(blocks)), key=lambda i: -len(blocks[i]))
+    shares = [by_size[k::workers] for k in range(workers)]
+    other = "xatlas" if params.backend == "uvatlas" else "uvatlas"
+    with ThreadPoolExecutor(workers) as pool:
+        first = pool.map(lambda share: _in_child(mesh, [blocks[i] for i in share], params.backend, params), shares)
+        results: dict[int, Any] = {
+            i: one for share, flat in zip(shares, first, strict=True) for i, one in zip(share, flat, strict=True)
+        }
+        for backend in (params.backend, other):
+            failed = [i for i, flat in results.items() if isinstance(flat, str)]
+            if backend == params.backend:  # one block can take its companions down with it: alone, the others pass
+                failed = [i for i in failed if results[i].startswith(CHILD) and len(blocks) > workers]
+            retried = pool.map(lambda i, b=backend: _in_child(mesh, [blocks[i]], b, params)[0], failed)
+            results.update(zip(failed, retried, strict=True))
+    for i, flat in results.items():
+        if isinstance(flat, str):
+            raise StepError(
+                "unwrap", f"neither UVAtlas nor xatlas can unwrap a block of {len(blocks[i])} faces ({flat})",
+                "Set a smaller `unwrap.block_faces`, or decimate further",
+            )  # fmt: skip
+    return [results[i] for i in range(len(blocks))]
+
+
+CHILD = "child process: "
+
+
+def _in_child(mesh: Mesh, blocks: list[Index], backend: Backend, params: UnwrapParams) -> list[Chartered | str]:
+    """Unwrap blocks in one child process; a reason for each that failed."""
+    import numpy as np
+
+    from pipeline import isolate
+
+    parts = []
+    for block in blocks:
+        used, faces = np.unique(mesh.faces[block], return_inverse=True)
+        parts.append((mesh.vertices[used], faces.reshape(-1, 3).astype(np.int32)))
+    timeout = params.timeout * sum(max(1.0, len(block) / 10_000) for block in blocks)
+    try:
+        return isolate.call(
+            "texturing.atlas:unwrap_blocks", backend, parts, params.texel, params.gutter, timeout=timeout, threads=1
+        )
+    except StepError as error:
+        return [CHILD + error.cause] * len(blocks)
+
+
+def _facts(mesh: Mesh, pages: list[dict[str, int]]) -> dict[str, Any]:
+    """Figures of an unwrapped mesh: pages, texels, utilisation, density achieved, stretch."""
+    import numpy as np
+
+    if not pages:
+        return {"faces": len(mesh), "pages": 0, "texels": 0}
+    assert mesh.uv is not None and mesh.page is not None
+    size = np.array([[p["width"], p["height"]] for p in pages], float)
+    flat = mesh.uv * size[mesh.page][:, None, :].astype(np.float32)
+    a, b = flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0]
+    texels = float(np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(dtype=np.float64) / 2)
+    area = float(mesh.face_area.sum(dtype=np.float64))
+    total = float(size.prod(axis=1).sum())
+    return {
+        "faces": len(mesh),
+        "pages": len(pages),
+        "page_sizes": [f"{p['width']}x{p['height']}" for p in pages],
+        "texels": int(total),
+        "utilisation": round(texels / total, 3),
+        "texel_m": round((area / max(texels, 1.0)) ** 0.5, 4),
+        "stretch_median": round(float(np.median(stretch(mesh.corners, flat))), 3),
+    }
+
+
+def stretch(corners: npt.NDArray[Any], flat: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """(N,) how much longer one direction of a face is drawn than the other, 1 for none; degenerate faces left out.
+
+    Args:
+        corners: (F, 3, 3) in space.
+        flat: (F, 3, 2) in the texture.
+    """
+    import numpy as np
+
+    e1, e2 = (corners[:, k].astype(np.float64) - corners[:, 0] for k in (1, 2))
+    length = np.linalg.norm(e1, axis=1)
+    height = np.linalg.norm(np.cross(e1, e2), axis=1) / np.maximum(length, 1e-12)
+    along = np.einsum("ij,ij->i", e1, e2) / np.maximum(length, 1e-12)
+    good = (length > 1e-6) & (height > 1e-6)
+    # the map from the face's own plane (e1 along x) to the texture, columns by solving for both edges
+    a, b = (flat[:, k].astype(np.float64) - flat[:, 0] for k in (1, 2))
+    jx = a[good] / length[good, None]
+    jy = (b[good] - jx * along[good, None]) / height[good, None]
+    s = np.linalg.svd(np.stack([jx, jy], axis=2), compute_uv=False)
+    return s[:, 0] / np.maximum(s[:, 1], 1e-12)
+
+
+UNWRAP = Step("unwrap", 1, unwrap, UnwrapParams, {"vegetation": {"backend": "xatlas", "texel": 0.03}})
