@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -29,6 +29,9 @@ Force = Annotated[bool, typer.Option("--force", help="Run everything again.")]
 From = Annotated[str | None, typer.Option("--from", metavar="STEP", help="Run this step and what follows again.")]
 Name = Annotated[str | None, typer.Option("--name", help="The tile's name; default: from the folder.")]
 TileOut = Annotated[Path, typer.Option("--out", "-o", help="The tile's folder.")]
+Crs = Annotated[str | None, typer.Option(help='CRS, where the files lack it: "EPSG:32633", or "local".')]
+Link = Annotated[bool, typer.Option("--link", help="Link files into the tile instead of copying them.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a tile that is there already.")]
 
 
 def _version(wanted: bool) -> None:
@@ -109,13 +112,19 @@ def import_kitti(
     drive: Annotated[Path, typer.Argument(help="A drive's folder (..._sync), or one that holds it.")],
     out: TileOut,
     poses: Annotated[Path | None, typer.Option(help="Sweep poses instead of OXTS: row-major 3x4 a line.")] = None,
+    max_range: Annotated[float, typer.Option(help="Metres; returns from further away are left out.")] = 50.0,
+    name: Name = None,
+    link: Link = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """KITTI raw: merge sweeps by OXTS or a pose file, colour points from the photos."""
     from flows.display import progress
     from pipeline.io.kitti import import_kitti_raw
 
     with progress("import") as report:
-        path = import_kitti_raw(drive, out, poses=poses, report=report)
+        path = import_kitti_raw(
+            drive, out, poses=poses, max_range=max_range, name=name, link=link, overwrite=overwrite, report=report
+        )
     typer.echo(f"Tile: {path}")
 
 
@@ -125,13 +134,23 @@ def import_colmap_model(
     images: Annotated[Path, typer.Argument(help="Folder of the photos.")],
     out: TileOut,
     cloud: Annotated[Path | None, typer.Option(help="Dense cloud (LAS, LAZ, PLY); default: the sparse points.")] = None,
+    crs: Crs = "local",
+    upright: Annotated[bool, typer.Option("--upright", help="Turn the model so that the photos stand upright.")] = False,
+    scale: Annotated[float, typer.Option(help="Metres per unit of the model.")] = 1.0,
+    name: Name = None,
+    link: Link = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """COLMAP model, text or binary."""
     from flows.display import progress
     from pipeline.io.colmap import import_colmap
 
+    up: Literal["photos"] | None = "photos" if upright else None
     with progress("import") as report:
-        path = import_colmap(model, images, out, cloud=cloud, report=report)
+        path = import_colmap(
+            model, images, out, cloud=cloud, crs=crs or "local", up=up, scale=scale,
+            name=name, link=link, overwrite=overwrite, report=report,
+        )  # fmt: skip
     typer.echo(f"Tile: {path}")
 
 
@@ -139,16 +158,25 @@ def import_colmap_model(
 def import_las_files(
     clouds: Annotated[list[Path], typer.Argument(help="LAS, LAZ, COPC or PLY files.")],
     out: TileOut,
-    cameras: Annotated[Path | None, typer.Option(help="CSV of photos, cameras and poses (docs/formats.md).")] = None,
-    crs: Annotated[str | None, typer.Option(help='CRS, where the clouds lack it: "EPSG:32633", or "local".')] = None,
+    photos: Annotated[Path | None, typer.Option(help="CSV of photos and poses (docs/formats.md).")] = None,
+    cameras: Annotated[Path | None, typer.Option(help="CSV of cameras, where the photos' lacks them.")] = None,
+    images: Annotated[Path | None, typer.Option(help="Folder of the photos; default: the CSV's.")] = None,
+    crs: Crs = None,
+    units: Annotated[str | None, typer.Option(help="m, ft or us-ft, where the CRS doesn't say.")] = None,
+    trajectory: Annotated[Path | None, typer.Option(help="CSV of the scanner's path: time,x,y,z.")] = None,
     name: Name = None,
+    link: Link = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Plain clouds, with a CSV of photos if there are any."""
     from flows.display import progress
     from pipeline.io.las_csv import import_las
 
     with progress("import") as report:
-        path = import_las(clouds, out, crs=crs, cameras_csv=cameras, name=name, report=report)
+        path = import_las(
+            clouds, out, photos=photos, cameras=cameras, images=images, crs=crs, units=units, trajectory=trajectory,
+            name=name, link=link, overwrite=overwrite, report=report,
+        )  # fmt: skip
     typer.echo(f"Tile: {path}")
 
 

@@ -80,8 +80,9 @@ class Settings:
             SettingError: a value out of range or of the wrong kind.
         """
         table = self.values.get(step.name, {})
-        general = {k: v for k, v in table.items() if k not in GROUPS}
-        special = table.get(group, {}) if group else {}
+        classes = {k: v for k, v in table.items() if k in GROUPS and isinstance(v, Mapping)}
+        general = {k: v for k, v in table.items() if k not in classes}
+        special = classes.get(group or "", {})
         merged = {**given, **step.per_class.get(group or "", {}), **general, **special}
         try:
             return step.params(**merged)

@@ -265,6 +265,11 @@ class Mesh:
         c = self.corners
         return np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0])
 
+    def moved_to(self, frame: Frame) -> Mesh:
+        """The same mesh in local coordinates of another frame (of the same CRS)."""
+        shift = np.asarray(self.frame.origin) - np.asarray(frame.origin)
+        return replace(self, frame=frame, vertices=(self.vertices + shift).astype(np.float32))
+
     def keep(self, mask: npt.NDArray[np.bool_]) -> Mesh:
         """The faces that `mask` (F,) selects, without the vertices that none of them uses."""
         faces = self.faces[mask]

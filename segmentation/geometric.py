@@ -172,7 +172,7 @@ def _above_ground(xyz: F32, height: F32, weight: F64, report: Report) -> U8:
     _buildings(label, xyz, height, shape)
     report(0.8, "things")
     rough = _mean(shape.variation, shape)
-    _poles(label, xyz, height, shape, rough)
+    _poles(label, xyz, shape)
     _vehicles(label, xyz, height, shape, rough)
     rest = label == 0
     label[rest & (rough > ROUGH)] = CODE["high_vegetation"]
@@ -201,8 +201,8 @@ def describe(xyz: F32, weight: F64, k: int) -> Shape:
         near[some], gap[some] = index[:, 1:], distance[:, 1:]
         around = xyz[index].astype(np.float64) - xyz[some, None]
         share = weight[index] / weight[index].sum(axis=1, keepdims=True)
-        around -= np.einsum("nk,nki->ni", share, around)[:, None]
-        values, vectors = np.linalg.eigh(np.einsum("nk,nki,nkj->nij", share, around, around, optimize=True))
+        around -= share[:, None] @ around
+        values, vectors = np.linalg.eigh((around * share[:, :, None]).transpose(0, 2, 1) @ around)
         total, largest = np.maximum(values.sum(axis=1), 1e-12), np.maximum(values[:, 2], 1e-12)
         variation[some] = values[:, 0] / total
         linearity[some] = (values[:, 2] - values[:, 1]) / largest
@@ -246,13 +246,12 @@ class Parts:
 
 
 def _parts(xyz: F32, member: Bools, a: Ints, b: Ints) -> Parts:
-    """Connected parts of the points that are `member`, over the edges `a`-`b`."""
+    """Connected parts of the points that are `member`, over edges `a`-`b` between them."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
     n = len(xyz)
-    inside = member[a] & member[b]
-    edges = coo_matrix((np.ones(inside.sum(), np.int8), (a[inside], b[inside])), shape=(n, n))
+    edges = coo_matrix((np.ones(len(a), np.int8), (a, b)), shape=(n, n))
     _, of = connected_components(edges, directed=False)
     of = np.where(member, of, -1).astype(np.int64)
     _, of[member] = np.unique(of[member], return_inverse=True)
@@ -271,18 +270,20 @@ def _boxes(xyz: F32, of: Ints) -> Parts:
     return Parts(of, low, high, count)
 
 
-def _edges(shape: Shape, k: int, reach: float) -> tuple[Ints, Ints]:
-    """Pairs of neighbours (first `k`) that are nearer than `reach` or than three times the local spacing."""
-    near, gap = shape.near[:, :k], shape.gap[:, :k]
-    close = gap < np.maximum(reach, 3 * gap[:, :1])
-    return np.nonzero(close)[0], near[close].astype(np.int64)
+def _edges(shape: Shape, member: Bools, k: int, reach: float) -> tuple[Ints, Ints]:
+    """Pairs of neighbours (first `k`) that are members, nearer than `reach` or than three times the local spacing."""
+    rows = np.flatnonzero(member)
+    near, gap = shape.near[rows, :k], shape.gap[rows, :k]
+    close = (gap < np.maximum(reach, 3 * gap[:, :1])) & member[near]
+    return rows[np.nonzero(close)[0]], near[close].astype(np.int64)
 
 
 def _buildings(label: U8, xyz: F32, height: F32, shape: Shape) -> None:
     """Large smooth surfaces: high ones are buildings, long low upright ones walls."""
-    a, b = _edges(shape, 8, 0.3)
+    smooth = shape.variation < SMOOTH
+    a, b = _edges(shape, smooth, 8, 0.3)
     same = np.abs(np.einsum("ni,ni->n", shape.normal[a], shape.normal[b])) > BEND
-    parts = _parts(xyz, shape.variation < SMOOTH, a[same], b[same])
+    parts = _parts(xyz, smooth, a[same], b[same])
     k = shape.gap.shape[1]
     area = parts.total(np.pi * shape.gap[:, -1] ** 2 / k)
     top = _top(parts, height)
@@ -295,16 +296,14 @@ def _buildings(label: U8, xyz: F32, height: F32, shape: Shape) -> None:
     _paint(label, parts, wall, CODE["wall_or_fence"])
     # what hangs on a building and on little else: edges, balconies, sparsely seen walls
     hangs = (label[shape.near] == CODE["building"]).any(axis=1)
-    a, b = _edges(shape, 8, 0.3)
-    parts = _parts(xyz, label == 0, a, b)
+    parts = _parts(xyz, label == 0, *_edges(shape, label == 0, 8, 0.3))
     _paint(label, parts, parts.mean(hangs) > 0.5, CODE["building"])
 
 
-def _poles(label: U8, xyz: F32, height: F32, shape: Shape, rough: F32) -> None:
-    """Thin upright lines that carry no crown."""
-    a, b = _edges(shape, NEIGHBOURS, 0.4)
+def _poles(label: U8, xyz: F32, shape: Shape) -> None:
+    """Thin upright lines, trunks of trees among them."""
     line = (label == 0) & (shape.linearity > 0.6) & (shape.upright > 0.9)
-    parts = _parts(xyz, line, a, b)
+    parts = _parts(xyz, line, *_edges(shape, line, NEIGHBOURS, 0.4))
     thin = (np.hypot(parts.size[:, 0], parts.size[:, 1]) < POLE_WIDTH) & (parts.size[:, 2] > POLE_HEIGHT)
     _paint(label, parts, thin, CODE["pole"])
 
@@ -323,8 +322,7 @@ def _vehicles(label: U8, xyz: F32, height: F32, shape: Shape, rough: F32) -> Non
         return
     inside = np.zeros(len(label), bool)
     inside[band] = True
-    a, b = _edges(shape, NEIGHBOURS, 0.3)
-    of = _parts(xyz, inside, a, b).of
+    of = _parts(xyz, inside, *_edges(shape, inside, NEIGHBOURS, 0.3)).of
     rest = np.flatnonzero(free & ~inside & (height < VEHICLE_HEIGHT[1]))
     gap, nearest = cKDTree(xyz[band, :2]).query(xyz[rest, :2], distance_upper_bound=0.3)
     close = np.isfinite(gap)

@@ -92,12 +92,13 @@ def manifold(faces: I32) -> tuple[I32, I32]:
 
 
 def _crowded(faces: I32) -> np.ndarray:
-    """(F,) whether a face has an edge that more than two faces share, or two in the same direction."""
+    """(F,) whether a face has an edge that more than two faces share, or two in the same direction, or has a twin."""
     start, end = faces.ravel().astype(np.int64), faces[:, [1, 2, 0]].ravel().astype(np.int64)
     key = np.minimum(start, end) << 32 | np.maximum(start, end)
     _, index, count = np.unique(key, return_inverse=True, return_counts=True)
     _, directed, same = np.unique(start << 32 | end, return_inverse=True, return_counts=True)
-    return ((count[index] > 2) | (same[directed] > 1)).reshape(-1, 3).any(axis=1)
+    _, kind, twins = np.unique(np.sort(faces, axis=1), axis=0, return_inverse=True, return_counts=True)
+    return ((count[index] > 2) | (same[directed] > 1)).reshape(-1, 3).any(axis=1) | (twins[kind.ravel()] > 1)
 
 
 def _area(corners: F32) -> float:

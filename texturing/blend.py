@@ -15,6 +15,8 @@ from pipeline.range_image import is_visible
 from pipeline.types import F32, I32
 
 BAND = 32
+EDGE = 0.01
+"""Share of its weight that a photo keeps beside something that hides what is behind."""
 
 
 def texels(uv: F32, width: int, height: int) -> F32:
@@ -112,7 +114,7 @@ def _sample(image, u, v, wrap):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, parallel=True)
 def accumulate(
-    total, owner, faces, flat, corners, normals, photo, mask, model, p, depth, depth_p, R, t, pixel,
+    total, owner, faces, flat, corners, normals, photo, mask, model, p, depth, near, depth_p, R, t, pixel,
     bias, power, feather, min_cos,
 ):  # type: ignore[no-untyped-def]  # fmt: skip
     """Add what one photo says to the texels of a page; returns the number of texels that it sees.
@@ -125,6 +127,8 @@ def accumulate(
         photo: the photo and its halvings, (h, w, 3) uint8 each.
         mask: (h, w) uint8, 0 where it must not be used; (0, 0) for none.
         model, p: camera of the photo; `depth`, `depth_p`: range image and its camera.
+        near: the least range around every pixel of `depth`; beside something nearer the photo's own pixels
+            mix both, and its weight falls to `EDGE`.
         R, t: (3, 3) and (3,), camera from local.
         pixel: radians a pixel of the range image spans.
         bias: metres, of the visibility test.
@@ -171,6 +175,8 @@ def accumulate(
                 if not wide:
                     border = min(border, min(u + 0.5, p[12] - 0.5 - u))
                 w = (cos / d2) ** power * (0.02 + 0.98 * min(1.0, border / feather))
+                if not is_visible(near, model, depth_p, 3 * pixel, bias, x, y, z, n[0], n[1], n[2]):
+                    w *= EDGE
                 # texels wider than the photo's pixels are sampled from a halved photo
                 ratio = size * focal / distance
                 level = 0

@@ -147,6 +147,7 @@ class Painter:
             faces: (N,) those on the page.
             width, height: of the page, texels.
         """
+        import cv2
         import numpy as np
 
         from pipeline.cameras import MODEL_ID, parameters, pixel_angle
@@ -171,7 +172,8 @@ class Painter:
                 self.used[i] = self.used.get(i, 0) + int(
                     blend.accumulate(
                         total, owner, np.searchsorted(faces, chosen), flat, corners, normals, *photo,
-                        MODEL_ID[view.camera.model], parameters(view.camera), depth.range, parameters(depth.camera),
+                        MODEL_ID[view.camera.model], parameters(view.camera), depth.range, cv2.erode(depth.range, np.ones((3, 3))),
+                        parameters(depth.camera),
                         np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3]), pixel_angle(depth.camera),
                         p.bias, p.power, p.feather * view.camera.width, p.min_cos,
                     )

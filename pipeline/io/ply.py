@@ -40,9 +40,8 @@ def read(path: Path, frame: Frame) -> PointCloud:
         colours = loaded.visual.vertex_colors
     rgb = np.asarray(colours, np.uint8)[:, :3] if colours is not None and len(colours) == len(xyz) else None
     data = loaded.metadata.get("_ply_raw", {}).get("vertex", {}).get("data")
-    names = (
-        data if isinstance(data, dict) else getattr(getattr(data, "dtype", None), "names", None) or ()
-    )  # ASCII: dict
+    fields = getattr(getattr(data, "dtype", None), "names", None) or ()
+    names = data if isinstance(data, dict) else fields  # trimesh gives ASCII as a dict
     label = next(
         (np.asarray(data[n]).ravel().astype(np.uint8) for n in ("classification", "class", "label") if n in names), None
     )

@@ -65,7 +65,7 @@ def truth_error(mesh: Mesh, truth: Mesh, group: str, samples: int) -> float:
     import numpy as np
 
     assert truth.label is not None
-    same = truth.keep(group_of()[truth.label] == GROUPS.index(group))  # type: ignore[arg-type]
+    same = truth.keep(group_of()[truth.label] == GROUPS.index(group)).moved_to(mesh.frame)  # type: ignore[arg-type]
     points = spread(mesh, samples)
     low, high = same.vertices.min(axis=0)[:2], same.vertices.max(axis=0)[:2]
     points = points[((points[:, :2] >= low) & (points[:, :2] <= high)).all(axis=1)]
