@@ -1,4 +1,4 @@
-"""Kernels of `pipeline.visibility`: triangles and discs into a range image, points tested against it.
+"""Kernels of `pipeline.visibility`: discs into a range image, points tested against it.
 
 Footprints are sorted into bands of rows, one thread a band, so that no two threads write one pixel and
 the result does not depend on their number. Import this module late: it loads numba.
@@ -11,26 +11,16 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from pipeline.cameras import EQUIRECTANGULAR, FISHEYE, PINHOLE, project_point
+from pipeline.cameras import EQUIRECTANGULAR, FISHEYE, project_point
 from pipeline.types import F32, F64
 
 BAND = 32
+SLOPE_SHARE = 0.4
+"""Of a pixel's footprint times the slope, what is added to the bias; more leaks, less hides falsely."""
 MAX_SLOPE = 30.0
 """tan(incidence) beyond which the bias grows no more (88 degrees)."""
-SPLITS = 4
-"""Triangles partly out of view are split this many times to find their footprint."""
 MAX_DISC = 40
 """Discs are drawn at most this many pixels to each side: one that near to the camera is noise."""
-
-
-def draw_triangles(depth: F32, rays: F32, model: int, p: F64, T_cam_world: F64, triangles: F32) -> None:
-    """Draw triangles (F, 3, 3), local coordinates, into the range image `depth` (H, W), in place.
-
-    `rays` (H, W, 3) are the pixels' unit rays; `model`, `p` the camera (`pipeline.cameras`).
-    """
-    corners = _to_camera(triangles.reshape(-1, 3), T_cam_world).reshape(-1, 3, 3)
-    boxes = _triangle_boxes(corners, model, p)
-    _fill(depth, rays, corners, boxes, *_bands(boxes, depth.shape[0]))
 
 
 def draw_discs(
@@ -42,7 +32,8 @@ def draw_discs(
     turned[:3, 3] = 0
     discs = np.ascontiguousarray(np.stack([at, _to_camera(normals, turned), np.full_like(at, radius)], axis=1))
     boxes = _disc_boxes(discs, model, p)
-    _fill(depth, rays, discs, boxes, *_bands(boxes, depth.shape[0]), True)
+    start, index = _bands(boxes, depth.shape[0])
+    _fill(depth, rays, discs, boxes, start, index)
 
 
 @njit(cache=True, parallel=True)
@@ -53,109 +44,6 @@ def _to_camera(points, T):  # type: ignore[no-untyped-def]
         for k in range(3):
             out[i, k] = T[k, 0] * x + T[k, 1] * y + T[k, 2] * z + T[k, 3]
     return out
-
-
-@njit(cache=True)
-def _wide(s):  # type: ignore[no-untyped-def]
-    """Whether an edge of the triangle (3, 3) spans more than about 0.15 rad, so that distortion bends it visibly."""
-    near, longest = np.inf, 0.0
-    for k in range(3):
-        m = (k + 1) % 3
-        near = min(near, s[k, 0] ** 2 + s[k, 1] ** 2 + s[k, 2] ** 2)
-        longest = max(longest, (s[k, 0] - s[m, 0]) ** 2 + (s[k, 1] - s[m, 1]) ** 2 + (s[k, 2] - s[m, 2]) ** 2)
-    return longest > 0.0225 * near
-
-
-@njit(cache=True)
-def _whole(model, p, s, level):  # type: ignore[no-untyped-def]
-    """1 if the corners of triangle (3, 3) bound its footprint, 0 if it must be split to know, -1 if it is out of view."""
-    hidden = 0
-    for k in range(3):
-        hidden += not project_point(model, p, s[k, 0], s[k, 1], s[k, 2])[2]
-    if hidden == 3 and s[0, 2] < 0 and s[1, 2] < 0 and s[2, 2] < 0:
-        return -1
-    return 0 if level > 0 and (hidden > 0 or (model != PINHOLE and _wide(s))) else 1
-
-
-@njit(cache=True)
-def _take_in(box, model, p, s):  # type: ignore[no-untyped-def]
-    """Grow a footprint (u0, v0, u1, v1) by those corners of a triangle (3, 3) that are in view.
-
-    Around the back of a full sphere columns are unrolled to be next to the footprint's first ones.
-    """
-    for k in range(3):
-        u, v, ok = project_point(model, p, s[k, 0], s[k, 1], s[k, 2])
-        if not ok:
-            continue
-        if model == EQUIRECTANGULAR and box[0] <= box[2]:
-            u -= round((u - 0.5 * (box[0] + box[2])) / p[12]) * p[12]
-        box[0], box[1] = min(box[0], u), min(box[1], v)
-        box[2], box[3] = max(box[2], u), max(box[3], v)
-
-
-@njit(cache=True)
-def _grow(box, model, p, triangle):  # type: ignore[no-untyped-def]
-    """Grow a footprint by a triangle (3, 3); one that is partly out of view or bent is split into four, again and again."""
-    state = _whole(model, p, triangle, SPLITS)
-    if state == 1:
-        _take_in(box, model, p, triangle)
-    if state != 0:
-        return
-    waiting = np.empty((3 * SPLITS + 4, 3, 3), np.float32)
-    level = np.empty(len(waiting), np.int64)
-    waiting[0], level[0], n = triangle, SPLITS, 1
-    while n > 0:
-        n -= 1
-        s, deep = waiting[n].copy(), level[n]
-        state = _whole(model, p, s, deep)
-        if state == 1:
-            _take_in(box, model, p, s)
-        if state == 0:
-            for part in range(4):  # three at the corners, and the middle one
-                for k in range(3):
-                    a, b = (part, k) if part < 3 else (k, (k + 1) % 3)
-                    for c in range(3):
-                        waiting[n, k, c] = np.float32(0.5) * (s[a, c] + s[b, c])
-                level[n] = deep - 1
-                n += 1
-
-
-@njit(cache=True)
-def _clamp(box, width, height, margin):  # type: ignore[no-untyped-def]
-    """Footprint to whole pixels within the image's rows; columns are clamped by the caller's wrapping."""
-    return (
-        int(math.floor(max(-1e6, box[0]) - margin)),
-        int(math.floor(max(0.0, box[1] - margin))),
-        int(math.ceil(min(1e6, box[2]) + margin)),
-        int(math.ceil(min(height - 1.0, box[3] + margin))),
-    )
-
-
-@njit(cache=True, parallel=True)
-def _triangle_boxes(corners, model, p):  # type: ignore[no-untyped-def]
-    """(F, 4) int32 footprints u0 v0 u1 v1, inclusive; v1 < v0 for what is out of view."""
-    boxes = np.empty((len(corners), 4), np.int32)
-    width, height = p[12], p[13]
-    curved = 0.0 if model == PINHOLE else 0.02
-    for i in prange(len(corners)):
-        box = np.array([np.inf, np.inf, -np.inf, -np.inf])
-        _grow(box, model, p, corners[i])
-        boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = 0, 0, -1, -1
-        if box[0] > box[2]:
-            continue
-        margin = 1 + curved * max(box[2] - box[0], box[3] - box[1])  # edges bend under distortion
-        u0, v0, u1, v1 = _clamp(box, width, height, margin)
-        if model != EQUIRECTANGULAR:
-            u0, u1 = max(u0, 0), min(u1, int(width) - 1)
-        else:
-            if v0 < 0.1 * height or v1 > 0.9 * height:  # near a pole: the triangle may go around it
-                u0, u1 = 0, int(width) - 1
-                v0, v1 = (0, v1) if v0 < 0.1 * height else (v0, int(height) - 1)
-            if u1 - u0 >= width:
-                u0, u1 = 0, int(width) - 1
-        if u0 <= u1 and v0 <= v1:
-            boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = u0, v0, u1, v1
-    return boxes
 
 
 @njit(cache=True, parallel=True)
@@ -207,43 +95,21 @@ def _bands(boxes, height):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, parallel=True)
-def _fill(depth, rays, shapes, boxes, start, index, disc=False):  # type: ignore[no-untyped-def]
-    """Keep in every pixel the least range at which its ray meets a shape: a triangle's corners, or a disc."""
+def _fill(depth, rays, discs, boxes, start, index):  # type: ignore[no-untyped-def]
+    """Keep in every pixel the least range at which its ray meets a disc."""
     height, width = depth.shape
     for band in prange(len(start) - 1):
         first, last = band * BAND, min(height, (band + 1) * BAND) - 1
         for j in range(start[band], start[band + 1]):
             i = index[j]
-            s = shapes[i]
+            s = discs[i]
             for v in range(max(first, boxes[i, 1]), min(last, boxes[i, 3]) + 1):
                 for column in range(boxes[i, 0], boxes[i, 2] + 1):
                     u = column % width
                     ray = rays[v, u]
-                    t = _meet_disc(ray, s) if disc else _meet_triangle(ray, s)
+                    t = _meet_disc(ray, s)
                     if 0 < t < depth[v, u]:  # a NaN ray meets nothing
                         depth[v, u] = t
-
-
-@njit(cache=True, inline="always")
-def _meet_triangle(d, s):  # type: ignore[no-untyped-def]
-    """Range at which the unit ray d meets the triangle s (3, 3), -1 if it does not (Moeller and Trumbore 1997)."""
-    ax, ay, az = s[0, 0], s[0, 1], s[0, 2]
-    e1x, e1y, e1z = s[1, 0] - ax, s[1, 1] - ay, s[1, 2] - az
-    e2x, e2y, e2z = s[2, 0] - ax, s[2, 1] - ay, s[2, 2] - az
-    px, py, pz = d[1] * e2z - d[2] * e2y, d[2] * e2x - d[0] * e2z, d[0] * e2y - d[1] * e2x
-    det = e1x * px + e1y * py + e1z * pz
-    if abs(det) < 1e-12:
-        return -1.0
-    f = 1.0 / det
-    eps = 1e-4  # no cracks between neighbours
-    b1 = -(ax * px + ay * py + az * pz) * f
-    if b1 < -eps or b1 > 1 + eps:
-        return -1.0
-    qx, qy, qz = -(ay * e1z - az * e1y), -(az * e1x - ax * e1z), -(ax * e1y - ay * e1x)
-    b2 = (d[0] * qx + d[1] * qy + d[2] * qz) * f
-    if b2 < -eps or b1 + b2 > 1 + eps:
-        return -1.0
-    return (e2x * qx + e2y * qy + e2z * qz) * f
 
 
 @njit(cache=True, inline="always")
@@ -283,8 +149,8 @@ def is_visible(depth, model, p, pixel, bias, x, y, z, nx, ny, nz):  # type: igno
     if nx != 0 or ny != 0 or nz != 0:
         c = min(1.0, abs(x * nx + y * ny + z * nz) / r)
         slope = min(MAX_SLOPE, math.sqrt(1 - c * c) / max(c, 1e-6))
-    # a neighbour on the same plane may be nearer by footprint times slope, half a pixel away to each side
-    return r <= depth[row, column] + bias + r * pixel * slope
+    # the pixel's own ray meets the same plane up to half a pixel away: nearer by that times the slope
+    return r <= depth[row, column] + bias + SLOPE_SHARE * r * pixel * slope
 
 
 @njit(cache=True, parallel=True)

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -86,8 +87,8 @@ class Renderer:
         for i, body in enumerate(self.bodies):
             if len(body.mesh):
                 key = self._casting.add_triangles(
-                    o3d.core.Tensor(np.ascontiguousarray(body.mesh.vertices)),
-                    o3d.core.Tensor(np.ascontiguousarray(body.mesh.faces, dtype=np.uint32)),
+                    _tensor(body.mesh.vertices),
+                    _tensor(body.mesh.faces.astype(np.uint32)),
                 )
                 self._body_of[int(key)] = i
         self._pixels = lru_cache(maxsize=16)(_read)
@@ -144,15 +145,14 @@ class Renderer:
         return self._cast(width, height, at, background, shaded, wireframe)
 
     def nearest(self, points: F32) -> tuple[U8, U8, F32]:
-        """Colours (N, 3) and masks (N,) of the places on the meshes nearest to points (N, 3), and metres to them (N,)."""
-        import open3d as o3d
+        """Colours (N, 3) and masks (N,) of the places on the meshes nearest to points (N, 3), and metres to them."""
 
         rgb, seen = np.zeros((len(points), 3), np.uint8), np.zeros(len(points), np.uint8)
         distance = np.full(len(points), np.inf, np.float32)
         if not self._body_of:
             return rgb, seen, distance
         points = np.ascontiguousarray(points, np.float32)
-        answer = self._casting.compute_closest_points(o3d.core.Tensor(points))
+        answer = self._casting.compute_closest_points(_tensor(points))
         distance[:] = np.linalg.norm(answer["points"].numpy() - points, axis=1)
         face = answer["primitive_ids"].numpy().astype(np.int32)
         barycentric, which = answer["primitive_uvs"].numpy(), answer["geometry_ids"].numpy()
@@ -165,7 +165,6 @@ class Renderer:
     def _cast(
         self, width: int, height: int, rays: Rays, background: tuple[int, int, int], shaded: bool, wireframe: bool
     ) -> Image:
-        import open3d as o3d
 
         n = width * height
         rgb = np.tile(np.array(background, np.uint8), (n, 1))
@@ -181,7 +180,7 @@ class Renderer:
             here = slice(first, min(n, first + CHUNK))
             origin, direction = rays(here.start, here.stop)
             cast = np.nan_to_num(np.concatenate([origin, direction], axis=1)).astype(np.float32)
-            answer = self._casting.cast_rays(o3d.core.Tensor(np.ascontiguousarray(cast)))
+            answer = self._casting.cast_rays(_tensor(cast))
             t = answer["t_hit"].numpy()
             hit = np.isfinite(t) & np.isfinite(direction).all(axis=1)
             distance[here] = np.where(hit, t, np.inf)
@@ -236,6 +235,12 @@ class Renderer:
         return out
 
 
+def _tensor(array: npt.NDArray[Any]) -> Any:
+    import open3d as o3d
+
+    return o3d.core.Tensor(np.ascontiguousarray(array))  # type: ignore[call-overload]  # its stubs know no typed arrays
+
+
 def _read(path: Path) -> tuple[U8, U8 | None]:
     """A page (H, W, 3) RGB, and its mask (H, W) or None."""
     import cv2
@@ -243,8 +248,10 @@ def _read(path: Path) -> tuple[U8, U8 | None]:
     page = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if page is None:
         raise InputError(path, "can't be read as an image", "Run again with `--from texture`")
-    mask = cv2.imread(str(path.with_name(f"{path.stem}_seen.png")), cv2.IMREAD_GRAYSCALE)
-    return np.ascontiguousarray(page[..., ::-1]), mask
+    mask: Any = cv2.imread(str(path.with_name(f"{path.stem}_seen.png")), cv2.IMREAD_GRAYSCALE)
+    if mask is not None:  # the nearest texel of a hit on a chart's border may be one of the room around it
+        mask = np.where(mask == 0, cv2.dilate(mask, np.ones((3, 3), np.uint8)), mask)
+    return np.ascontiguousarray(page[..., ::-1]).astype(np.uint8, copy=False), mask
 
 
 def _look_up(page: U8, mask: U8 | None, uv: F32) -> tuple[U8, U8]:

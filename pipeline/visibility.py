@@ -1,9 +1,8 @@
 """Who sees what: range images of meshes and points, and the test of a point against them.
 
-A range image holds, for every pixel of a (scaled-down) camera, the distance along the pixel's ray to
-what it meets first. Triangles and discs go through the same kernel: their footprint in the image is
-found by projection, and every pixel in it asks exactly where its own ray meets the plane. So it holds
-for every camera model, and equals ray casting at a fraction of its time.
+A range image holds, for every pixel of a scaled camera, the distance along the pixel's ray to
+what it meets first, whatever the camera model. Meshes are met by ray casting (Embree); for discs every
+pixel of their footprint asks exactly where its own ray meets the plane.
 
 What hides: the meshes, and of the cloud only what the meshes lack (cars, people, what was trimmed away),
 as discs along the points' normals. A point is visible if its range is no more than the range image's
@@ -13,26 +12,37 @@ plus a bias that grows with the slope at which the surface is seen.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from pipeline.types import F32, F64, Camera, Mesh, PointCloud
 
-BIAS = 0.05
+BIAS = 0.04
 """Metres that a point may lie behind what the range image shows and still count as seen."""
-PIXELS = 1_000_000
+PIXELS = 2_000_000
 """Range images are at most this large."""
+ENLARGED = 2.0
+"""They are at most this many times as wide as the photo: finer pixels leak less and hide less falsely."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What hides: triangles (F, 3, 3), and discs with centres (N, 3), unit normals (N, 3), one radius (m)."""
+    """What hides.
 
-    triangles: F32
+    Attributes:
+        casting: Open3D's `RaycastingScene` of the meshes.
+        triangles: number of them.
+        centres, normals: (N, 3) of the discs; unit normals.
+        radius: of the discs, metres.
+    """
+
+    casting: Any
+    triangles: int
     centres: F32
     normals: F32
     radius: float
@@ -43,7 +53,7 @@ class DepthMap:
     """What a view sees first.
 
     Attributes:
-        camera: scaled down from the view's.
+        camera: the view's, scaled.
         T_world_cam: (4, 4) camera to local coordinates.
         range: (H, W) float32 metres along each pixel's ray; inf where it meets nothing.
     """
@@ -64,28 +74,20 @@ def scene(
         radius: of the discs, metres; about the cloud's voxel size.
         lacking: points nearer than this to a mesh (metres) are left to the mesh.
     """
-    parts = [mesh.corners for mesh in meshes if len(mesh)]
-    triangles = np.concatenate(parts) if parts else np.zeros((0, 3, 3), np.float32)
-    empty = np.zeros((0, 3), np.float32)
-    if cloud is None or not len(cloud) or cloud.normal is None:
-        return Scene(np.ascontiguousarray(triangles), empty, empty, radius)
-    far = _farther_than(cloud.xyz, parts, lacking)
-    return Scene(np.ascontiguousarray(triangles), cloud.xyz[far], cloud.normal[far], radius)
-
-
-def _farther_than(points: F32, parts: Sequence[F32], distance: float) -> npt.NDArray[np.bool_]:
-    """(N,) which points lie farther than `distance` from every triangle."""
-    if not parts:
-        return np.ones(len(points), bool)
     import open3d as o3d
 
-    casting = o3d.t.geometry.RaycastingScene()
-    for corners in parts:
-        casting.add_triangles(
-            o3d.core.Tensor(np.ascontiguousarray(corners.reshape(-1, 3))),
-            o3d.core.Tensor(np.arange(3 * len(corners), dtype=np.uint32).reshape(-1, 3)),
-        )
-    return casting.compute_distance(o3d.core.Tensor(np.ascontiguousarray(points))).numpy() > distance
+    casting, triangles = o3d.t.geometry.RaycastingScene(), 0
+    for mesh in meshes:
+        if len(mesh):
+            casting.add_triangles(np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(mesh.faces, np.uint32))
+            triangles += len(mesh)
+    if cloud is None or not len(cloud) or cloud.normal is None:
+        empty = np.zeros((0, 3), np.float32)
+        return Scene(casting, triangles, empty, empty, radius)
+    if triangles:
+        cloud = cloud.take(casting.compute_distance(np.ascontiguousarray(cloud.xyz)).numpy() > lacking)
+    assert cloud.normal is not None
+    return Scene(casting, triangles, cloud.xyz, cloud.normal, radius)
 
 
 def depth_map(camera: Camera, T_world_cam: F64, hides: Scene, *, pixels: int = PIXELS) -> DepthMap:
@@ -95,21 +97,27 @@ def depth_map(camera: Camera, T_world_cam: F64, hides: Scene, *, pixels: int = P
         camera: of the view, at full size.
         T_world_cam: (4, 4) camera to local coordinates.
         hides: see `scene`.
-        pixels: the camera is scaled down to at most this many.
+        pixels: the camera is scaled to at most this many, and to at most `ENLARGED` times its width.
     """
+    from pipeline import range_image
     from pipeline.cameras import MODEL_ID, parameters, pixel_rays
 
-    camera = camera.scaled(min(1.0, math.sqrt(pixels / (camera.width * camera.height))))
+    camera = camera.scaled(min(ENLARGED, math.sqrt(pixels / (camera.width * camera.height))))
     model, p, rays = MODEL_ID[camera.model], parameters(camera), pixel_rays(camera)
-    T_cam_world = np.linalg.inv(np.asarray(T_world_cam, np.float64))
+    T_world_cam = np.asarray(T_world_cam, np.float64)
     depth = np.full((camera.height, camera.width), np.inf, np.float32)
-    from pipeline import range_image
-
-    if len(hides.triangles):
-        range_image.draw_triangles(depth, rays, model, p, T_cam_world, hides.triangles)
+    if hides.triangles:
+        cast = np.empty((camera.height, camera.width, 6), np.float32)
+        cast[..., :3], cast[..., 3:] = (
+            T_world_cam[:3, 3],
+            np.nan_to_num(rays) @ T_world_cam[:3, :3].T.astype(np.float32),
+        )
+        met = hides.casting.cast_rays(cast)["t_hit"].numpy()
+        depth = np.where(np.isfinite(rays[..., 0]), met, np.inf).astype(np.float32)
     if len(hides.centres):
+        T_cam_world = np.linalg.inv(T_world_cam)
         range_image.draw_discs(depth, rays, model, p, T_cam_world, hides.centres, hides.normals, hides.radius)
-    return DepthMap(camera, np.asarray(T_world_cam, np.float64), depth)
+    return DepthMap(camera, T_world_cam, depth)
 
 
 def load_depth_map(path: Path, camera: Camera, T_world_cam: F64) -> DepthMap:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -18,7 +18,7 @@ Backend = Literal["uvatlas", "xatlas"]
 SMALLEST = 16
 """Pages are at least this wide (texels)."""
 COARSE = 4
-"""xatlas packs in steps of this many texels: its search for places slows with their number."""
+"""xatlas packs in steps of this many texels at most: its search for places slows with their number."""
 CHART = 100_000
 """xatlas' charts are at most this many texels: growing one takes the square of its faces."""
 
@@ -44,7 +44,7 @@ class Chartered:
 def unwrap_blocks(
     backend: Backend, blocks: Sequence[tuple[F32, I32]], texel: float, gutter: int
 ) -> list[Chartered | str]:
-    """Unwrap blocks (vertices (V, 3) metres, faces (F, 3)), each onto a page of its own; a reason where one can't be."""
+    """Unwrap blocks (vertices (V, 3) metres, faces (F, 3)), each onto a page of its own, or the reason why not."""
     backends = {"uvatlas": _uvatlas, "xatlas": _xatlas}
     out: list[Chartered | str] = []
     for vertices, faces in blocks:
@@ -56,7 +56,7 @@ def unwrap_blocks(
 
 
 def manifold(faces: I32) -> tuple[I32, I32]:
-    """Cut a mesh where it is no manifold: at edges of three or more faces or of unlike winding, and at pinched vertices.
+    """Cut a mesh where it is no manifold: edges of three faces or of unlike winding, pinched vertices, twin faces.
 
     Args:
         faces: (F, 3) without repeated vertices within a face.
@@ -123,9 +123,8 @@ def _uvatlas(vertices: F32, faces: I32, texel: float, gutter: int) -> Chartered:
     cut, old = manifold(faces[whole])
     area = _area(vertices[faces])
     guess = math.sqrt(area / 0.6) / texel
-    mesh = o3d.t.geometry.TriangleMesh(
-        o3d.core.Tensor(np.ascontiguousarray(vertices[old])), o3d.core.Tensor(np.ascontiguousarray(cut))
-    )
+    tensor: Any = o3d.core.Tensor
+    mesh = o3d.t.geometry.TriangleMesh(tensor(np.ascontiguousarray(vertices[old])), tensor(np.ascontiguousarray(cut)))
     _, charts, _ = mesh.compute_uvatlas(size=max(SMALLEST, round(guess)), gutter=float(gutter), parallel_partitions=1)
     uv = np.zeros((len(faces), 3, 2), np.float32)
     uv[whole] = mesh.triangle["texture_uvs"].numpy()
@@ -144,15 +143,16 @@ def _xatlas(vertices: F32, faces: I32, texel: float, gutter: int) -> Chartered:
     atlas.add_mesh(np.ascontiguousarray(vertices), np.ascontiguousarray(faces, dtype=np.uint32))
     chart, pack = xatlas.ChartOptions(), xatlas.PackOptions()
     chart.max_chart_area = CHART * texel**2
-    pack.padding, pack.texels_per_unit = math.ceil(gutter / COARSE), 1.0 / (COARSE * texel)
+    coarse = min(COARSE, gutter)
+    pack.padding, pack.texels_per_unit = math.ceil(gutter / coarse), 1.0 / (coarse * texel)
     atlas.generate(chart, pack)
     if not atlas.width or not atlas.height:
         raise RuntimeError("xatlas made no atlas")
     _, index, uv = atlas.get_mesh(0)
     return Chartered(
         np.ascontiguousarray(uv[index], np.float32),
-        max(SMALLEST, COARSE * int(atlas.width)),
-        max(SMALLEST, COARSE * int(atlas.height)),
+        max(SMALLEST, coarse * int(atlas.width)),
+        max(SMALLEST, coarse * int(atlas.height)),
         int(atlas.chart_count),
         "xatlas",
     )

@@ -113,10 +113,10 @@ def _sample(image, u, v, wrap):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, parallel=True)
-def accumulate(
+def accumulate(  # type: ignore[no-untyped-def]
     total, owner, faces, flat, corners, normals, photo, mask, model, p, depth, near, depth_p, R, t, pixel,
     bias, power, feather, min_cos,
-):  # type: ignore[no-untyped-def]  # fmt: skip
+):  # fmt: skip
     """Add what one photo says to the texels of a page; returns the number of texels that it sees.
 
     Args:
@@ -175,7 +175,7 @@ def accumulate(
                 if not wide:
                     border = min(border, min(u + 0.5, p[12] - 0.5 - u))
                 w = (cos / d2) ** power * (0.02 + 0.98 * min(1.0, border / feather))
-                if not is_visible(near, model, depth_p, 3 * pixel, bias, x, y, z, n[0], n[1], n[2]):
+                if not is_visible(near, model, depth_p, 3.5 * pixel, bias, x, y, z, n[0], n[1], n[2]):
                     w *= EDGE
                 # texels wider than the photo's pixels are sampled from a halved photo
                 ratio = size * focal / distance

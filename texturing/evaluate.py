@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -26,7 +26,8 @@ class HeldOut:
     Attributes:
         view: posed photo.
         photo, render: (H, W, 3) uint8 RGB.
-        mask: (H, W) pixels that count: the surface there was seen by another photo, and no mask of this one forbids it.
+        mask: (H, W) pixels that count: a surface that another photo saw, hidden from this one by nothing that
+            the world leaves out (a parked car), and not masked out.
         coverage: share of the pixels with a surface that another photo saw.
         psnr_db, psnr_gain_db, ssim: see `score`.
     """
@@ -46,7 +47,8 @@ def score(photo: U8, render: U8, mask: Mask) -> dict[str, float]:
 
     Returns:
         psnr_db: as it is; psnr_gain_db: after the least-squares gain of each channel; ssim: mean structural
-        similarity of the grey images (Wang et al. 2004), where the window lies mostly in the mask. NaN for an empty mask.
+        similarity of the grey images (Wang et al. 2004), where the window lies mostly in the mask; NaN for an
+        empty mask.
     """
     if not mask.any():
         return {"psnr_db": float("nan"), "psnr_gain_db": float("nan"), "ssim": float("nan")}
@@ -68,7 +70,7 @@ def _ssim(photo: U8, render: U8, mask: Mask) -> float:
     import cv2
 
     def blur(image: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        return cv2.GaussianBlur(image, (11, 11), 1.5)
+        return np.asarray(cv2.GaussianBlur(image, (11, 11), 1.5), np.float32)
 
     m = mask.astype(np.float32)
     weight = blur(m)
@@ -82,22 +84,33 @@ def _ssim(photo: U8, render: U8, mask: Mask) -> float:
     return float(index[inner].mean()) if inner.any() else float("nan")
 
 
-def held_out(folders: Sequence[Path], views: Sequence[View]) -> Iterator[HeldOut]:
-    """Render textured meshes (folders of the step `texture`) from each of the views, and score; unreadable photos are skipped."""
+def held_out(folders: Sequence[Path], views: Sequence[View], depths: Sequence[Path] | None = None) -> Iterator[HeldOut]:
+    """Render textured meshes from each of the views, and score; unreadable photos are skipped.
+
+    Args:
+        folders: of the step `texture`.
+        views: held out.
+        depths: files of the views' depth maps, which tell where a photo shows something that the world leaves
+            out; None: every pixel with a surface counts.
+    """
     import cv2
 
     from pipeline.render import Renderer, textured
     from texturing.texture import read_mask
 
     renderer = Renderer([textured(folder) for folder in folders])
-    for view in views:
-        photo = cv2.imread(str(view.photo), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    files: list[Path | None] = list(depths) if depths is not None else [None] * len(views)
+    for view, depth in zip(views, files, strict=True):
+        photo: Any = cv2.imread(str(view.photo), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         if photo is None or photo.shape[:2] != (view.camera.height, view.camera.width):
             continue
         photo = np.ascontiguousarray(photo[..., ::-1])
         render = renderer.view(view.camera, view.T_world_cam)
         allowed = read_mask(view) if view.mask is not None else None
         surface = render.hit if allowed is None else render.hit & (allowed > 0)
+        if depth is not None:
+            first = cv2.resize(np.load(depth), surface.shape[::-1], interpolation=cv2.INTER_NEAREST)
+            surface &= render.range <= first * 1.02 + 0.1
         mask = surface & (render.seen == 255)
         coverage = float(mask.sum() / max(1, surface.sum()))
         yield HeldOut(view, photo, render, mask, coverage, **score(photo, render.rgb, mask))

@@ -61,7 +61,7 @@ class Page:
 
 
 def fill(page: Page, colours: Colours, texel: float) -> None:
-    """Colour the texels of faces that have no colour yet (`seen` 0), in place; far from any point they are marked filled.
+    """Colour the texels of faces that have none yet (`seen` 0), in place; far from any point they are marked filled.
 
     Args:
         page: to be filled.
@@ -184,5 +184,5 @@ def shaded(label: U8, normal: npt.NDArray[np.floating] | None) -> U8:
 
     rgb = colour_of()[label].astype(np.float32)
     if normal is not None:
-        rgb *= (0.75 + 0.25 * np.clip(normal @ np.float32([0.3, 0.2, 0.93]), 0, 1))[:, None]
+        rgb *= (0.75 + 0.25 * np.clip(normal @ np.array([0.3, 0.2, 0.93]), 0, 1))[:, None]
     return rgb.astype(np.uint8)

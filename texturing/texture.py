@@ -48,7 +48,7 @@ class TextureParams(Params):
     power: float = Field(3.0, gt=0)
     max_distance: float = Field(40.0, gt=0)
     min_cos: float = Field(0.08, ge=0, lt=1)
-    bias: float = Field(0.06, ge=0)
+    bias: float = Field(0.04, ge=0)
     feather: float = Field(0.04, gt=0, le=0.5)
     padding: int = Field(16, ge=2)
 
@@ -168,11 +168,12 @@ class Painter:
                 if photo is None:
                     continue
                 view, depth = self._views[i], self._depth(i)
+                near = np.asarray(cv2.erode(depth.range, np.ones((3, 3))))
                 T = np.linalg.inv(view.T_world_cam)
                 self.used[i] = self.used.get(i, 0) + int(
                     blend.accumulate(
                         total, owner, np.searchsorted(faces, chosen), flat, corners, normals, *photo,
-                        MODEL_ID[view.camera.model], parameters(view.camera), depth.range, cv2.erode(depth.range, np.ones((3, 3))),
+                        MODEL_ID[view.camera.model], parameters(view.camera), depth.range, near,
                         parameters(depth.camera),
                         np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3]), pixel_angle(depth.camera),
                         p.bias, p.power, p.feather * view.camera.width, p.min_cos,
@@ -188,7 +189,7 @@ class Painter:
 
         view = self._views[i]
         size = (view.camera.height, view.camera.width)
-        image = cv2.imread(str(view.photo), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        image: Any = cv2.imread(str(view.photo), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         if image is None:
             self.skipped[i] = f"{view.photo} can't be read"
             return None
@@ -203,16 +204,17 @@ class Painter:
 
 def _halved(image: U8) -> U8:
     import cv2
+    import numpy as np
 
     size = (max(1, image.shape[1] // 2), max(1, image.shape[0] // 2))
-    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def read_mask(view: View) -> U8 | None:
-    """The view's mask (H, W) uint8, 0 where its photo must not be used; None if it can't be read or is of another size."""
+    """The view's mask (H, W), 0 where its photo must not be used; None if it can't be read or is of another size."""
     import cv2
 
-    mask = cv2.imread(str(view.mask), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    mask: Any = cv2.imread(str(view.mask), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     return mask if mask is not None and mask.shape == (view.camera.height, view.camera.width) else None
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
 
@@ -36,12 +36,12 @@ class UnwrapParams(Params):
         backend: "uvatlas" (few charts) or "xatlas" (fast on foliage); each is the other's fallback.
         texel: metres a texel spans; 1 cm, vegetation 3 cm.
         page_size: pages are at most this wide and high, texels.
-        gutter: texels between charts.
+        gutter: texels between charts; 2 for vegetation, whose charts are small and many.
         block_faces: triangles unwrapped at once.
         timeout: seconds that the unwrapping of one block may take, per 10 000 triangles and at least once.
     """
 
-    backend: str = Field("uvatlas", pattern="^(uvatlas|xatlas)$")
+    backend: Literal["uvatlas", "xatlas"] = "uvatlas"
     texel: float = Field(0.01, gt=0)
     page_size: int = Field(4096, ge=64, le=8192)
     gutter: int = Field(4, ge=1, le=64)
@@ -124,7 +124,7 @@ def _unwrap_all(mesh: Mesh, blocks: list[Index], params: UnwrapParams) -> list[C
     workers = max(1, min(os.cpu_count() or 1, len(blocks)))
     by_size = sorted(range(len(blocks)), key=lambda i: -len(blocks[i]))
     shares = [by_size[k::workers] for k in range(workers)]
-    other = "xatlas" if params.backend == "uvatlas" else "uvatlas"
+    other: Backend = "xatlas" if params.backend == "uvatlas" else "uvatlas"
     with ThreadPoolExecutor(workers) as pool:
         first = pool.map(lambda share: _in_child(mesh, [blocks[i] for i in share], params.backend, params), shares)
         results: dict[int, Any] = {
@@ -213,4 +213,10 @@ def stretch(corners: npt.NDArray[Any], flat: npt.NDArray[Any]) -> npt.NDArray[An
     return s[:, 0] / np.maximum(s[:, 1], 1e-12)
 
 
-UNWRAP = Step("unwrap", 1, unwrap, UnwrapParams, {"vegetation": {"backend": "xatlas", "texel": 0.03}})
+UNWRAP = Step(
+    "unwrap",
+    1,
+    unwrap,
+    UnwrapParams,
+    {"building": {"backend": "xatlas"}, "vegetation": {"backend": "xatlas", "texel": 0.03, "gutter": 2}},
+)

@@ -55,11 +55,11 @@ def save(path: Path, views: Sequence[View], held_out: Sequence[bool] = ()) -> No
 def load(path: Path) -> tuple[View, ...]:
     """Read the views that `save` wrote, in order; relative photos are beside the file, links are followed."""
 
-    def place(file: Path | None) -> Path | None:
-        return None if file is None else (path.parent / file).resolve()
+    def place(file: Path) -> Path:
+        return (path.parent / file).resolve()
 
     views = (from_json(row) for row in _rows(path))
-    return tuple(replace(view, photo=place(view.photo), mask=place(view.mask)) for view in views)
+    return tuple(replace(v, photo=place(v.photo), mask=place(v.mask) if v.mask else None) for v in views)
 
 
 def load_held_out(path: Path) -> tuple[bool, ...]:

@@ -18,7 +18,7 @@ class VisibilityParams(Params):
         lacking: points further than this from every mesh hide by themselves (cars, people), metres.
     """
 
-    pixels: int = Field(1_000_000, ge=10_000)
+    pixels: int = Field(2_000_000, ge=10_000)
     radius: float = Field(0.08, gt=0)
     lacking: float = Field(0.2, gt=0)
 
@@ -46,9 +46,7 @@ def visibility(inputs: Inputs, params: VisibilityParams, out: Path, report: Repo
         report(i / len(views), view.name)
         depth = kernel.depth_map(view.camera, view.T_world_cam, hides, pixels=params.pixels)
         np.save(folder / f"{i}.npy", depth.range)
-    return Done(
-        {"depth": folder}, {"views": len(views), "triangles": len(hides.triangles), "discs": len(hides.centres)}
-    )
+    return Done({"depth": folder}, {"views": len(views), "triangles": hides.triangles, "discs": len(hides.centres)})
 
 
 VISIBILITY = Step("visibility", 1, visibility, VisibilityParams)

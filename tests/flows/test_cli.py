@@ -18,7 +18,7 @@ from pipeline.io import las
 from pipeline.types import Frame, PointCloud
 from tests.conftest import ROOT
 
-SMALL = ["--set", "unwrap.texel=0.05", "--set", "decimate.target=10000", "--set", "voxel.size=0.2"]
+SMALL = ["--set", "unwrap.texel=0.05", "--set", "decimate.target=10000"]
 
 
 def scan2sim(*arguments: object, timeout: float = 300) -> subprocess.CompletedProcess[str]:
