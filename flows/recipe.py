@@ -119,7 +119,7 @@ def recipe(tile: Tile, settings: Settings) -> list[Node]:
     if tile.truth_mesh and tile.truth_points:
         truth = {"truth.mesh": tile.truth_mesh, "truth.points": tile.truth_points}
     add(GEOMETRY, meshes | clouds | truth)
-    add(SCORE, textured | seen | truth)
+    add(SCORE, textured | seen | {"depth": Output("visibility", "depth")} | truth)
     stages = {
         f"{step.name}.{g}": Output(f"{step.name}.{g}", "mesh") for step in (POISSON, TRIM, DECIMATE) for g in groups
     }

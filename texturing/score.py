@@ -25,7 +25,10 @@ class ScoreParams(Params):
 
 
 def score(inputs: Inputs, params: ScoreParams, out: Path, report: Report) -> Done:
-    """Compare the textured groups with held-out photos (pixels that another photo saw) and with the truth.
+    """Compare the textured groups with held-out photos and with the truth.
+
+    Pixels count where another photo saw the surface, and where this one does: not where it shows a car or
+    person that the world leaves out (`depth`, the folder of depth maps, tells).
 
     Facts: `held_out` photos; their mean `psnr_db` (as it is), `psnr_gain_db` (after a gain a channel) and
     `ssim`, None without any; `photos`, the same for each; `truth_psnr_db` for generated tiles.
@@ -35,9 +38,11 @@ def score(inputs: Inputs, params: ScoreParams, out: Path, report: Report) -> Don
 
     folders = [inputs[g] for g in GROUPS if g in inputs]
     views = views_io.load(inputs["views"])
-    held = [view for view, out_ in zip(views, views_io.load_held_out(inputs["views"]), strict=True) if out_]
+    index = [i for i, out_ in enumerate(views_io.load_held_out(inputs["views"])) if out_]
+    held = [views[i] for i in index]
+    depths = [inputs["depth"] / f"{i}.npy" for i in index]
     photos: dict[str, dict[str, float]] = {}
-    for i, result in enumerate(held_out(folders, held) if held else ()):
+    for i, result in enumerate(held_out(folders, held, depths) if held else ()):
         report(i / (len(held) + 1), result.view.name)
         figures = {name: getattr(result, name) for name in ("psnr_db", "psnr_gain_db", "ssim", "coverage")}
         if not any(math.isnan(value) for value in figures.values()):

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     Index = npt.NDArray[np.int64]
 
-UTILISATION = 0.6
+UTILISATION = 0.5
 """Share of a page that charts are expected to cover, when blocks are cut to pages."""
 
 
@@ -33,7 +33,8 @@ class UnwrapParams(Params):
     """How the surface is laid flat.
 
     Attributes:
-        backend: "uvatlas" (few charts) or "xatlas" (fast on foliage); each is the other's fallback.
+        backend: "xatlas" (fast, the same at every run) or "uvatlas" (fewer, larger charts, several times
+            slower, and never quite the same twice); each is the other's fallback.
         texel: metres a texel spans; 1 cm, vegetation 3 cm.
         page_size: pages are at most this wide and high, texels.
         gutter: texels between charts; 2 for vegetation, whose charts are small and many.
@@ -41,7 +42,7 @@ class UnwrapParams(Params):
         timeout: seconds that the unwrapping of one block may take, per 10 000 triangles and at least once.
     """
 
-    backend: Literal["uvatlas", "xatlas"] = "uvatlas"
+    backend: Literal["xatlas", "uvatlas"] = "xatlas"
     texel: float = Field(0.01, gt=0)
     page_size: int = Field(4096, ge=64, le=8192)
     gutter: int = Field(4, ge=1, le=64)
@@ -218,5 +219,5 @@ UNWRAP = Step(
     1,
     unwrap,
     UnwrapParams,
-    {"building": {"backend": "xatlas"}, "vegetation": {"backend": "xatlas", "texel": 0.03, "gutter": 2}},
+    {"vegetation": {"texel": 0.03, "gutter": 2}},
 )

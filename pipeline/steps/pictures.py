@@ -69,7 +69,7 @@ def pictures(inputs: Inputs, params: PicturesParams, out: Path, report: Report) 
     folder = out / "pictures"
     folder.mkdir()
     album = Album(folder)
-    cloud = PointCloud.load(inputs["cloud"])
+    cloud = PointCloud.join([PointCloud.load(file) for name, file in inputs.items() if name.startswith("cloud.")])
     path = Trajectory.load(inputs["path"]) if "path" in inputs else None
     groups = [g for g in GROUPS if g in inputs]
     plain = render.Renderer([render.Body(Mesh.load(inputs[f"decimate.{g}"]), colour=GROUP_RGB[g]) for g in groups])
@@ -105,7 +105,7 @@ def pictures(inputs: Inputs, params: PicturesParams, out: Path, report: Report) 
         points_from_above(cloud, low, high, params.width),
         "step",
         "Classes.",
-        f"{len(cloud):,} points by class.",
+        "The thinned points by class.",
     )
     album.add(
         "mesh",
@@ -206,7 +206,7 @@ def bird_pose(low: F64, high: F64) -> F64:
 def points_from_above(cloud: PointCloud, low: F64, high: F64, width: int) -> U8:
     """A map of the points by class, the highest of a pixel on top, its colour dimmed by depth."""
     assert cloud.label is not None
-    width = min(width, 900) if len(cloud) < 2_000_000 else width
+    width = min(width, 900)
     metre = max(float((high - low)[:2].max()) / width, 0.02)
     size = np.maximum(np.ceil((high - low)[:2] / metre).astype(int), 1)
     inside = ((cloud.xyz[:, :2] >= low[:2]) & (cloud.xyz[:, :2] < high[:2])).all(axis=1)
