@@ -135,7 +135,7 @@ def import_colmap_model(
     out: TileOut,
     cloud: Annotated[Path | None, typer.Option(help="Dense cloud (LAS, LAZ, PLY); default: the sparse points.")] = None,
     crs: Crs = "local",
-    upright: Annotated[bool, typer.Option("--upright", help="Turn the model so that the photos stand upright.")] = False,
+    upright: Annotated[bool, typer.Option("--upright", help="Turn it so that photos stand upright.")] = False,
     scale: Annotated[float, typer.Option(help="Metres per unit of the model.")] = 1.0,
     name: Name = None,
     link: Link = False,

@@ -120,17 +120,8 @@ def recipe(tile: Tile, settings: Settings) -> list[Node]:
         truth = {"truth.mesh": tile.truth_mesh, "truth.points": tile.truth_points}
     add(GEOMETRY, meshes | clouds | truth)
     add(SCORE, textured | seen | {"depth": Output("visibility", "depth")} | truth)
-    stages = {
-        f"{step.name}.{g}": Output(f"{step.name}.{g}", "mesh") for step in (POISSON, TRIM, DECIMATE) for g in groups
-    }
-    add(
-        PICTURES,
-        textured
-        | stages
-        | seen
-        | {"cloud": Output("segment", "cloud")}
-        | ({"path": Output("path", "path")} if path else {}),
-    )
+    stages = {f"decimate.{g}": Output(f"decimate.{g}", "mesh") for g in groups}
+    add(PICTURES, textured | stages | clouds | seen | scanner)
     return nodes
 
 

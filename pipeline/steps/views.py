@@ -64,7 +64,7 @@ def views(inputs: Inputs, params: ViewsParams, out: Path, report: Report) -> Don
     if sees_nothing and not kept:
         raise DataError(
             inputs["photo.0"].parent,
-            f"the cloud and the cameras never meet: none of {len(sees_nothing)} photos sees a point within {REACH:.0f} m",
+            f"cloud and cameras never meet: none of {len(sees_nothing)} photos sees a point within {REACH:.0f} m",
             "Check CRS, units and axes of the poses (camera to world; x right, y down, z forward)",
         )
     if params.poses and not kept:

@@ -15,8 +15,10 @@ import numpy as np
 import pytest
 
 from pipeline.io import las
+from pipeline.io.tile import read_tile
 from pipeline.types import Frame, PointCloud
 from tests.conftest import ROOT
+from tests.gazebo.checker import check_world
 
 SMALL = ["--set", "unwrap.texel=0.05", "--set", "decimate.target=10000"]
 
@@ -96,6 +98,17 @@ def test_a_street_becomes_a_world_with_its_report(world: Path) -> None:
     assert page.count("data:image/") >= 8 and "http" not in page.split("<main>")[1]
 
 
+def test_gazebo_loads_the_world_and_a_box_rests_on_its_road(street: Path, world: Path) -> None:
+    tile = read_tile(street)
+    assert tile.trajectory is not None
+    x, y, z = tile.trajectory.positions[len(tile.trajectory.times) // 4]
+    seen = check_world(next((world / "world").glob("*.sdf")), (float(x), float(y), float(z)))
+    assert seen["speed"] < 0.1
+    assert abs(seen["rest"][2] - (z - 2.0 + 0.2)) < 0.15, "the scanner rides 2 m above the road; the box is 40 cm high"
+    textures = {texture for mesh in seen["meshes"] for texture in mesh["textures"]}
+    assert {name.split("_")[0] for name in textures} == {"terrain", "building", "vegetation"}
+
+
 def test_running_again_does_nothing_and_a_deleted_page_comes_back(street: Path, world: Path) -> None:
     command = ("run", street, "--out", world, "--hold-out", 4, *SMALL)
     before = {p: p.stat().st_mtime_ns for p in (world / "steps").rglob("*") if p.is_file()}
@@ -137,18 +150,12 @@ def test_plants_as_places(street: Path, tmp_path: Path) -> None:
 
 def test_a_cloud_alone_without_colours_or_classes(street: Path, tmp_path: Path) -> None:
     frame = Frame("EPSG:32633", (500000.0, 5400000.0, 200.0))
-    cloud = las.read(street / "cloud.laz", las_frame(street))
+    cloud = las.read(street / "cloud.laz", read_tile(street).frame)
     las.write(tmp_path / "plain.laz", PointCloud(frame, cloud.xyz))
     good(scan2sim("import", "las", tmp_path / "plain.laz", "--out", tmp_path / "tile"))
     good(scan2sim("run", tmp_path / "tile", "--out", tmp_path / "out", *SMALL))
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert report["texture"]["coverage"] == 0 and report["steps"]["segment"]["facts"]["source"] == "geometry"
-
-
-def las_frame(tile: Path) -> Frame:
-    from pipeline.io.tile import read_tile
-
-    return read_tile(tile).frame
 
 
 def test_truncated_cloud(damaged: Path, tmp_path: Path) -> None:
@@ -158,7 +165,7 @@ def test_truncated_cloud(damaged: Path, tmp_path: Path) -> None:
 
 
 def test_no_crs(damaged: Path, tmp_path: Path) -> None:
-    cloud = las.read(damaged / "cloud.laz", las_frame(damaged))
+    cloud = las.read(damaged / "cloud.laz", read_tile(damaged).frame)
     las.write(damaged / "cloud.laz", PointCloud(Frame(), cloud.xyz))
     text = (damaged / "tile.toml").read_text()
     (damaged / "tile.toml").write_text("\n".join(line for line in text.splitlines() if not line.startswith("crs")))
@@ -166,7 +173,7 @@ def test_no_crs(damaged: Path, tmp_path: Path) -> None:
 
 
 def test_two_crs(damaged: Path, tmp_path: Path) -> None:
-    cloud = las.read(damaged / "cloud.laz", las_frame(damaged))
+    cloud = las.read(damaged / "cloud.laz", read_tile(damaged).frame)
     las.write(damaged / "other.laz", PointCloud(Frame("EPSG:2154", (600000.0, 6000000.0, 0.0)), cloud.xyz[:5000]))
     edit(damaged, '"cloud.laz"', '"cloud.laz", "other.laz"')
     bad(scan2sim("run", damaged, "--out", tmp_path / "out"), 3, "other.laz", "EPSG:2154", "one CRS")
@@ -216,12 +223,11 @@ def test_nan_pose_and_no_rotation(damaged: Path, tmp_path: Path) -> None:
 
 def _one_line(rest: str) -> str:
     """A TOML value's remainder with the value commented out, whether on one line or several."""
-    depth, i = 0, rest.index("[")
-    for i in range(i, len(rest)):
-        depth += {"[": 1, "]": -1}.get(rest[i], 0)
-        if depth == 0:
-            break
-    return rest[: i + 1].replace("\n", " ") + rest[i + 1 :]
+    depth, end = 0, rest.index("[")
+    while depth > 0 or rest[end] == "[":
+        depth += {"[": 1, "]": -1}.get(rest[end], 0)
+        end += 1
+    return rest[:end].replace("\n", " ") + rest[end:]
 
 
 def test_bad_input_leaves_earlier_results(street: Path, world: Path, tmp_path: Path) -> None:
