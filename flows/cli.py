@@ -18,6 +18,8 @@ app = typer.Typer(
 imports = typer.Typer(no_args_is_help=True, help="Make a tile from your files.")
 app.add_typer(imports, name="import")
 
+INTERRUPTED = 130  # as typer turns Ctrl-C into
+
 TilePath = Annotated[Path, typer.Argument(metavar="TILE", help="A tile.toml, or the folder that holds one.")]
 OutDir = Annotated[Path, typer.Option("--out", "-o", help="Folder for the world, the report and kept results.")]
 Sets = Annotated[list[str] | None, typer.Option("--set", metavar="STEP.PARAM=VALUE", help="Change a setting.")]
@@ -193,14 +195,16 @@ def main() -> None:
     """Run the command; errors become one message and an exit code (`pipeline.errors.EXIT_CODES`)."""
     try:
         app()
-    except (Exception, KeyboardInterrupt) as error:
+    except SystemExit as ended:
+        if ended.code == INTERRUPTED:
+            typer.echo("Interrupted; what was finished is kept, the same command goes on from there.", err=True)
+        raise
+    except Exception as error:
         from pipeline.errors import ScanError, exit_code
 
         if isinstance(error, ScanError):
             typer.secho(f"error: {error.where}: {error.cause}", fg="red", err=True)
             typer.echo(f"  {error.remedy}.", err=True)
-        elif isinstance(error, KeyboardInterrupt):
-            typer.echo("Interrupted; what was finished is kept, the same command goes on from there.", err=True)
         else:
             from flows.display import log_unexpected
 

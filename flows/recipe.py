@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from flows.settings import Settings
 from pipeline.classes import GROUPS
@@ -70,12 +71,12 @@ def recipe(tile: Tile, settings: Settings) -> list[Node]:
     settings.check(STEPS)
     nodes: list[Node] = []
 
-    def add(step: Step, inputs: Mapping[str, Path | Output], group: str | None = None, **given: object) -> str:
+    def add(step: Step, inputs: Mapping[str, Path | Output], group: str | None = None, **given: Any) -> str:
         label = f"{step.name}.{group}" if group else step.name
         nodes.append(Node(label, step, settings.params(step, group, **given), inputs))
         return label
 
-    frame = {"crs": tile.frame.crs, "origin": tile.frame.origin, "unit": tile.frame.unit}
+    frame: dict[str, Any] = {"crs": tile.frame.crs, "origin": tile.frame.origin, "unit": tile.frame.unit}
     add(INGEST, {f"cloud.{i:04d}": path for i, path in enumerate(tile.clouds)}, **frame)
     add(SEGMENT, {"cloud": Output("ingest", "cloud")})
     add(SPLIT, {"cloud": Output("segment", "cloud")})
@@ -125,7 +126,7 @@ def recipe(tile: Tile, settings: Settings) -> list[Node]:
     return nodes
 
 
-def scanner_path(tile: Tile) -> dict[str, object]:
+def scanner_path(tile: Tile) -> dict[str, Any]:
     """Parameters of the path: the trajectory, else the cameras; empty where there is neither."""
     if tile.trajectory is not None:
         return {"positions": _rows(tile.trajectory.positions), "times": tuple(tile.trajectory.times.tolist())}

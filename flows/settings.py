@@ -80,7 +80,9 @@ class Settings:
             SettingError: a value out of range or of the wrong kind.
         """
         table = self.values.get(step.name, {})
-        classes = {k: v for k, v in table.items() if k in GROUPS and isinstance(v, Mapping)}
+        classes: dict[str, Mapping[str, Any]] = {
+            k: v for k, v in table.items() if k in GROUPS and isinstance(v, Mapping)
+        }
         general = {k: v for k, v in table.items() if k not in classes}
         special = classes.get(group or "", {})
         merged = {**given, **step.per_class.get(group or "", {}), **general, **special}

@@ -23,7 +23,7 @@ def oriented_normals(cloud: PointCloud, neighbours: int, path: Trajectory | None
     the mass around it.
     """
     if len(cloud) < 3:
-        return replace(cloud, normal=np.tile(np.float32([0, 0, 1]), (len(cloud), 1)))
+        return replace(cloud, normal=np.tile(np.array([0, 0, 1], np.float32), (len(cloud), 1)))
     points = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.xyz.astype(np.float64)))
     points.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(min(neighbours, len(cloud))))
     normal = np.asarray(points.normals).astype(np.float32)

@@ -111,7 +111,7 @@ class Trajectory:
     times: F64
     positions: F64
 
-    def at(self, times: npt.ArrayLike) -> F64:
+    def at(self, times: F64) -> F64:
         """(N, 3) positions at `times`, linearly interpolated, held at both ends."""
         return np.stack([np.interp(times, self.times, self.positions[:, k]) for k in range(3)], axis=-1)
 

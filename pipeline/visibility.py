@@ -115,7 +115,7 @@ def depth_map(camera: Camera, T_world_cam: F64, hides: Scene, *, pixels: int = P
         met = hides.casting.cast_rays(cast)["t_hit"].numpy()
         depth = np.where(np.isfinite(rays[..., 0]), met, np.inf).astype(np.float32)
     if len(hides.centres):
-        T_cam_world = np.linalg.inv(T_world_cam)
+        T_cam_world: F64 = np.linalg.inv(T_world_cam).astype(np.float64)
         range_image.draw_discs(depth, rays, model, p, T_cam_world, hides.centres, hides.normals, hides.radius)
     return DepthMap(camera, T_world_cam, depth)
 

@@ -15,7 +15,7 @@ def _load(path: Path) -> Any:
     import trimesh
 
     try:
-        loaded = trimesh.load(path, process=False)
+        loaded: Any = trimesh.load(path, process=False)
         if len(loaded.vertices) == 0:
             raise ValueError("no vertices")
         return loaded

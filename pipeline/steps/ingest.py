@@ -38,7 +38,7 @@ def ingest(inputs: Inputs, params: IngestParams, out: Path, report: Report) -> D
     for i, name in enumerate(sorted(inputs)):
         report(i / len(inputs), f"reading {inputs[name].name}")
         cloud = clouds.read(inputs[name], frame)
-        finite = np.isfinite(cloud.xyz).all(axis=1)
+        finite = np.atleast_1d(np.isfinite(cloud.xyz).all(axis=1))
         if not finite.all():
             warnings.append(f"{inputs[name].name}: {np.count_nonzero(~finite):,} points with NaN coordinates left out")
             cloud = cloud.take(finite)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,7 +21,8 @@ if TYPE_CHECKING:
 GROUP_RGB = {"terrain": (176, 158, 138), "building": (206, 160, 132), "vegetation": (126, 172, 104)}
 SEEN_RGB = {255: (92, 160, 96), 128: (222, 170, 70), 64: (196, 84, 76)}
 EYE_HEIGHT = 1.6  # metres above the ground, a driver's
-MAP_ASPECT = 3.0  # a map is turned to lie along its longer side, and is at most this wide to its height
+COARSE = 0.17  # metres a pixel of the map of points, enough for every voxel to fill its own
+GLANCE = 96  # pixels across, enough to tell how much of a photo the world fills
 
 
 class PicturesParams(Params):
@@ -132,7 +134,8 @@ def pictures(inputs: Inputs, params: PicturesParams, out: Path, report: Report) 
             )
 
     views, held = views_io.load(inputs["views"]), views_io.load_held_out(inputs["views"])
-    for i in _compared(held, params.compared):
+    filled = [world.view(view.camera.scaled(GLANCE / view.camera.width), view.T_world_cam).hit.mean() for view in views]
+    for i in _compared(held, filled, params.compared):
         report(0.7 + 0.3 * i / max(1, len(views)), views[i].name)
         photo = read_photo(views[i].photo)
         if photo is None:
@@ -206,8 +209,7 @@ def bird_pose(low: F64, high: F64) -> F64:
 def points_from_above(cloud: PointCloud, low: F64, high: F64, width: int) -> U8:
     """A map of the points by class, the highest of a pixel on top, its colour dimmed by depth."""
     assert cloud.label is not None
-    width = min(width, 900)
-    metre = max(float((high - low)[:2].max()) / width, 0.02)
+    metre = max(float((high - low)[:2].max()) / width, COARSE)
     size = np.maximum(np.ceil((high - low)[:2] / metre).astype(int), 1)
     inside = ((cloud.xyz[:, :2] >= low[:2]) & (cloud.xyz[:, :2] < high[:2])).all(axis=1)
     inside &= cloud.label != 18
@@ -217,7 +219,7 @@ def points_from_above(cloud: PointCloud, low: F64, high: F64, width: int) -> U8:
     picture = np.full((size[1], size[0], 3), 250, np.uint8)
     light = np.clip(0.75 + 0.35 * (xyz[order, 2] - low[2]) / max(high[2] - low[2], 1e-3), 0.6, 1.15)
     picture[size[1] - 1 - cell[:, 1], cell[:, 0]] = np.clip(colour_of()[label[order]] * light[:, None], 0, 255)
-    return lying(picture)
+    return lying(picture.repeat(max(1, width // max(size)), axis=0).repeat(max(1, width // max(size)), axis=1))
 
 
 def lying(picture: U8) -> U8:
@@ -258,14 +260,9 @@ def resized(photo: U8, camera: Camera) -> U8:
     return cv2.resize(np.ascontiguousarray(photo), (camera.width, camera.height), interpolation=cv2.INTER_AREA)
 
 
-def _compared(held: list[bool], count: int) -> list[int]:
-    """Indices of views to compare: held-out ones first, spread evenly over those of a kind."""
-    out: list[int] = []
-    for kind in (True, False):
-        of_kind = [i for i, h in enumerate(held) if h == kind]
-        wanted = min(count - len(out), len(of_kind))
-        out += [of_kind[(2 * k + 1) * len(of_kind) // (2 * wanted)] for k in range(wanted)]
-    return out
+def _compared(held: Sequence[bool], filled: Sequence[float], count: int) -> list[int]:
+    """Indices of views to compare: held-out ones first, of a kind those that the world fills most of."""
+    return sorted(range(len(held)), key=lambda i: (not held[i], -filled[i]))[:count]
 
 
 PICTURES = Step("pictures", 1, pictures, PicturesParams)

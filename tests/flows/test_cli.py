@@ -254,6 +254,17 @@ def test_a_full_disk(street: Path, tmp_path: Path) -> None:
         subprocess.run(["umount", str(mount)], check=True)
 
 
+def test_ctrl_c_ends_with_a_message_and_frees_the_folder(street: Path, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "flows.cli", "run", str(street), "--out", str(tmp_path / "out"), *SMALL]
+    child = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    while child.poll() is None and not (tmp_path / "out" / "steps" / "poisson.terrain").exists():
+        time.sleep(0.02)
+    child.send_signal(signal.SIGINT)
+    _, message = child.communicate(timeout=30)
+    assert child.returncode == 130 and "what was finished is kept" in message and "Traceback" not in message
+    bad(scan2sim("run", street, "--out", tmp_path / "out", "--from", "roof"), 2, "no such step")  # not locked
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "step", ["ingest", "poisson.terrain", "unwrap.building", "texture.terrain", "export", "pictures"]

@@ -29,7 +29,7 @@ def test_what_is_saved_comes_back(tmp_path: Path) -> None:
     assert back.time is not None and cloud.time is not None and (back.time == cloud.time).all()
     path = Trajectory(np.arange(3.0), random.random((3, 3)))
     path.save(tmp_path / "t.npz")
-    assert np.allclose(Trajectory.load(tmp_path / "t.npz").at([0.5]), path.positions[:2].mean(axis=0))
+    assert np.allclose(Trajectory.load(tmp_path / "t.npz").at(np.array([0.5])), path.positions[:2].mean(axis=0))
 
 
 def test_join_fills_what_some_clouds_lack() -> None:
