@@ -19,7 +19,7 @@ SMALLEST = 16
 """Pages are at least this wide (texels)."""
 COARSE = 4
 """xatlas packs in steps of this many texels at most: its search for places slows with their number."""
-CHART = 100_000
+CHART = 30_000
 """xatlas' charts are at most this many texels: growing one takes the square of its faces."""
 
 
