@@ -81,7 +81,7 @@ def main() -> None:
     for group in GROUPS:
         ours_mesh = Mesh.load(next((ours_out / "steps" / f"decimate.{group}").glob("*/mesh.npz")))
         naive_mesh = Mesh.load(naive_out / f"{group}.npz")
-        mine, other = (truth_error(m, truth, group, SAMPLES) for m in (ours_mesh, naive_mesh))
+        mine, other = (truth_error(m, truth, group, SAMPLES) or float("nan") for m in (ours_mesh, naive_mesh))
         ratios[group] = round(mine / other, 3)
         print(f"{group:<12}{other * 100:>9.2f}{mine * 100:>9.2f}{ratios[group]:>8.2f}")
     result = {

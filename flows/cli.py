@@ -60,7 +60,7 @@ def run(
     hold_out: HoldOut = None,
     force: Force = False,
     from_: From = None,
-    jobs: Annotated[int, typer.Option(help="Steps at a time; 0: as the cores allow.")] = 0,
+    jobs: Annotated[int, typer.Option(min=0, help="Steps at a time; 0: as the cores allow.")] = 0,
 ) -> None:
     """Make a world of a tile; what an earlier run has finished is kept."""
     from flows.run import run_tile
@@ -114,7 +114,9 @@ def import_kitti(
     drive: Annotated[Path, typer.Argument(help="A drive's folder (..._sync), or one that holds it.")],
     out: TileOut,
     poses: Annotated[Path | None, typer.Option(help="Sweep poses instead of OXTS: row-major 3x4 a line.")] = None,
+    camera: Annotated[list[str] | None, typer.Option(help="Its folder; several times for several.")] = None,
     max_range: Annotated[float, typer.Option(help="Metres; returns from further away are left out.")] = 50.0,
+    rigid: Annotated[bool, typer.Option("--rigid", help="Sweeps are motion-compensated already.")] = False,
     name: Name = None,
     link: Link = False,
     overwrite: Overwrite = False,
@@ -125,8 +127,9 @@ def import_kitti(
 
     with progress("import") as report:
         path = import_kitti_raw(
-            drive, out, poses=poses, max_range=max_range, name=name, link=link, overwrite=overwrite, report=report
-        )
+            drive, out, poses=poses, cameras=camera or ["image_02"], max_range=max_range, deskew=not rigid,
+            name=name, link=link, overwrite=overwrite, report=report,
+        )  # fmt: skip
     typer.echo(f"Tile: {path}")
 
 
@@ -200,7 +203,10 @@ def main() -> None:
             typer.echo("Interrupted; what was finished is kept, the same command goes on from there.", err=True)
         raise
     except Exception as error:
-        from pipeline.errors import ScanError, exit_code
+        from pipeline.errors import ScanError, exit_code, from_os_error
+
+        if isinstance(error, OSError):
+            error = from_os_error(error, error.filename or "a file")
 
         if isinstance(error, ScanError):
             typer.secho(f"error: {error.where}: {error.cause}", fg="red", err=True)

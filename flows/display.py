@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from flows.execute import Event
@@ -39,7 +40,7 @@ def progress(title: str) -> Iterator[Report]:
         task = bars.add_task(title, total=1.0, message="")
 
         def report(fraction: float, message: str = "") -> None:
-            bars.update(task, completed=fraction, message=message)
+            bars.update(task, completed=fraction, message=escape(message))
 
         yield report
 
@@ -70,7 +71,7 @@ class RunDisplay:
             self._started[node.label] = time.perf_counter()
             self._tasks[node.label] = self._bars.add_task(node.label, total=1.0, message="")
         elif event == "progress":
-            self._bars.update(self._tasks[node.label], completed=fraction, message=message)  # type: ignore[arg-type]
+            self._bars.update(self._tasks[node.label], completed=fraction, message=escape(message))  # type: ignore[arg-type]
         else:
             self._done += 1
             self._kept += event == "kept"

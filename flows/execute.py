@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from flows.recipe import Node, Output
-from pipeline.errors import ScanError, StepError, UnavailableError, from_os_error
+from pipeline.errors import BusyError, ScanError, StepError, from_os_error
 from pipeline.isolate import die_with_parent
 from pipeline.step import Report, silent
 from pipeline.store import Manifest, Store, digest, key_of
@@ -172,7 +172,7 @@ def locked(folder: Path) -> Iterator[None]:
     """Hold a folder for one run at a time.
 
     Raises:
-        UnavailableError: another run holds it.
+        BusyError: another run holds it.
         SpaceError: it can't be made.
     """
     try:
@@ -184,9 +184,7 @@ def locked(folder: Path) -> Iterator[None]:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise UnavailableError(
-                folder, "another run is writing here", "Wait for it, or choose another --out"
-            ) from None
+            raise BusyError(folder, "another run is writing here", "Wait for it, or choose another --out") from None
         yield
 
 

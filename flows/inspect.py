@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from xml.etree import ElementTree
 
+from rich.markup import escape
 from rich.table import Table
 
 from flows.display import console
@@ -22,9 +23,11 @@ def inspect_path(path: Path) -> None:
         InputError: nothing is there, or of no known kind.
     """
     kind, facts = _reader(path)(path)
-    table = Table(show_header=False, box=None, title=f"{kind}: {path}", title_justify="left", title_style="bold")
+    table = Table(
+        show_header=False, box=None, title=escape(f"{kind}: {path}"), title_justify="left", title_style="bold"
+    )
     for name, value in facts:
-        table.add_row(name, value)
+        table.add_row(name, escape(value))
     console.print(table, highlight=False)
 
 
@@ -130,7 +133,8 @@ def _mesh(path: Path) -> tuple[str, Facts]:
 
 
 def _ply(path: Path) -> tuple[str, Facts]:
-    head = path.read_bytes()[:4096]
+    with open(path, "rb") as file:
+        head = file.read(4096)
     return _mesh(path) if b"element face" in head and b"element face 0" not in head else _cloud(path)
 
 

@@ -36,6 +36,7 @@ STEPS: tuple[Step, ...] = (
     INGEST, PATH, SEGMENT, SPLIT, VOXEL, POISSON, TRIM, ISLANDS, DECIMATE, PLANTS, VIEWS, UNWRAP,
     VISIBILITY, TEXTURE, COLLISION, EXPORT, GEOMETRY, SCORE, PICTURES,
 )  # fmt: skip
+PER_CLASS: tuple[Step, ...] = (VOXEL, POISSON, TRIM, ISLANDS, DECIMATE, UNWRAP, TEXTURE)
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,7 @@ def recipe(tile: Tile, settings: Settings) -> list[Node]:
     Raises:
         SettingError: a setting that doesn't exist or is out of range.
     """
-    settings.check(STEPS)
+    settings.check(STEPS, PER_CLASS)
     nodes: list[Node] = []
 
     def add(step: Step, inputs: Mapping[str, Path | Output], group: str | None = None, **given: Any) -> str:
@@ -86,12 +87,11 @@ def recipe(tile: Tile, settings: Settings) -> list[Node]:
 
     vegetation = settings.params(SPLIT).vegetation
     groups = [g for g in GROUPS if g != "vegetation" or vegetation != "locations"]
-    size = settings.params(VOXEL).size
     scanner = {"path": Output("path", "path")} if path else {}
     for part in (*GROUPS, "rest"):
         add(VOXEL, {"cloud": Output("split", part)} | scanner, part)
     for group in groups:
-        cloud = Output(f"voxel.{group}", "cloud")
+        cloud, size = Output(f"voxel.{group}", "cloud"), settings.params(VOXEL, group).size
         add(POISSON, {"cloud": cloud}, group, voxel=size)
         add(TRIM, {"mesh": Output(f"poisson.{group}", "mesh"), "cloud": cloud}, group, voxel=size)
         add(ISLANDS, {"mesh": Output(f"trim.{group}", "mesh")}, group)

@@ -12,6 +12,7 @@ from typing import Any
 
 from flows.execute import Planned, versions
 from pipeline.classes import GROUPS
+from pipeline.io import crs
 from pipeline.store import Manifest, Store
 from pipeline.types import Tile
 
@@ -53,7 +54,7 @@ def figures(tile: Tile, done: Mapping[str, Manifest]) -> dict[str, Any]:
     }
     return {
         "tile": tile.name,
-        "crs": tile.frame.crs[:80],
+        "crs": crs.name(tile.frame.crs),
         "origin": list(tile.frame.origin),
         "made": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         "versions": versions(),

@@ -9,9 +9,11 @@ import time
 import traceback
 from pathlib import Path
 
+from rich.markup import escape
+
 from flows.display import RunDisplay, console
-from flows.execute import Planned, execute, locked, plan, versions
-from flows.recipe import recipe
+from flows.execute import Event, Planned, execute, locked, plan, versions
+from flows.recipe import Node, recipe
 from flows.report import write_report
 from flows.settings import Settings
 from pipeline.errors import ScanError, SettingError, from_os_error
@@ -20,6 +22,8 @@ from pipeline.store import Manifest, Store
 from pipeline.types import Tile
 
 STORE = "steps"
+EDITED = (".sdf", ".config", ".json", ".mtl", ".geojson", ".csv")  # what users change by hand
+BULKY = ("poses", "positions", "times")  # parameters that repeat the tile
 
 
 def run_tile(
@@ -34,24 +38,37 @@ def run_tile(
         ScanError: see `pipeline.errors`; earlier results stay.
     """
     began = time.perf_counter()
+    tile = read_tile(path)
     with locked(out):
-        tile, planned, store = _plan(path, out, settings, force, start)
+        planned, store = _plan(tile, out, settings, force, start)
+        log = Log(out / "run.log")
+        log.write(f"tile {tile.path}, settings {json.dumps(settings.values)}, versions {json.dumps(versions())}")
         missing = sum(p.reason is not None for p in planned)
         try:
             with RunDisplay(len(planned)) as display:
-                done = execute(planned, store, jobs=jobs or default_jobs(), watch=display.watch)
+
+                def watch(node: Node, event: Event, fraction: float, message: str) -> None:
+                    display.watch(node, event, fraction, message)
+                    if event != "progress":
+                        log.write(f"{node.label}: {event}")
+
+                done = execute(planned, store, jobs=jobs or default_jobs(), watch=watch)
+            for label, manifest in done.items():
+                told = [manifest.facts["told"]] if "told" in manifest.facts else []
+                for line in told + [f"warning: {text}" for text in manifest.warnings]:
+                    log.write(f"{label}: {line}")
             _publish(store, planned, done, out, tile, settings)
             report = write_report(tile, planned, done, store, out, seconds=time.perf_counter() - began)
         except ScanError as error:
-            _log(out, error)
+            log.write(f"error: {error}", *getattr(error, "__notes__", traceback.format_exception(error)))
             raise
         except OSError as error:
             raise from_os_error(error, out) from error
         store.sweep({p.node.label: p.key for p in planned})
     for label, manifest in done.items():
         for warning in manifest.warnings:
-            console.print(f"[yellow]warning:[/] {label}: {warning}", highlight=False)
-    console.print(f"World:  {out / 'world'}\nReport: {report}", highlight=False, soft_wrap=True)
+            console.print(f"[yellow]warning:[/] {label}: {escape(warning)}", highlight=False, soft_wrap=True)
+    console.print(f"World:  {out / 'world'}\nReport: {report}", highlight=False, soft_wrap=True, markup=False)
     if missing == 0:
         console.print(
             f"[dim]nothing to do: all is as the tile and the settings say ({time.perf_counter() - began:.1f} s)"
@@ -63,7 +80,7 @@ def show_plan(path: Path, out: Path, settings: Settings, *, force: bool = False,
     """Print each step of the tile, whether it would run, and why."""
     from rich.table import Table
 
-    _, planned, _ = _plan(path, out, settings, force, start)
+    planned, _ = _plan(read_tile(path), out, settings, force, start)
     table = Table("step", "would run", "why", box=None, header_style="bold")
     for item in planned:
         runs, why = ("yes", item.reason) if item.reason else ("no", "kept: same input, settings and version")
@@ -76,48 +93,61 @@ def default_jobs() -> int:
     return 3 if (os.cpu_count() or 1) >= 6 else 2
 
 
-def _plan(
-    path: Path, out: Path, settings: Settings, force: bool, start: str | None
-) -> tuple[Tile, list[Planned], Store]:
-    tile = read_tile(path)
+def _plan(tile: Tile, out: Path, settings: Settings, force: bool, start: str | None) -> tuple[list[Planned], Store]:
     nodes = recipe(tile, settings)
     names = {node.step.name for node in nodes}
     if start is not None and start not in names:
         raise SettingError(f"--from {start}", "there is no such step", f"Steps are: {', '.join(sorted(names))}")
     store = Store(out / STORE)
-    return tile, plan(nodes, store, force=force, start=start), store
+    return plan(nodes, store, force=force, start=start), store
 
 
 def _publish(
     store: Store, planned: list[Planned], done: dict[str, Manifest], out: Path, tile: Tile, settings: Settings
 ) -> None:
-    """Put the world beside the report, as hard links into the store where the file system allows."""
-    keys = {p.node.label: p.key for p in planned}
-    source = store.folder("export", keys["export"]) / done["export"].files["world"]
+    """Put the world and the resolved settings beside the report; a world that is there already stays as it is."""
+    key = next(p.key for p in planned if p.node.label == "export")
+    source = store.folder("export", key) / done["export"].files["world"]
+    _publish_world(source, out, key)
+    config = {
+        "tile": str(tile.path),
+        "versions": versions(),
+        "set": settings.values,
+        "steps": {label: {k: v for k, v in m.params.items() if k not in BULKY} for label, m in done.items()},
+    }
+    (out / "config.json").write_text(json.dumps(config, indent=1), encoding="utf-8")
+
+
+def _publish_world(source: Path, out: Path, key: str) -> None:
+    """Copy the world from the store (meshes and textures as hard links, where that can be), unless it is the same."""
+    stamp = out / "world" / ".result"
+    files = [path.relative_to(source) for path in source.rglob("*") if path.is_file()]
+    if stamp.is_file() and stamp.read_text() == key and all((out / "world" / file).is_file() for file in files):
+        return
     fresh = out / ".world"
     shutil.rmtree(fresh, ignore_errors=True)
     shutil.copytree(source, fresh, copy_function=_link)
     shutil.rmtree(out / "world", ignore_errors=True)
     fresh.rename(out / "world")
-    config = {
-        "tile": str(tile.path),
-        "versions": versions(),
-        "set": settings.values,
-        "steps": {
-            p.node.label: done[p.node.label].params for p in planned if p.node.step.name not in ("views", "path")
-        },
-    }
-    (out / "config.json").write_text(json.dumps(config, indent=1), encoding="utf-8")
+    stamp.write_text(key)
 
 
 def _link(source: str, target: str) -> None:
     try:
+        if Path(source).suffix in EDITED:
+            raise OSError("a user's edit must not reach the store")
         os.link(source, target)
     except OSError:
         shutil.copy2(source, target)
 
 
-def _log(out: Path, error: ScanError) -> None:
-    with open(out / "run.log", "a", encoding="utf-8") as file:
-        file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {error}\n")
-        file.writelines(getattr(error, "__notes__", traceback.format_exception(error)))
+class Log:
+    """`run.log`: what was asked for, what ran when, what steps told, and the details of errors."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def write(self, *lines: str) -> None:
+        """Append lines, the first with the time."""
+        with open(self.path, "a", encoding="utf-8") as file:
+            file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} " + "".join(f"{line.rstrip()}\n" for line in lines))

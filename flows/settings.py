@@ -45,39 +45,40 @@ class Settings:
             parts = path.strip().split(".")
             if not equals or len(parts) not in (2, 3):
                 raise SettingError(f"--set {text}", "is no assignment", "Write --set step.param=value")
-            table = values
+            table: Any = values
             for part in parts[:-1]:
                 table = table.setdefault(part, {})
+                if not isinstance(table, dict):
+                    raise SettingError(f"--set {text}", f"`{part}` was given a value before", "Make it a table there")
             table[parts[-1]] = _value(value.strip())
         return cls(values)
 
-    def check(self, steps: Iterable[Step]) -> None:
-        """Refuse names that no step knows.
+    def check(self, steps: Iterable[Step], per_class: Iterable[Step]) -> None:
+        """Refuse names that no step knows, and classes where a step is not run per class.
 
         Raises:
-            SettingError: naming the nearest one that exists.
+            SettingError: naming the nearest name that exists.
         """
-        known = {step.name: step for step in steps}
+        known, by_class = {step.name: step for step in steps}, {step.name for step in per_class}
         for name, table in self.values.items():
             if name not in known:
                 raise SettingError(name, "there is no such step", _nearest(name, known))
             if not isinstance(table, Mapping):
                 raise SettingError(name, "must be a table of parameters", f"Write [{name}] or --set {name}.param=value")
+            fields = known[name].params.model_fields
             for key, value in table.items():
-                inner = value if key in GROUPS and isinstance(value, Mapping) else {key: value}
-                for param in inner:
-                    if param not in known[name].params.model_fields:
-                        raise SettingError(
-                            f"{name}.{param}",
-                            "there is no such parameter",
-                            _nearest(param, known[name].params.model_fields),
-                        )
+                special = key in GROUPS and isinstance(value, Mapping)
+                if special and name not in by_class:
+                    raise SettingError(f"{name}.{key}", "this step is not run per class", f"Set {name}.param instead")
+                for param in value if special else (key,):
+                    if param not in fields:
+                        raise SettingError(f"{name}.{param}", "there is no such parameter", _nearest(param, fields))
 
     def params(self, step: Step, group: str | None = None, **given: Any) -> Any:
         """The step's parameters: `given` by the recipe, defaults of the class, what the user set.
 
         Raises:
-            SettingError: a value out of range or of the wrong kind.
+            SettingError: a value out of range or of the wrong kind, or one that only the recipe sets.
         """
         table = self.values.get(step.name, {})
         classes: dict[str, Mapping[str, Any]] = {
@@ -85,6 +86,8 @@ class Settings:
         }
         general = {k: v for k, v in table.items() if k not in classes}
         special = classes.get(group or "", {})
+        for name in {*general, *special} & set(given):
+            raise SettingError(f"{step.name}.{name}", "follows from the tile or other settings", "Leave it out")
         merged = {**given, **step.per_class.get(group or "", {}), **general, **special}
         try:
             return step.params(**merged)

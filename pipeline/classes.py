@@ -53,6 +53,7 @@ CLASSES: tuple[PointClass, ...] = (
     PointClass(69, "sidewalk", "terrain", (200, 180, 190)),
 )
 CODE: dict[str, int] = {c.name: c.code for c in CLASSES}
+NOISE = (7, 18)
 UNKNOWN = (0, 1, 12)  # never classified, unclassified, legacy overlap
 
 

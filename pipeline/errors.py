@@ -49,6 +49,10 @@ class SpaceError(ScanError):
     """The disk is full or may not be written to."""
 
 
+class BusyError(ScanError):
+    """Another run is at work in the same place."""
+
+
 class UnavailableError(ScanError):
     """Something that is not installed or can't run on this machine."""
 
@@ -61,6 +65,7 @@ EXIT_CODES: dict[type[BaseException], tuple[int, int, str]] = {
     StepError: (5, 500, "a step failed, its retry and fallback included"),
     SpaceError: (6, 507, "the disk is full or can't be written to"),
     UnavailableError: (7, 501, "something needed is not installed or can't run here"),
+    BusyError: (8, 409, "another run is at work in the same folder"),
     KeyboardInterrupt: (130, 499, "interrupted; what was finished is kept"),
 }
 
@@ -76,8 +81,11 @@ def exit_code(error: BaseException) -> int:
 def from_os_error(error: OSError, path: str | Path) -> ScanError:
     """Turn an operating system's refusal to write into a `SpaceError` that names the path."""
     where = error.filename or path
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+    partial_write = error.errno is None and "written" in str(error)  # as numpy tells of a full disk
+    if error.errno in (errno.ENOSPC, errno.EDQUOT) or partial_write:
         return SpaceError(where, "no space left on the disk", "Free some space and run again; finished steps are kept")
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         return SpaceError(where, "may not be written to", "Choose another --out, or change its permissions")
+    if error.errno in (errno.EEXIST, errno.ENOTDIR, errno.EISDIR):
+        return SettingError(where, str(error.strerror), "Name another path: there is something else in its place")
     return InputError(where, str(error.strerror or error), "Check that the path exists and can be read")

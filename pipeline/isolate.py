@@ -26,14 +26,15 @@ def call(target: str, *args: Any, timeout: float, threads: int | None = None) ->
     Raises:
         StepError: the child crashed, raised, or ran out of time.
     """
-    environment = dict(os.environ, OMP_WAIT_POLICY="passive")
+    # the parent's own search path: a user's folder may hold modules named like ours
+    environment = dict(os.environ, OMP_WAIT_POLICY="passive", PYTHONPATH=os.pathsep.join(filter(None, sys.path)))
     if threads is not None:
         environment |= {"OMP_NUM_THREADS": str(threads), "NUMBA_NUM_THREADS": str(threads)}
     with tempfile.TemporaryDirectory(prefix="scan2sim-") as folder:
         exchange = Path(folder)
         (exchange / "in").write_bytes(pickle.dumps((target, args), protocol=5))
         child = subprocess.Popen(
-            [sys.executable, "-m", "pipeline.isolate", folder],
+            [sys.executable, "-P", "-m", "pipeline.isolate", folder],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             env=environment,

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from pipeline.types import F32, F64, PointCloud, Trajectory
 
 STEEP = 0.3  # |nz| below which "up" says nothing of a surface's outside
+CHUNK = 20_000
 WALL_RADIUS = 3.0  # metres around a wall's point in which its building is looked for
 
 
@@ -49,7 +50,11 @@ def _away_from_mass(xyz: F32, normal: F32) -> npt.NDArray[np.floating]:
     if len(steep):
         coarse = np.unique(np.round(xyz / 0.5).astype(np.int32), axis=0).astype(np.float32) * 0.5
         tree = cKDTree(coarse)
-        near = tree.query_ball_point(xyz[steep], WALL_RADIUS, workers=-1)
-        toward[steep] = [xyz[i] - coarse[j].mean(axis=0) if j else (0, 0, 1) for i, j in zip(steep, near, strict=True)]
+        for at in range(0, len(steep), CHUNK):  # lists of neighbours are large
+            here = steep[at : at + CHUNK]
+            near = tree.query_ball_point(xyz[here], WALL_RADIUS, workers=-1)
+            toward[here] = [
+                xyz[i] - coarse[j].mean(axis=0) if j else (0, 0, 1) for i, j in zip(here, near, strict=True)
+            ]
         toward[steep, 2] = 0
     return toward

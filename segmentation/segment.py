@@ -32,7 +32,7 @@ def segment(inputs: Inputs, params: SegmentParams, out: Path, report: Report) ->
 
     import numpy as np
 
-    from pipeline.classes import CLASSES, UNKNOWN
+    from pipeline.classes import CLASSES, UNKNOWN, group_of
     from pipeline.types import PointCloud
 
     report(0.0, "reading")
@@ -60,8 +60,14 @@ def segment(inputs: Inputs, params: SegmentParams, out: Path, report: Report) ->
         "points": {names.get(code, str(code)): int(count[code]) for code in np.flatnonzero(count).tolist()},
     }
     warnings = []
+    group = group_of()
     if source == "geometry":
-        warnings.append("The cloud has no classes of its own: they were told from shape, which confuses some things")
+        why = "they were told anew" if own else "The cloud has none of its own: they were told"
+        warnings.append(f"classes: {why} from shape, which confuses some things")
+    elif not np.isin(group[np.flatnonzero(count)], (1, 2)).any():
+        warnings.append(
+            "the cloud classifies neither buildings nor vegetation; --set segment.overwrite=true finds them"
+        )
     return Done({"cloud": file}, facts, warnings)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -95,16 +95,16 @@ def held_out(folders: Sequence[Path], views: Sequence[View], depths: Sequence[Pa
     """
     import cv2
 
+    from pipeline.io import image
     from pipeline.render import Renderer, textured
     from texturing.texture import read_mask
 
     renderer = Renderer([textured(folder) for folder in folders])
     files: list[Path | None] = list(depths) if depths is not None else [None] * len(views)
     for view, depth in zip(views, files, strict=True):
-        photo: Any = cv2.imread(str(view.photo), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        photo = image.read_rgb(view.photo)
         if photo is None or photo.shape[:2] != (view.camera.height, view.camera.width):
             continue
-        photo = np.ascontiguousarray(photo[..., ::-1])
         render = renderer.view(view.camera, view.T_world_cam)
         allowed = read_mask(view) if view.mask is not None else None
         surface = render.hit if allowed is None else render.hit & (allowed > 0)

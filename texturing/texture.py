@@ -61,9 +61,9 @@ def texture(inputs: Inputs, params: TextureParams, out: Path, report: Report) ->
     File: `textured`, a folder with `mesh.npz`, `page_<i>.png` and `page_<i>_seen.png` (255 seen by a photo,
     128 coloured from points, 64 filled from neighbours or by class, 0 no surface).
     """
-    import cv2
     import numpy as np
 
+    from pipeline.io import image
     from pipeline.io import views as views_io
     from pipeline.types import Mesh
 
@@ -88,8 +88,8 @@ def texture(inputs: Inputs, params: TextureParams, out: Path, report: Report) ->
         faces = np.flatnonzero(mesh.page == k)
         page = painter.paint(faces, size["width"], size["height"])
         texels[faces] = _finish(page, faces, mesh, colours, own, params)
-        cv2.imwrite(str(folder / f"page_{k}.png"), page.rgb[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 2])
-        cv2.imwrite(str(folder / f"page_{k}_seen.png"), page.seen, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+        image.write(folder / f"page_{k}.png", page.rgb)
+        image.write(folder / f"page_{k}_seen.png", page.seen, compression=1)
     warnings = [f"{name}: not used for texture, other photos stand in" for name in painter.skipped.values()]
     return Done({"textured": folder}, _facts(mesh, texels, sizes, painter), warnings)
 
@@ -184,19 +184,19 @@ class Painter:
 
     def _read(self, i: int) -> tuple[tuple[U8, U8, U8], U8] | None:
         """Photo `i`, halved once and twice, and its mask ((0, 0) where it has none); None if it can't be used."""
-        import cv2
         import numpy as np
+
+        from pipeline.io import image
 
         view = self._views[i]
         size = (view.camera.height, view.camera.width)
-        image: Any = cv2.imread(str(view.photo), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-        if image is None:
+        whole = image.read_rgb(view.photo)
+        if whole is None:
             self.skipped[i] = f"{view.photo} can't be read"
             return None
-        if image.shape[:2] != size:
-            self.skipped[i] = f"{view.photo} is {image.shape[1]} x {image.shape[0]} pixels, not {size[1]} x {size[0]}"
+        if whole.shape[:2] != size:
+            self.skipped[i] = f"{view.photo} is {whole.shape[1]} x {whole.shape[0]} pixels, not {size[1]} x {size[0]}"
             return None
-        whole = np.ascontiguousarray(image[..., ::-1])
         half = _halved(whole)
         mask = read_mask(view) if view.mask is not None else None
         return (whole, half, _halved(half)), (np.zeros((0, 0), np.uint8) if mask is None else mask)

@@ -54,8 +54,12 @@ def common(
     if crs == LOCAL:
         return LOCAL, UNITS[units or "m"]
     unit = _metres_per_unit(tile, crs)
-    if units:
-        unit = UNITS[units]
+    if units and abs(UNITS[units] / unit - 1) > 1e-5:
+        raise InputError(
+            tile,
+            f"says units = {units!r}, but the axes of {name(crs)} are of {unit:g} m",
+            "Leave `units` out: a CRS has its own; it is for clouds without one",
+        )
     return crs, unit
 
 
@@ -128,4 +132,12 @@ def _metres_per_unit(tile: Path, crs: str) -> float:
             f"its CRS {name(crs)} is not projected (degrees can't be meshed)",
             "Reproject the clouds, to UTM for example",
         )
-    return float(horizontal.axis_info[0].unit_conversion_factor)
+    factor = float(horizontal.axis_info[0].unit_conversion_factor)
+    heights = [float(axis.unit_conversion_factor) for axis in _parsed(crs).axis_info[2:]]
+    if any(abs(height / factor - 1) > 1e-5 for height in heights):
+        raise InputError(
+            tile,
+            f"in {name(crs)} heights are in units of {heights[0]:g} m, but positions of {factor:g} m",
+            "Bring the clouds to one unit first (a CRS with metres, or feet, for both)",
+        )
+    return factor

@@ -28,6 +28,9 @@ def _load(path: Path) -> Any:
 def read_header(path: Path) -> tuple[int, F64, F64, str | None]:
     """Number of points, low and high corner (CRS units); PLY has no CRS."""
     xyz = np.asarray(_load(path).vertices, np.float64)
+    xyz = xyz[np.isfinite(xyz).all(axis=1)]
+    if len(xyz) == 0:
+        raise InputError(path, "holds no point with finite coordinates", "Export it again, or as LAZ")
     return len(xyz), xyz.min(axis=0), xyz.max(axis=0), None
 
 

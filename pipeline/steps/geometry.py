@@ -52,12 +52,13 @@ def geometry(inputs: Inputs, params: GeometryParams, out: Path, report: Report) 
             "cloud_to_mesh_p95_m": float(np.percentile(distance, 95)),
         }
         if truth is not None and truth.label is not None:
-            figures["truth_mean_m"] = truth_error(mesh, truth, group, params.samples)
+            error = truth_error(mesh, truth, group, params.samples)
+            figures |= {} if error is None else {"truth_mean_m": error}
         facts[group] = {name: round(value, 4) for name, value in figures.items()}
     return Done({}, facts)
 
 
-def truth_error(mesh: Mesh, truth: Mesh, group: str, samples: int) -> float:
+def truth_error(mesh: Mesh, truth: Mesh, group: str, samples: int) -> float | None:
     """Mean distance in metres from points spread evenly on the mesh to the true surface of its class.
 
     Samples outside the bounds of the true surface (a cloud reaches further than its street) don't count.
@@ -66,6 +67,8 @@ def truth_error(mesh: Mesh, truth: Mesh, group: str, samples: int) -> float:
 
     assert truth.label is not None
     same = truth.keep(group_of()[truth.label] == GROUPS.index(group)).moved_to(mesh.frame)  # type: ignore[arg-type]
+    if not len(same):
+        return None
     points = spread(mesh, samples)
     low, high = same.vertices.min(axis=0)[:2], same.vertices.max(axis=0)[:2]
     points = points[((points[:, :2] >= low) & (points[:, :2] <= high)).all(axis=1)]

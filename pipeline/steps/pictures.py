@@ -12,6 +12,7 @@ import numpy as np
 from pydantic import Field
 
 from pipeline.classes import GROUPS, colour_of
+from pipeline.io import image
 from pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
@@ -52,12 +53,8 @@ class Album:
         self.index.append(entry)
 
     def _write(self, name: str, rgb: U8) -> str:
-        import cv2
-
-        path = self.folder / f"{name}.jpg"
-        if not cv2.imwrite(str(path), np.ascontiguousarray(rgb[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 88]):
-            raise OSError(28, "No space left on device", str(path))
-        return path.name
+        image.write(self.folder / f"{name}.jpg", rgb, quality=88)
+        return f"{name}.jpg"
 
 
 def pictures(inputs: Inputs, params: PicturesParams, out: Path, report: Report) -> Done:
@@ -137,7 +134,7 @@ def pictures(inputs: Inputs, params: PicturesParams, out: Path, report: Report) 
     filled = [world.view(view.camera.scaled(GLANCE / view.camera.width), view.T_world_cam).hit.mean() for view in views]
     for i in _compared(held, filled, params.compared):
         report(0.7 + 0.3 * i / max(1, len(views)), views[i].name)
-        photo = read_photo(views[i].photo)
+        photo = image.read_rgb(views[i].photo)
         if photo is None:
             continue
         small = views[i].camera.scaled(min(1.0, params.width / views[i].camera.width))
@@ -164,7 +161,7 @@ def driver_pose(path: F64 | None, low: F64, high: F64, ground: Any) -> F64:
     if path is not None and len(path) > 1:
         inside = path[((path[:, :2] > low[:2]) & (path[:, :2] < high[:2])).all(axis=1)]
         path = inside if len(inside) > 1 else path
-        axis = np.linalg.svd(path - path.mean(axis=0))[2][0] if len(path) < 5000 else np.ptp(path, axis=0)
+        axis = np.linalg.svd(path - path.mean(axis=0), full_matrices=False)[2][0]
         along = (path - path.mean(axis=0)) @ axis
         ends = path[np.argsort(along)[[len(along) // 8, -1]]]
         start, end = ends if (ends[1] - ends[0])[:2].any() else (path[0], path[-1])
@@ -183,10 +180,10 @@ def driver_pose(path: F64 | None, low: F64, high: F64, ground: Any) -> F64:
 def ground_height(renderer: Any, point: F64, low: F64, high: F64) -> float:
     """Height of the lowest surface about a point, metres; of the tile's floor where there is none."""
     corner = np.array([point[0] - 1, point[1] - 1, low[2] - 50]), np.array([point[0] + 1, point[1] + 1, high[2] + 50])
-    image = renderer.above(*corner, width=9)
-    if not image.hit.any():
+    shot = renderer.above(*corner, width=9)
+    if not shot.hit.any():
         return float(low[2])
-    return float(corner[1][2] + 1.0 - image.range[image.hit].max())
+    return float(corner[1][2] + 1.0 - shot.range[shot.hit].max())
 
 
 def bird_pose(low: F64, high: F64) -> F64:
@@ -212,7 +209,6 @@ def points_from_above(cloud: PointCloud, low: F64, high: F64, width: int) -> U8:
     metre = max(float((high - low)[:2].max()) / width, COARSE)
     size = np.maximum(np.ceil((high - low)[:2] / metre).astype(int), 1)
     inside = ((cloud.xyz[:, :2] >= low[:2]) & (cloud.xyz[:, :2] < high[:2])).all(axis=1)
-    inside &= cloud.label != 18
     xyz, label = cloud.xyz[inside], cloud.label[inside]
     order = np.argsort(xyz[:, 2], kind="stable")
     cell = ((xyz[order, :2] - low[:2]) / metre).astype(int).clip(max=size - 1)
@@ -227,30 +223,23 @@ def lying(picture: U8) -> U8:
     return np.ascontiguousarray(np.rot90(picture)) if picture.shape[0] > picture.shape[1] * 1.3 else picture
 
 
-def seen_colours(image: Image) -> U8:
+def seen_colours(shot: Image) -> U8:
     """The picture tinted by where each texel's colour comes from."""
-    tint = np.full(image.rgb.shape, 230, np.uint8)
+    tint = np.full(shot.rgb.shape, 230, np.uint8)
     for value, rgb in SEEN_RGB.items():
-        tint[image.hit & (image.seen == value)] = rgb
-    grey = image.rgb.mean(axis=2, keepdims=True) / 255
-    return np.where(image.hit[..., None], tint * (0.45 + 0.6 * grey), 250).clip(0, 255).astype(np.uint8)
+        tint[shot.hit & (shot.seen == value)] = rgb
+    grey = shot.rgb.mean(axis=2, keepdims=True) / 255
+    return np.where(shot.hit[..., None], tint * (0.45 + 0.6 * grey), 250).clip(0, 255).astype(np.uint8)
 
 
 def thumbnail(page: Path, width: int) -> U8:
     """A texture page, at most `width` pixels wide."""
     import cv2
 
-    image = cv2.imread(str(page), cv2.IMREAD_COLOR)
-    factor = min(1.0, width / max(image.shape[:2]))
-    return cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)[..., ::-1]
-
-
-def read_photo(path: Path) -> U8 | None:
-    """(H, W, 3) RGB, None where it can't be decoded (texturing has warned of it)."""
-    import cv2
-
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    return None if image is None else image[..., ::-1]
+    pixels = image.read_rgb(page)
+    assert pixels is not None
+    factor = min(1.0, width / max(pixels.shape[:2]))
+    return cv2.resize(pixels, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
 
 
 def resized(photo: U8, camera: Camera) -> U8:

@@ -93,15 +93,15 @@ def crowns(xyz: F32, ground: F32, params: PlantsParams) -> npt.NDArray[np.float6
     background = ~filled
     markers[background] = -1
     grown = ndimage.watershed_ift(levels, markers.astype(np.int32)) if count else markers
-    result = []
-    for i in range(1, count + 1):
-        at = np.argwhere(top & (markers == i)).mean(axis=0)
-        crown = (grown == i) & filled
-        row, column = at.astype(int)
-        x, y = (at + 0.5) * CELL + low
-        tall = height[crown].max() if crown.any() else height[row, column]
-        result.append((x, y, base[row, column], tall, np.sqrt(max(crown.sum(), 1) * CELL**2 / np.pi)))
-    return np.array(result, np.float64).reshape(-1, 5)
+    if not count:
+        return np.empty((0, 5))
+    plant = np.arange(1, count + 1)
+    middle = np.array(ndimage.center_of_mass(top, markers * top, plant))
+    row, column = middle.astype(int).T
+    crown = np.where(filled, grown, 0)
+    tall = ndimage.maximum(height, crown, plant)
+    area = np.bincount(crown[crown > 0], minlength=count + 1)[1 : count + 1] * CELL**2
+    return np.column_stack([(middle + 0.5) * CELL + low, base[row, column], tall, np.sqrt(area / np.pi)])
 
 
 def _geojson_crs(crs: str) -> dict[str, object] | None:

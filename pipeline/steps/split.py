@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from pipeline.classes import CLASSES, GROUPS, group_of
+from pipeline.classes import CLASSES, GROUPS, NOISE, group_of
 from pipeline.errors import DataError
 from pipeline.step import Done, Inputs, Params, Report, Step
 
@@ -25,7 +25,7 @@ def split(inputs: Inputs, params: SplitParams, out: Path, report: Report) -> Don
     """Cut the classified `cloud` into `terrain`, `building`, `vegetation` and `rest`.
 
     Signs and poles go with buildings; vehicles, people, wires, noise and what has no class are
-    left out of the surface (`rest`), though they still hide what is behind them.
+    left out of the surface (`rest`), though they still hide what is behind them; noise is dropped.
 
     Raises:
         DataError: no point belongs to any surface.
@@ -40,7 +40,8 @@ def split(inputs: Inputs, params: SplitParams, out: Path, report: Report) -> Don
     files, counts, warnings = {}, {}, []
     for i, name in enumerate((*GROUPS, "rest")):
         report(i / 4, name)
-        part = cloud.take(np.flatnonzero(group == (i if name != "rest" else -1)))
+        chosen = group == i if name != "rest" else (group == -1) & ~np.isin(cloud.label, NOISE)
+        part = cloud.take(np.flatnonzero(chosen))
         part.save(out / f"{name}.npz")
         files[name] = out / f"{name}.npz"
         counts[name] = len(part)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +22,7 @@ class ViewsParams(Params):
     """What becomes of the photos.
 
     Attributes:
-        hold_out: keeps every nth photo out of texturing, to score the texture against; 0: none.
+        hold_out: keeps every nth photo out of texturing (of all cameras in turn), to score it; 0: none.
         poses: the views as JSON (`pipeline.io.views`), file names without folders; set by the recipe.
     """
 
@@ -60,7 +61,8 @@ def views(inputs: Inputs, params: ViewsParams, out: Path, report: Report) -> Don
         elif not _sees(view, points):
             sees_nothing.append(view.name)
         else:
-            kept.append(replace(view, photo=_linked(view.photo, out, i), mask=mask and _linked(mask, out, i)))
+            photo = _linked(view.photo, out / "photos", i)
+            kept.append(replace(view, photo=photo, mask=mask and _linked(mask, out / "masks", i)))
     if sees_nothing and not kept:
         raise DataError(
             inputs["photo.0"].parent,
@@ -71,19 +73,31 @@ def views(inputs: Inputs, params: ViewsParams, out: Path, report: Report) -> Don
         raise InputError(inputs["photo.0"], "no photo of the tile can be read", "Put the photos back, or take them out")
     if sees_nothing:
         warnings.append(f"{len(sees_nothing)} photos see no point of the cloud: {', '.join(sees_nothing[:5])}")
-    held = [params.hold_out > 0 and i % params.hold_out == params.hold_out // 2 for i in range(len(kept))]
+    held = held_out(kept, params.hold_out)
+    if params.hold_out and kept and not any(held):
+        warnings.append(f"{len(kept)} photos are too few to hold every {params.hold_out}th out: none is")
     views_io.save(out / "views.json", kept, held)
     # links: a moved tile breaks them, which rebuilds this step alone, not what was made from the photos
     facts = {"photos": len(params.poses), "usable": len(kept), "held_out": sum(held)}
     return Done({"views": out / "views.json"}, facts, warnings)
 
 
-def _linked(file: Path, out: Path, index: int) -> Path:
-    """A link below `out` to a photo or mask, relative to `out`."""
-    link = Path("photos") / f"{index:05d}_{file.name}"
-    (out / "photos").mkdir(exist_ok=True)
-    (out / link).symlink_to(file.resolve())
-    return link
+def _linked(file: Path, folder: Path, index: int) -> Path:
+    """A link in `folder` to a photo or mask, relative to the folder's own."""
+    folder.mkdir(exist_ok=True)
+    link = folder / f"{index:05d}_{file.name}"
+    link.symlink_to(file.resolve())
+    return link.relative_to(folder.parent)
+
+
+def held_out(views: Sequence[View], every: int) -> list[bool]:
+    """Which views are held out: every nth, counted camera after camera, so that every camera has its turn."""
+    held = [False] * len(views)
+    cameras = list(dict.fromkeys(view.camera for view in views))
+    in_turn = sorted(range(len(views)), key=lambda i: cameras.index(views[i].camera))
+    for i in in_turn[every // 2 :: every] if every else ():
+        held[i] = True
+    return held
 
 
 def _problem(view: View) -> str | None:
@@ -100,6 +114,8 @@ def _problem(view: View) -> str | None:
         try:
             with Image.open(path) as image:
                 size = image.size
+                image.draft(None, (size[0] // 8, size[1] // 8))  # a JPEG is decoded at an eighth, which tells enough
+                image.load()
         except FileNotFoundError:
             return f"{path} is missing"
         except (UnidentifiedImageError, OSError) as error:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from pipeline.io import las
 from pipeline.io.tile import read_tile
@@ -206,6 +207,40 @@ def test_missing_and_unreadable_photos_are_skipped(damaged: Path, tmp_path: Path
         assert photo.name in out, out
 
 
+def test_masks_named_as_their_photos_keep_pixels_out(damaged: Path, tmp_path: Path) -> None:
+    (damaged / "masks").mkdir()
+    text, out = (damaged / "tile.toml").read_text(), []
+    for line in text.splitlines():
+        out.append(line)
+        if line.startswith("file ="):
+            name = Path(line.split('"')[1]).name
+            width, height = Image.open(damaged / "photos" / name).size
+            Image.new("L", (width, height), 0).save(damaged / "masks" / name, quality=100)
+            out.append(f'mask = "masks/{name}"')
+    (damaged / "tile.toml").write_text("\n".join(out))
+    good(scan2sim("run", damaged, "--out", tmp_path / "out", *SMALL))
+    assert json.loads((tmp_path / "out" / "report.json").read_text())["texture"]["coverage"] == 0
+
+
+def test_a_folder_that_is_no_tile_is_not_overwritten(street: Path, tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    result = scan2sim("import", "las", street / "cloud.laz", "--out", tmp_path, "--overwrite")
+    bad(result, 2, "is no tile")
+    assert (tmp_path / "notes.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize("options", [["--jobs", "-1"], ["--set", "ingest.unit=2.0"], ["--set", "split.roof.x=1"]])
+def test_options_that_make_no_sense(street: Path, tmp_path: Path, options: list[str]) -> None:
+    assert scan2sim("run", street, "--out", tmp_path / "out", *options).returncode == 2
+
+
+def test_a_users_edit_of_the_world_stays(street: Path, world: Path) -> None:
+    sdf = next((world / "world").glob("*.sdf"))
+    sdf.write_text(sdf.read_text() + "<!-- my robot -->")
+    good(scan2sim("run", street, "--out", world, "--hold-out", 4, *SMALL))
+    assert "my robot" in sdf.read_text()
+
+
 def test_all_photos_gone(damaged: Path, tmp_path: Path) -> None:
     shutil.rmtree(damaged / "photos")
     bad(scan2sim("run", damaged, "--out", tmp_path / "out", *SMALL), 3, "no photo of the tile can be read")
@@ -243,10 +278,13 @@ def test_bad_input_leaves_earlier_results(street: Path, world: Path, tmp_path: P
     assert list((tmp_path / "out" / "steps" / "poisson.terrain").glob("*/mesh.npz"))
 
 
-def test_a_full_disk(street: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("megabytes", [6, 40])
+def test_a_full_disk(street: Path, tmp_path: Path, megabytes: int) -> None:
     mount = tmp_path / "small_disk"
     mount.mkdir()
-    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=6m", "tmpfs", str(mount)], capture_output=True).returncode:
+    if subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", f"size={megabytes}m", "tmpfs", str(mount)], capture_output=True
+    ).returncode:
         pytest.skip("a small file system can't be mounted here (not root)")
     try:
         bad(scan2sim("run", street, "--out", mount / "out", *SMALL), 6, "no space left", "Free some space")
@@ -265,9 +303,12 @@ def test_ctrl_c_ends_with_a_message_and_frees_the_folder(street: Path, tmp_path:
     bad(scan2sim("run", street, "--out", tmp_path / "out", "--from", "roof"), 2, "no such step")  # not locked
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    "step", ["ingest", "poisson.terrain", "unwrap.building", "texture.terrain", "export", "pictures"]
+    "step",
+    [
+        "poisson.terrain",
+        *(pytest.param(s, marks=pytest.mark.slow) for s in ("ingest", "unwrap.building", "texture.terrain", "export")),
+    ],
 )
 def test_kill_9_at_any_step_then_resume(street: Path, tmp_path: Path, step: str) -> None:
     command = [sys.executable, "-m", "flows.cli", "run", str(street), "--out", str(tmp_path / "out"), *SMALL]

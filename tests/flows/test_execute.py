@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from flows.execute import execute, locked, plan
-from pipeline.errors import DataError, StepError, UnavailableError
+from pipeline.errors import BusyError, DataError, StepError
 from pipeline.store import Manifest, Store
 from tests.conftest import ROOT
 from tests.flows.toy import chain
@@ -125,7 +125,7 @@ def test_plan_says_why(tmp_path: Path, source: Path, run: Run) -> None:
 
 
 def test_two_runs_do_not_share_a_folder(tmp_path: Path) -> None:
-    with locked(tmp_path / "out"), pytest.raises(UnavailableError, match="another run"), locked(tmp_path / "out"):
+    with locked(tmp_path / "out"), pytest.raises(BusyError, match="another run"), locked(tmp_path / "out"):
         pass
 
 
@@ -138,26 +138,17 @@ def test_kill_9_leaves_nothing_half_made_and_no_process_behind(tmp_path: Path, s
     child = subprocess.Popen([sys.executable, "-c", script], cwd=ROOT)
     log = tmp_path / "log"
     deadline = time.monotonic() + 60
-    while time.monotonic() < deadline and (not log.exists() or "b" not in log.read_text()):
+    while time.monotonic() < deadline and not (tmp_path / "pid_b").exists():
         time.sleep(0.05)
+    hanging = (tmp_path / "pid_b").read_text()
     child.send_signal(signal.SIGKILL)
     child.wait()
     store = Store(tmp_path / "store")
     kept = {p.node.label: p.reason for p in plan(chain(source, log), store)}
     assert kept["a"] is None and kept["b"] is not None
     assert run()["d"].facts == {"total": 2}
-    while time.monotonic() < deadline and _hangs(str(tmp_path)):
+    pid = (tmp_path / "pid_b").read_text()  # of the run above, which ended
+    assert hanging != pid
+    while time.monotonic() < deadline and Path(f"/proc/{hanging}").exists():
         time.sleep(0.1)
-    assert not _hangs(str(tmp_path))
-
-
-def _hangs(folder: str) -> bool:
-    """Whether a process still has a file or argument in `folder`."""
-    me = str(os.getpid())
-    for process in Path("/proc").glob("[0-9]*"):
-        try:
-            if process.name != me and folder in (process / "cmdline").read_text():
-                return True
-        except OSError:
-            continue
-    return False
+    assert not Path(f"/proc/{hanging}").exists()

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from flows.recipe import STEPS
+from flows.recipe import PER_CLASS, STEPS
 from flows.settings import Settings
 from pipeline.errors import SettingError
 from pipeline.steps.decimate import DECIMATE
@@ -47,7 +47,7 @@ def test_a_class_wins_over_all_classes_and_the_command_line_over_the_file(tmp_pa
 )
 def test_unknown_names_are_refused_with_the_nearest(text: str, message: str) -> None:
     with pytest.raises(SettingError) as caught:
-        Settings.read(None, [text]).check(STEPS)
+        Settings.read(None, [text]).check(STEPS, PER_CLASS)
     assert message in str(caught.value)
 
 

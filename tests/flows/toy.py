@@ -26,6 +26,7 @@ def toy(inputs: Inputs, params: ToyParams, out: Path, report: Report) -> Done:
     """Write the sum of all inputs and the value."""
     with open(params.log, "a") as file:
         file.write(params.name + "\n")
+    params.log.with_name(f"pid_{params.name}").write_text(str(os.getpid()))
     total = params.value + sum(int(path.read_text()) for path in inputs.values())
     (out / "number.txt").write_text(str(total))
     if params.does == "fail":

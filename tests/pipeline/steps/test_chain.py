@@ -146,21 +146,27 @@ def test_poisson_follows_the_ground(ground: dict[str, Path]) -> None:
     assert distances(cloud.xyz, mesh).mean() < 0.01
 
 
+def test_poisson_repeats_bit_for_bit(ground: dict[str, Path], tmp_path: Path) -> None:
+    again = Mesh.load(go(POISSON, tmp_path, {"cloud": ground["cloud"]}).files["mesh"])
+    once = Mesh.load(ground["mesh"])
+    assert (again.vertices == once.vertices).all() and (again.faces == once.faces).all()
+
+
 def test_poisson_falls_back_when_the_child_dies(
     ground: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls = []
     real = isolate.call
 
-    def flaky(*args: Any, threads: int | None = None, **kwargs: Any) -> Any:
-        calls.append(threads)
+    def flaky(*args: Any, **kwargs: Any) -> Any:
+        calls.append(args[3])
         if len(calls) < 3:
             raise StepError("poisson", "crashed (exit status -11)", "")
-        return real(*args, threads=threads, **kwargs)
+        return real(*args, **kwargs)
 
     monkeypatch.setattr(isolate, "call", flaky)
     done = go(POISSON, tmp_path, {"cloud": ground["cloud"]}, depth=8)
-    assert calls == [None, 1, 1]
+    assert calls == [8, 8, 7]
     assert done.facts["depth"] == 7 and len(done.warnings) == 2
 
 

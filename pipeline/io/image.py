@@ -1,0 +1,33 @@
+"""Photos and pictures, through OpenCV: pixels as they lie in the file, RGB."""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.types import U8
+
+
+def read_rgb(path: Path) -> U8 | None:
+    """(H, W, 3) RGB, the camera's orientation flag ignored (poses and sizes are of the pixels); None if unreadable."""
+    import cv2
+
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    return None if image is None else np.ascontiguousarray(image[..., ::-1])
+
+
+def write(path: Path, image: U8, *, quality: int = 90, compression: int = 2) -> None:
+    """Write (H, W, 3) RGB or (H, W) grey; `quality` is a JPEG's, `compression` a PNG's.
+
+    Raises:
+        OSError: nothing could be written; OpenCV doesn't say why, nearly always the disk is full.
+    """
+    import cv2
+
+    pixels = image[..., ::-1] if image.ndim == 3 else image
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_PNG_COMPRESSION, compression]
+    if not cv2.imwrite(str(path), np.ascontiguousarray(pixels), options):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
