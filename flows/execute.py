@@ -9,6 +9,7 @@ import os
 import shutil
 import signal
 import sys
+import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
@@ -21,7 +22,6 @@ from typing import Any, Literal
 
 from flows.recipe import Node, Output
 from pipeline.errors import BusyError, ScanError, StepError, from_os_error
-from pipeline.isolate import die_with_parent
 from pipeline.step import Report, silent
 from pipeline.store import Manifest, Store, digest, key_of
 
@@ -224,7 +224,7 @@ def _child(connection: Connection, item: Planned, store: Store, inputs: dict[str
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent is interrupted, and stops its children
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     os.setpgrp()
-    die_with_parent()
+    threading.Thread(target=_end_with_the_run, daemon=True).start()
 
     def report(fraction: float, message: str = "") -> None:
         connection.send(("progress", fraction, message))
@@ -233,6 +233,14 @@ def _child(connection: Connection, item: Planned, store: Store, inputs: dict[str
         connection.send(("done", run_node(item, store, inputs, report), ""))
     except ScanError as error:
         connection.send(("error", error, traceback.format_exc()))
+
+
+def _end_with_the_run() -> None:
+    """Wait for the death of the process that runs the recipe, and follow it: nobody would take the result."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    wait([parent.sentinel])
+    os.killpg(os.getpgrp(), signal.SIGKILL)
 
 
 def _receive(connection: Connection, item: Planned, process: ForkServerProcess, watch: Watch) -> Manifest | None:
