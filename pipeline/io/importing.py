@@ -25,9 +25,7 @@ def tile_folder(out: Path, overwrite: bool = False) -> Iterator[Path]:
     if out.is_dir() and any(out.iterdir()) and not overwrite:
         raise SettingError(out, "exists and is not empty", "Name a new folder, or say that it may be overwritten")
     if out.is_dir() and any(out.iterdir()) and not (out / "tile.toml").is_file():
-        raise SettingError(
-            out, "is no tile, and is not overwritten", "Name a new folder, or a tile's"
-        )
+        raise SettingError(out, "is no tile, and is not overwritten", "Name a new folder, or a tile's")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         work = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
