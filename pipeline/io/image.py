@@ -5,10 +5,11 @@ from __future__ import annotations
 import errno
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from pipeline.types import U8
+from pipeline.types import U8, View
 
 
 def read_rgb(path: Path) -> U8 | None:
@@ -28,6 +29,15 @@ def write(path: Path, image: U8, *, quality: int = 90, compression: int = 2) -> 
     import cv2
 
     pixels = image[..., ::-1] if image.ndim == 3 else image
-    options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_PNG_COMPRESSION, compression]
+    jpeg = path.suffix.lower() in (".jpg", ".jpeg")
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality] if jpeg else [cv2.IMWRITE_PNG_COMPRESSION, compression]
     if not cv2.imwrite(str(path), np.ascontiguousarray(pixels), options):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+
+def read_mask(view: View) -> U8 | None:
+    """The view's mask (H, W), 0 where its photo must not be used; None if it can't be read or is of another size."""
+    import cv2
+
+    mask: Any = cv2.imread(str(view.mask), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    return mask if mask is not None and mask.shape == (view.camera.height, view.camera.width) else None
