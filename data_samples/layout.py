@@ -23,7 +23,8 @@ HALF_WIDTH = 20.0
 class Style:
     """The ranges and lists from which a street is drawn; change some to randomise its looks.
 
-    Lengths in metres, angles in degrees, colours linear RGB, shares in [0, 1].
+    Lengths in metres, angles in degrees, colours linear RGB, shares in [0, 1]. `moving_car`: whether one drives
+    in the other lane; all else is the same without it.
     """
 
     curve_radius: Span = (260.0, 900.0)
@@ -39,6 +40,7 @@ class Style:
     tree_spacing: Span = (8.5, 13.0)
     tree_height: Span = (5.4, 8.6)
     parked_spacing: Span = (6.2, 15.0)
+    moving_car: bool = True
     sun_elevation: Span = (40.0, 56.0)
     sun_strength: Span = (0.80, 0.95)
     sky_strength: Span = (0.40, 0.48)
@@ -184,6 +186,7 @@ class Layout:
     posts: tuple[Post, ...]
     parked: tuple[ParkedCar, ...]
     moving: RGB
+    moving_car: bool
     seed: int
     hills: Field = field(repr=False)
     bumps: Field = field(repr=False)
@@ -253,7 +256,8 @@ def lay_out(length: float, seed: int, style: Style | None = None) -> Layout:
         trees=tuple(trees),
         posts=tuple(_posts(rng, length, kerb, zebra, trees)),
         parked=tuple(_parked(rng, style, length, lane, parking, zebra)),
-        moving=_pick(rng, style.car),
+        moving=_pick(rng, style.car),  # drawn in any case: without the car all else stays as it is
+        moving_car=style.moving_car,
         seed=seed,
         hills=waves(rng, 7.0, dimensions=2),
         bumps=waves(rng, 1.3, dimensions=2),

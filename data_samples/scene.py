@@ -177,14 +177,14 @@ class Scene:
         """Where the moving car is `time` seconds after it passes the street's middle.
 
         Returns:
-            Position (..., 3), heading (...), and whether it is within the street.
+            Position (..., 3), heading (...), and whether it is within the street (never, if the style has none).
         """
         s = self.layout.axis.length / 2 + np.asarray(time, np.float64) * CAR_SPEED * way + centre
         t = -np.asarray(way) * self.layout.lane / 2
         xy, heading = self.layout.axis.place(s, t)
         z = self.layout.height(s, t) + 0.01
         margin = objects.CAR_LENGTH / 2 + 0.1
-        inside = (s > margin) & (s < self.layout.axis.length - margin)
+        inside = self.layout.moving_car & (s > margin) & (s < self.layout.axis.length - margin)
         return np.concatenate([xy, z[..., None]], axis=-1), heading + np.where(np.asarray(way) > 0, 0.0, np.pi), inside
 
     def cast(self, origins: F32, directions: F32, car: CarPoses | None = None) -> Hits:

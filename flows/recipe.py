@@ -28,15 +28,18 @@ from pipeline.steps.visibility import VISIBILITY
 from pipeline.steps.voxel import VOXEL
 from pipeline.types import Tile
 from segmentation.segment import SEGMENT
+from texturing.agreement import AGREEMENT
+from texturing.choose import CHOOSE
+from texturing.exposure import EXPOSURE
 from texturing.score import SCORE
 from texturing.texture import TEXTURE
 from texturing.unwrap import UNWRAP
 
 STEPS: tuple[Step, ...] = (
     INGEST, PATH, SEGMENT, SPLIT, VOXEL, POISSON, TRIM, ISLANDS, DECIMATE, PLANTS, VIEWS, UNWRAP,
-    VISIBILITY, TEXTURE, COLLISION, EXPORT, GEOMETRY, SCORE, PICTURES,
+    VISIBILITY, EXPOSURE, AGREEMENT, CHOOSE, TEXTURE, COLLISION, EXPORT, GEOMETRY, SCORE, PICTURES,
 )  # fmt: skip
-PER_CLASS: tuple[Step, ...] = (VOXEL, POISSON, TRIM, ISLANDS, DECIMATE, UNWRAP, TEXTURE)
+PER_CLASS: tuple[Step, ...] = (VOXEL, POISSON, TRIM, ISLANDS, DECIMATE, CHOOSE, UNWRAP, TEXTURE)
 
 
 @dataclass(frozen=True)
@@ -96,7 +99,6 @@ def recipe(tile: Tile, settings: Settings) -> list[Node]:
         add(TRIM, {"mesh": Output(f"poisson.{group}", "mesh"), "cloud": cloud}, group, voxel=size)
         add(ISLANDS, {"mesh": Output(f"trim.{group}", "mesh")}, group)
         add(DECIMATE, {"mesh": Output(f"islands.{group}", "mesh")}, group)
-        add(UNWRAP, {"mesh": Output(f"decimate.{group}", "mesh")}, group)
     meshes = {f"mesh.{g}": Output(f"decimate.{g}", "mesh") for g in groups}
     clouds = {f"cloud.{part}": Output(f"voxel.{part}", "cloud") for part in (*GROUPS, "rest")}
     plants: dict[str, Path | Output] = {}
@@ -107,11 +109,22 @@ def recipe(tile: Tile, settings: Settings) -> list[Node]:
     photos: dict[str, Path | Output] = {f"photo.{i}": view.photo for i, view in enumerate(tile.views)}
     masks: dict[str, Path | Output] = {f"mask.{i}": view.mask for i, view in enumerate(tile.views) if view.mask}
     add(VIEWS, photos | masks | clouds, poses=tuple(views_io.to_json(view, with_paths=False) for view in tile.views))
-    seen = {"views": Output("views", "views")}
+    seen: dict[str, Path | Output] = {"views": Output("views", "views")}
     add(VISIBILITY, meshes | clouds | seen)
+    seen = seen | {"depth": Output("visibility", "depth")}
+    prior = settings.params(EXPOSURE).prior
+    add(EXPOSURE, seen | ({"prior": Path(prior)} if prior else {}))
+    seen = seen | {"exposures": Output("exposure", "exposures")}
+    add(AGREEMENT, seen)
+    seen = seen | {"agreement": Output("agreement", "agreement")}
     for group in groups:
-        inputs = {"mesh": Output(f"unwrap.{group}", "mesh"), "pages": Output(f"unwrap.{group}", "pages")}
-        add(TEXTURE, inputs | clouds | seen | {"depth": Output("visibility", "depth")}, group)
+        mesh = {"mesh": Output(f"decimate.{group}", "mesh")}
+        add(CHOOSE, mesh | seen, group)
+        choice = {"choice": Output(f"choose.{group}", "choice")}
+        by_photo = {**choice, **seen} if settings.params(UNWRAP, group).backend == "photo" else {}
+        add(UNWRAP, mesh | by_photo, group)
+        unwrapped = {name: Output(f"unwrap.{group}", name) for name in ("mesh", "pages")}
+        add(TEXTURE, {**unwrapped, **choice, **clouds, **seen}, group)
     textured = {g: Output(f"texture.{g}", "textured") for g in groups}
     add(COLLISION, {g: Output(f"decimate.{g}", "mesh") for g in groups})
     add(EXPORT, textured | plants | {"collision": Output("collision", "mesh")}, name=tile.name)
@@ -120,9 +133,9 @@ def recipe(tile: Tile, settings: Settings) -> list[Node]:
     if tile.truth_mesh and tile.truth_points:
         truth = {"truth.mesh": tile.truth_mesh, "truth.points": tile.truth_points}
     add(GEOMETRY, meshes | clouds | truth)
-    add(SCORE, textured | seen | {"depth": Output("visibility", "depth")} | truth)
+    add(SCORE, textured | {name: seen[name] for name in ("views", "depth")} | truth)
     stages = {f"decimate.{g}": Output(f"decimate.{g}", "mesh") for g in groups}
-    add(PICTURES, textured | stages | clouds | seen | scanner)
+    add(PICTURES, textured | stages | clouds | {"views": seen["views"]} | scanner)
     return nodes
 
 

@@ -17,6 +17,9 @@ from pipeline.store import Manifest, Store
 from pipeline.types import Tile
 
 TEMPLATE = "report.html.j2"
+AREAS = ("area_m2", "seen_m2", "coloured_m2", "filled_m2")
+Picture = dict[str, Any]
+"""An entry of an album's index.json: `file`, `role`, `title`, `caption`, and perhaps `other`."""
 
 
 def write_report(
@@ -25,15 +28,14 @@ def write_report(
     """Write both reports into `out`; returns the page's path."""
     body = figures(tile, done) | {"seconds_this_run": round(seconds, 2)}
     _replace(out / "report.json", json.dumps(body, indent=1))
-    pictures: list[dict[str, Any]] = []
-    if "pictures" in done:
-        key = next(p.key for p in planned if p.node.label == "pictures")
-        folder = store.folder("pictures", key) / done["pictures"].files["pictures"]
-        pictures = json.loads((folder / "index.json").read_text(encoding="utf-8"))
-        for picture in pictures:
-            picture["src"] = _embedded(folder / picture["file"])
-            if "other" in picture:
-                picture["other_src"] = _embedded(folder / picture["other"])
+    keys = {p.node.label: p.key for p in planned}
+    pictures: list[Picture] = []
+    for label, name in (("pictures", "pictures"), ("score", "error")):
+        if label in done:
+            folder = store.folder(label, keys[label]) / done[label].files[name]
+            entries = json.loads((folder / "index.json").read_text(encoding="utf-8"))
+            shown = telling(entries, done[label].facts["photos"]) if name == "error" else entries
+            pictures += [_with_pixels(entry, folder) for entry in shown]
     page = out / "report.html"
     _replace(page, _render(body, pictures))
     return page
@@ -51,6 +53,7 @@ def figures(tile: Tile, done: Mapping[str, Manifest]) -> dict[str, Any]:
     texture: dict[str, Any] = {
         "coverage": round(sum(s.get("seen_m2", 0.0) for s in seen.values()) / area, 4) if area else 0.0,
         "coverage_by_class": {g: s.get("coverage", 0.0) for g, s in seen.items()},
+        "area_by_class": {g: {name: s.get(name, 0.0) for name in AREAS} for g, s in seen.items()},
     }
     return {
         "tile": tile.name,
@@ -70,7 +73,22 @@ def figures(tile: Tile, done: Mapping[str, Manifest]) -> dict[str, Any]:
     }
 
 
-def _render(body: Mapping[str, Any], pictures: Sequence[Mapping[str, Any]]) -> str:
+def telling(entries: Sequence[Picture], scores: Mapping[str, Mapping[str, float]]) -> list[Picture]:
+    """Of the error pictures the worst, the median and the best by `psnr_gain_db`, which `scores` gives by title."""
+    ordered = sorted(entries, key=lambda entry: scores[entry["title"]]["psnr_gain_db"])
+    if len(ordered) < 3:
+        return ordered
+    chosen = {"worst": ordered[0], "median": ordered[len(ordered) // 2], "best": ordered[-1]}
+    return [entry | {"caption": f"({rank} of {len(ordered)}) {entry['caption']}"} for rank, entry in chosen.items()]
+
+
+def _with_pixels(entry: Picture, folder: Path) -> Picture:
+    """The picture with what the page shows of it: `src`, and `other_src` where there is another."""
+    other = {"other_src": _embedded(folder / entry["other"])} if "other" in entry else {}
+    return entry | {"src": _embedded(folder / entry["file"])} | other
+
+
+def _render(body: Mapping[str, Any], pictures: Sequence[Picture]) -> str:
     from jinja2 import Environment, FileSystemLoader
 
     environment = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True)

@@ -105,10 +105,13 @@ def _plan(tile: Tile, out: Path, settings: Settings, force: bool, start: str | N
 def _publish(
     store: Store, planned: list[Planned], done: dict[str, Manifest], out: Path, tile: Tile, settings: Settings
 ) -> None:
-    """Put the world and the resolved settings beside the report; a world that is there already stays as it is."""
+    """Put the world, the exposures and the resolved settings beside the report; a world that is there stays."""
     key = next(p.key for p in planned if p.node.label == "export")
     source = store.folder("export", key) / done["export"].files["world"]
     _publish_world(source, out, key)
+    key = next(p.key for p in planned if p.node.label == "exposure")
+    solved = store.folder("exposure", key) / done["exposure"].files["exposures"]
+    shutil.copyfile(solved, out / "exposure.json")  # for the next tile, as its `exposure.prior`
     config = {
         "tile": str(tile.path),
         "versions": versions(),

@@ -24,13 +24,15 @@ MAX_DISC = 40
 
 
 def draw_discs(
-    depth: F32, rays: F32, model: int, p: F64, T_cam_world: F64, centres: F32, normals: F32, radius: float
+    depth: F32, rays: F32, model: int, p: F64, T_cam_world: F64, centres: F32, normals: F32, radii: F32
 ) -> None:
-    """Draw discs, centres (N, 3) and unit normals (N, 3) in local coordinates, radius in metres, in place."""
+    """Draw discs, centres (N, 3) and unit normals (N, 3) in local coordinates, radii (N,) metres, in place."""
     at = _to_camera(centres, T_cam_world)
     turned = T_cam_world.copy()
     turned[:3, 3] = 0
-    discs = np.ascontiguousarray(np.stack([at, _to_camera(normals, turned), np.full_like(at, radius)], axis=1))
+    discs = np.ascontiguousarray(
+        np.stack([at, _to_camera(normals, turned), np.repeat(radii[:, None], 3, axis=1)], axis=1)
+    )
     boxes = _disc_boxes(discs, model, p)
     start, index = _bands(boxes, depth.shape[0])
     _fill(depth, rays, discs, boxes, start, index)
@@ -147,10 +149,15 @@ def is_visible(depth, model, p, pixel, bias, x, y, z, nx, ny, nz):  # type: igno
     r = math.sqrt(x * x + y * y + z * z)
     slope = 0.0
     if nx != 0 or ny != 0 or nz != 0:
-        c = min(1.0, abs(x * nx + y * ny + z * nz) / r)
-        slope = min(MAX_SLOPE, math.sqrt(1 - c * c) / max(c, 1e-6))
-    # the pixel's own ray meets the same plane up to half a pixel away: nearer by that times the slope
+        slope = slope_of(abs(x * nx + y * ny + z * nz) / r)
     return r <= depth[row, column] + bias + SLOPE_SHARE * r * pixel * slope
+
+
+@njit(cache=True, inline="always")
+def slope_of(cos):  # type: ignore[no-untyped-def]
+    """tan of the angle of incidence, bounded: a pixel's own ray meets a plane nearer by this times half the pixel."""
+    c = min(1.0, cos)
+    return min(MAX_SLOPE, math.sqrt(1 - c * c) / max(c, 1e-6))
 
 
 @njit(cache=True, parallel=True)

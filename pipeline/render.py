@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -23,7 +23,8 @@ CHUNK = 500_000
 SKY = (200, 214, 230)
 SUN = np.array([0.45, 0.3, 0.84])
 
-Rays = Callable[[int, int], tuple[F64, F64]]
+Rays = Callable[[F64, F64], tuple[F64, F64]]
+"""Column and row of places (N,) in a picture, pixels, to origins and directions (N, 3) of the rays through them."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +72,15 @@ def textured(folder: Path) -> Body:
     return Body(mesh, tuple(folder / f"page_{i}.png" for i in range(count)))
 
 
+class _Met(NamedTuple):
+    """What N rays meet first: arrays (N,) as in `Image`."""
+
+    face: I32
+    body: npt.NDArray[np.int16]
+    range: F32
+    barycentric: F32
+
+
 class Renderer:
     """Meshes ready to be rendered from any number of cameras.
 
@@ -101,6 +111,7 @@ class Renderer:
         background: tuple[int, int, int] = SKY,
         shaded: bool = False,
         wireframe: bool = False,
+        samples: int = 1,
     ) -> Image:
         """What a camera sees.
 
@@ -109,17 +120,19 @@ class Renderer:
             background: colour where nothing is.
             shaded: darken by the angle to a made-up sun (for plain colours; textures have their own light).
             wireframe: draw the triangles' edges.
+            samples: rays a pixel each way; the colour of a pixel whose centre meets a mesh is the mean of those of
+                them that meet one. A simulator filters far textures with mip-maps; one ray a pixel makes them look
+                sharper than they are. All but the colours is of the ray through the pixel's centre.
         """
-        from pipeline.cameras import pixel_rays
+        from pipeline.cameras import unproject
 
-        rays = pixel_rays(camera).reshape(-1, 3)
         rotation, centre = np.asarray(T_world_cam)[:3, :3], np.asarray(T_world_cam)[:3, 3]
 
-        def at(first: int, last: int) -> tuple[F64, F64]:
-            directions = rays[first:last] @ rotation.T
+        def rays(column: F64, row: F64) -> tuple[F64, F64]:
+            directions = unproject(camera, np.column_stack([column, row])) @ rotation.T
             return np.broadcast_to(centre, directions.shape), directions
 
-        return self._cast(camera.width, camera.height, at, background, shaded, wireframe)
+        return self._cast(camera.width, camera.height, rays, background, shaded, wireframe, samples)
 
     def above(
         self,
@@ -137,16 +150,14 @@ class Renderer:
         height = max(1, round((high[1] - low[1]) / metre))
         top = high[2] + 1.0
 
-        def at(first: int, last: int) -> tuple[F64, F64]:
-            row, column = np.divmod(np.arange(first, last), width)
+        def rays(column: F64, row: F64) -> tuple[F64, F64]:
             x, y = low[0] + (column + 0.5) * metre, high[1] - (row + 0.5) * metre
             return np.column_stack([x, y, np.full(len(x), top)]), np.broadcast_to([0.0, 0.0, -1.0], (len(x), 3))
 
-        return self._cast(width, height, at, background, shaded, wireframe)
+        return self._cast(width, height, rays, background, shaded, wireframe, 1)
 
     def nearest(self, points: F32) -> tuple[U8, U8, F32]:
         """Colours (N, 3) and masks (N,) of the places on the meshes nearest to points (N, 3), and metres to them."""
-
         rgb, seen = np.zeros((len(points), 3), np.uint8), np.zeros(len(points), np.uint8)
         distance = np.full(len(points), np.inf, np.float32)
         if not self._body_of:
@@ -162,47 +173,83 @@ class Renderer:
                 rgb[at], seen[at] = self._colour(self.bodies[i], face[at], barycentric[at])
         return rgb, seen, distance
 
-    def _cast(
-        self, width: int, height: int, rays: Rays, background: tuple[int, int, int], shaded: bool, wireframe: bool
-    ) -> Image:
+    def nearest_places(self, points: F32) -> tuple[F32, F32]:
+        """The places on the meshes nearest to points (N, 3), local metres, and the unit normals of the faces there.
 
-        n = width * height
-        rgb = np.tile(np.array(background, np.uint8), (n, 1))
-        seen = np.zeros(n, np.uint8)
-        face = np.full(n, -1, np.int32)
-        which = np.full(n, -1, np.int16)
-        distance = np.full(n, np.inf, np.float32)
-        barycentric = np.zeros((n, 2), np.float32)
-        lookup = np.full(max(self._body_of, default=0) + 1, -1, np.int16)
-        for key, i in self._body_of.items():
-            lookup[key] = i
-        for first in range(0, n, CHUNK) if self._body_of else ():
-            here = slice(first, min(n, first + CHUNK))
-            origin, direction = rays(here.start, here.stop)
-            cast = np.nan_to_num(np.concatenate([origin, direction], axis=1)).astype(np.float32)
-            answer = self._casting.cast_rays(_tensor(cast))
-            t = answer["t_hit"].numpy()
-            hit = np.isfinite(t) & np.isfinite(direction).all(axis=1)
-            distance[here] = np.where(hit, t, np.inf)
-            face[here][hit] = answer["primitive_ids"].numpy()[hit].astype(np.int32)
-            which[here][hit] = lookup[answer["geometry_ids"].numpy()[hit]]
-            barycentric[here][hit] = answer["primitive_uvs"].numpy()[hit]
-            for i, body in enumerate(self.bodies):
-                at = np.flatnonzero(which[here] == i) + here.start
-                if len(at):
-                    rgb[at], seen[at] = self._colour(body, face[at], barycentric[at])
-                    if shaded:
-                        rgb[at] = _shade(body.mesh, face[at], direction[at - here.start], rgb[at])
-            if wireframe:
-                at = np.flatnonzero(which[here] >= 0) + here.start
-                size = np.linalg.norm(direction[at - here.start], axis=1)
-                edge = self._edge_distance(which[at], face[at], barycentric[at]) < 0.0012 * distance[at] * size + 0.002
-                rgb[at[edge]] = (rgb[at[edge]] * 0.35).astype(np.uint8)
-        shape = (height, width)
+        Both (N, 3) float32; NaN where there is no mesh.
+        """
+        if not self._body_of:
+            return np.full((len(points), 3), np.nan, np.float32), np.full((len(points), 3), np.nan, np.float32)
+        answer = self._casting.compute_closest_points(_tensor(np.asarray(points, np.float32)))
+        return answer["points"].numpy(), answer["primitive_normals"].numpy()
+
+    def _cast(
+        self,
+        width: int,
+        height: int,
+        rays: Rays,
+        background: tuple[int, int, int],
+        shaded: bool,
+        wireframe: bool,
+        samples: int,
+    ) -> Image:
+        n, shape = width * height, (height, width)
+        rgb, seen = np.tile(np.array(background, np.uint8), (n, 1)), np.zeros(n, np.uint8)
+        face, which = np.full(n, -1, np.int32), np.full(n, -1, np.int16)
+        distance, barycentric = np.full(n, np.inf, np.float32), np.zeros((n, 2), np.float32)
+        across, down = _sub_pixels(samples)
+        step = max(1, CHUNK // samples**2)
+        for first in range(0, n, step) if self._body_of else ():
+            here = slice(first, min(n, first + step))
+            row, column = np.divmod(np.arange(here.start, here.stop, dtype=np.float64), width)
+            origin, direction = rays(column, row)
+            met = self._meet(origin, direction)
+            face[here], which[here], distance[here], barycentric[here] = met
+            colour, seen[here] = self._paint(met, direction, shaded, wireframe)
+            hit = met.body >= 0
+            colour = colour[hit]
+            if samples > 1:
+                origin, direction = rays((column[hit, None] + across).ravel(), (row[hit, None] + down).ravel())
+                fine = self._meet(origin, direction)
+                colours, _ = self._paint(fine, direction, shaded, wireframe)
+                colour = _mean(colours, fine.body >= 0, colour)
+            rgb[here][hit] = colour
         return Image(
             rgb.reshape(*shape, 3), (which >= 0).reshape(shape), seen.reshape(shape), face.reshape(shape),
             which.reshape(shape), distance.reshape(shape), barycentric.reshape(*shape, 2),
         )  # fmt: skip
+
+    def _meet(self, origin: F64, direction: F64) -> _Met:
+        """What rays from origins along directions (N, 3) meet first; a direction of NaN meets nothing."""
+        cast, known = np.concatenate([origin, direction], axis=1, dtype=np.float32), np.isfinite(direction).all(axis=1)
+        cast[~known] = 0
+        answer = self._casting.cast_rays(_tensor(cast))
+        t = answer["t_hit"].numpy()
+        hit = np.isfinite(t) & known
+        lookup = np.full(max(self._body_of) + 1, -1, np.int16)
+        lookup[list(self._body_of)] = list(self._body_of.values())
+        face, body = np.full(len(t), -1, np.int32), np.full(len(t), -1, np.int16)
+        face[hit] = answer["primitive_ids"].numpy()[hit].astype(np.int32)
+        body[hit] = lookup[answer["geometry_ids"].numpy()[hit]]
+        barycentric = np.where(hit[:, None], answer["primitive_uvs"].numpy(), 0).astype(np.float32)
+        return _Met(face, body, np.where(hit, t, np.inf).astype(np.float32), barycentric)
+
+    def _paint(self, met: _Met, direction: F64, shaded: bool, wireframe: bool) -> tuple[U8, U8]:
+        """Colours (N, 3) and masks (N,) of what rays met, black and 0 where that is nothing."""
+        rgb, seen = np.zeros((len(met.body), 3), np.uint8), np.zeros(len(met.body), np.uint8)
+        for i, body in enumerate(self.bodies):
+            at = np.flatnonzero(met.body == i)
+            if len(at):
+                rgb[at], seen[at] = self._colour(body, met.face[at], met.barycentric[at])
+                if shaded:
+                    rgb[at] = _shade(body.mesh, met.face[at], direction[at], rgb[at])
+        if wireframe:
+            at = np.flatnonzero(met.body >= 0)
+            size = np.linalg.norm(direction[at], axis=1)
+            width = 0.0012 * met.range[at] * size + 0.002
+            edge = self._edge_distance(met.body[at], met.face[at], met.barycentric[at]) < width
+            rgb[at[edge]] = (rgb[at[edge]] * 0.35).astype(np.uint8)
+        return rgb, seen
 
     def _colour(self, body: Body, face: I32, barycentric: F32) -> tuple[U8, U8]:
         if not body.pages:
@@ -233,6 +280,21 @@ class Renderer:
             opposite = np.linalg.norm(c[:, [2, 0, 1]] - c[:, [1, 2, 0]], axis=2)
             out[on] = (weights * doubled[:, None] / np.maximum(opposite, 1e-9)).min(axis=1)
         return out
+
+
+def _sub_pixels(samples: int) -> tuple[F64, F64]:
+    """Offsets (samples^2,) across and down of a regular grid within a pixel, from its centre, pixels."""
+    offset = (np.arange(samples) + 0.5) / samples - 0.5
+    down, across = np.meshgrid(offset, offset, indexing="ij")
+    return across.ravel(), down.ravel()
+
+
+def _mean(colours: U8, hit: npt.NDArray[np.bool_], centre: U8) -> U8:
+    """Mean (N, 3) of the S colours (N * S, 3) of every pixel that `hit` (N * S,); of none: the `centre`'s (N, 3)."""
+    pixels, each = len(centre), len(hit) // max(1, len(centre))
+    count = hit.reshape(pixels, each, 1).sum(axis=1)
+    total = (colours * hit[:, None]).reshape(pixels, each, 3).sum(axis=1, dtype=np.float32)
+    return np.where(count > 0, np.round(total / np.maximum(count, 1)), centre).astype(np.uint8)
 
 
 def _tensor(array: npt.NDArray[Any]) -> Any:

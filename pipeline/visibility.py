@@ -4,9 +4,11 @@ A range image holds, for every pixel of a scaled camera, the distance along the 
 what it meets first, whatever the camera model. Meshes are met by ray casting (Embree); for discs every
 pixel of their footprint asks exactly where its own ray meets the plane.
 
-What hides: the meshes, and of the cloud only what the meshes lack (cars, people, what was trimmed away),
-as discs along the points' normals. A point is visible if its range is no more than the range image's
-plus a bias that grows with the slope at which the surface is seen.
+What hides: the meshes where points bear them out (Poisson rounds off what is thin, and such a bulge hides nothing),
+and of the cloud only what the meshes lack (cars, people, what was trimmed away), as discs along the points'
+normals. What drove past while it was scanned left a trail of points: each hides only from photos taken at about the
+time when it was scanned. A point is visible if its range is no more than the range image's plus a bias that grows
+with the slope at which the surface is seen. Measured on a street whose truth is known by `bench/visibility.py`.
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.classes import CODE
 from pipeline.types import F32, F64, Camera, Mesh, PointCloud
 
 BIAS = 0.04
@@ -28,6 +31,25 @@ PIXELS = 2_000_000
 """Range images are at most this large."""
 ENLARGED = 2.0
 """They are at most this many times as wide as the photo: finer pixels leak less and hide less falsely."""
+SUPPORT = 1.3
+"""A mesh farther from every point than so many times the points' usual spacing hides nothing there."""
+LOOSE = 2.5
+"""Leaves stand off the mesh of their crown: their points are left to it even so many times farther away."""
+MOVABLE = (CODE["vehicle"], CODE["person"])
+FOLIAGE = (CODE["low_vegetation"], CODE["mid_vegetation"], CODE["high_vegetation"])
+PASSING = 1.0
+"""Seconds: a movable thing moves where the points around one of its points were all scanned within this time."""
+AROUND = 1.0
+"""Metres: the points that are around another."""
+PASS = 5.0
+"""Seconds between scans of the same place that are told apart as two passes of the scanner."""
+PRESENT = (-0.1, 0.4)
+"""Seconds after its scan within which a point of a moving thing hides: points tell when their place was first scanned,
+and a car takes about so long to leave it."""
+CLOSING = 0.7
+"""Discs of movable things reach so far of the way to the eighth neighbour: seen from one side, they are sparse."""
+SPARSE = 3.0
+"""Though to at most so many times the discs' radius."""
 
 
 @dataclass(frozen=True)
@@ -38,14 +60,16 @@ class Scene:
         casting: Open3D's `RaycastingScene` of the meshes.
         triangles: number of them.
         centres, normals: (N, 3) of the discs; unit normals.
-        radius: of the discs, metres.
+        radii: (N,) of the discs, metres.
+        times: (N,) of the discs, seconds: when a moving thing was there; NaN for those that hide at all times.
     """
 
     casting: Any
     triangles: int
     centres: F32
     normals: F32
-    radius: float
+    radii: F32
+    times: F64
 
 
 @dataclass(frozen=True)
@@ -70,33 +94,95 @@ def scene(
 
     Args:
         meshes: all classes.
-        cloud: with normals; None if only meshes hide.
+        cloud: with normals; None if only meshes hide, all of them.
         radius: of the discs, metres; about the cloud's voxel size.
         lacking: points nearer than this to a mesh (metres) are left to the mesh.
     """
     import open3d as o3d
 
+    whole = cloud is None or not len(cloud) or cloud.normal is None
+    if cloud is not None and not whole:
+        meshes = _borne_out(meshes, cloud)
     casting, triangles = o3d.t.geometry.RaycastingScene(), 0
     for mesh in meshes:
         if len(mesh):
             casting.add_triangles(np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(mesh.faces, np.uint32))
             triangles += len(mesh)
-    if cloud is None or not len(cloud) or cloud.normal is None:
+    if cloud is None or whole:
         empty = np.zeros((0, 3), np.float32)
-        return Scene(casting, triangles, empty, empty, radius)
+        return Scene(casting, triangles, empty, empty, np.zeros(0, np.float32), np.zeros(0))
     if triangles:
-        cloud = cloud.take(casting.compute_distance(np.ascontiguousarray(cloud.xyz)).numpy() > lacking)
+        near = casting.compute_distance(np.ascontiguousarray(cloud.xyz)).numpy()
+        cloud = cloud.take(near > np.where(_of_class(cloud, FOLIAGE), LOOSE * lacking, lacking))
     assert cloud.normal is not None
-    return Scene(casting, triangles, cloud.xyz, cloud.normal, radius)
+    return Scene(casting, triangles, cloud.xyz, cloud.normal, _radii(cloud, radius), _times_of_moving(cloud))
 
 
-def depth_map(camera: Camera, T_world_cam: F64, hides: Scene, *, pixels: int = PIXELS) -> DepthMap:
+def _of_class(cloud: PointCloud, codes: tuple[int, ...]) -> npt.NDArray[np.bool_]:
+    """(N,) which points are of these classes; none where the classes aren't known."""
+    return np.zeros(len(cloud), bool) if cloud.label is None else np.isin(cloud.label, codes)
+
+
+def _borne_out(meshes: Iterable[Mesh], cloud: PointCloud) -> list[Mesh]:
+    """The faces whose corners all have a point near by; how near, the points' usual spacing says."""
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(cloud.xyz)
+    some = cloud.xyz[:: max(1, len(cloud) // 20_000)]
+    spacing, _ = tree.query(some, k=min(7, len(cloud)), workers=-1)
+    reach = SUPPORT * float(np.median(np.atleast_2d(spacing)[:, 1:].mean(axis=1))) if len(cloud) > 1 else np.inf
+    kept = []
+    for mesh in meshes:
+        distance, _ = tree.query(mesh.vertices, distance_upper_bound=reach, workers=-1)
+        kept.append(mesh.keep(np.isfinite(distance)[mesh.faces].all(axis=1)))
+    return kept
+
+
+def _radii(cloud: PointCloud, radius: float) -> F32:
+    """(N,) metres: `radius`, and of movable things so large that their discs close the surface between them."""
+    from scipy.spatial import cKDTree
+
+    radii = np.full(len(cloud), radius, np.float32)
+    movable = np.flatnonzero(_of_class(cloud, MOVABLE))
+    if len(movable):
+        xyz = cloud.xyz[movable]
+        distance, _ = cKDTree(xyz).query(xyz, k=[9], workers=-1)  # the first is the point itself
+        radii[movable] = np.clip(CLOSING * distance[:, 0], radius, SPARSE * radius)
+    return radii
+
+
+def _times_of_moving(cloud: PointCloud) -> F64:
+    """(N,) seconds: when points of moving things were scanned; NaN for all that stands, or of which it isn't known.
+
+    The scanner sees what stands for seconds while it drives by, and what drives past only for a moment at each place.
+    """
+    from scipy.spatial import cKDTree
+
+    times = np.full(len(cloud), np.nan)
+    movable = np.flatnonzero(_of_class(cloud, MOVABLE))
+    if len(movable) == 0 or cloud.time is None:
+        return times
+    xyz, own = cloud.xyz[movable], cloud.time[movable]
+    some = slice(None, None, 8)  # enough to tell, and so few that a fixed number of neighbours reaches far
+    _, near = cKDTree(xyz[some]).query(xyz, k=32, distance_upper_bound=AROUND, workers=-1)
+    around = np.append(own[some], np.nan)[near]
+    around[~(np.abs(around - own[:, None]) < PASS)] = np.nan
+    around[:, 0] = own
+    moving = np.nanmax(around, axis=1) - np.nanmin(around, axis=1) < PASSING
+    times[movable[moving]] = own[moving]
+    return times
+
+
+def depth_map(
+    camera: Camera, T_world_cam: F64, hides: Scene, *, time: float | None = None, pixels: int = PIXELS
+) -> DepthMap:
     """The range image of a view.
 
     Args:
         camera: of the view, at full size.
         T_world_cam: (4, 4) camera to local coordinates.
         hides: see `scene`.
+        time: of the photo, seconds, for what moves; None: everything hides wherever it was scanned.
         pixels: the camera is scaled to at most this many, and to at most `ENLARGED` times its width.
     """
     from pipeline import range_image
@@ -114,9 +200,12 @@ def depth_map(camera: Camera, T_world_cam: F64, hides: Scene, *, pixels: int = P
         )
         met = hides.casting.cast_rays(cast)["t_hit"].numpy()
         depth = np.where(np.isfinite(rays[..., 0]), met, np.inf).astype(np.float32)
-    if len(hides.centres):
+    since = np.full(len(hides.centres), np.nan) if time is None else time - hides.times
+    there = np.isnan(since) | ((since > PRESENT[0]) & (since < PRESENT[1]))
+    if there.any():
         T_cam_world: F64 = np.linalg.inv(T_world_cam).astype(np.float64)
-        range_image.draw_discs(depth, rays, model, p, T_cam_world, hides.centres, hides.normals, hides.radius)
+        centres, normals, radii = hides.centres[there], hides.normals[there], hides.radii[there]
+        range_image.draw_discs(depth, rays, model, p, T_cam_world, centres, normals, radii)
     return DepthMap(camera, T_world_cam, depth)
 
 

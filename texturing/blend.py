@@ -11,10 +11,12 @@ import numpy as np
 from numba import njit, prange
 
 from pipeline.cameras import EQUIRECTANGULAR, project_point
-from pipeline.range_image import is_visible
+from pipeline.range_image import SLOPE_SHARE, slope_of
 from pipeline.types import F32, I32
+from texturing.photos import OFFSET
 
 BAND = 32
+WHITE = 251.0
 EDGE = 0.01
 """Share of its weight that a photo keeps beside something that hides what is behind."""
 
@@ -93,7 +95,7 @@ def frame(flat, corners, f):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, inline="always")
-def _sample(image, u, v, wrap):  # type: ignore[no-untyped-def]
+def sample(image, u, v, wrap):  # type: ignore[no-untyped-def]
     """Bilinear colour of a photo (H, W, 3) at a pixel."""
     height, width = image.shape[0], image.shape[1]
     u0, v0 = math.floor(u), math.floor(v)
@@ -112,33 +114,118 @@ def _sample(image, u, v, wrap):  # type: ignore[no-untyped-def]
     )
 
 
+@njit(cache=True, inline="always")
+def _cubic(f):  # type: ignore[no-untyped-def]
+    """Weights of four neighbours at fraction f between the middle ones (Catmull and Rom)."""
+    f2, f3 = f * f, f * f * f
+    return (
+        -0.5 * f3 + f2 - 0.5 * f,
+        1.5 * f3 - 2.5 * f2 + 1,
+        -1.5 * f3 + 2 * f2 + 0.5 * f,
+        0.5 * f3 - 0.5 * f2,
+    )
+
+
+@njit(cache=True)
+def sample_sharp(image, u, v, wrap):  # type: ignore[no-untyped-def]
+    """Bicubic colour of a photo (H, W, 3) at a pixel: keeps what bilinear interpolation blurs."""
+    height, width = image.shape[0], image.shape[1]
+    u0, v0 = math.floor(u), math.floor(v)
+    wu, wv = _cubic(u - u0), _cubic(v - v0)
+    r = g = b = 0.0
+    for j in range(4):
+        y = min(max(int(v0) + j - 1, 0), height - 1)
+        for i in range(4):
+            x = int(u0) + i - 1
+            x = x % width if wrap else min(max(x, 0), width - 1)
+            w = wu[i] * wv[j]
+            r += w * image[y, x, 0]
+            g += w * image[y, x, 1]
+            b += w * image[y, x, 2]
+    return r, g, b
+
+
+@njit(cache=True, inline="always")
+def vignette(exposure, p, u, v):  # type: ignore[no-untyped-def]
+    """Factor that undoes the darkening towards a photo's corners; `exposure` as of `photos.Exposures.of`."""
+    if exposure[3] == 0.0 and exposure[4] == 0.0:
+        return 1.0
+    cx, cy = 0.5 * (p[12] - 1), 0.5 * (p[13] - 1)
+    q = ((u - cx) ** 2 + (v - cy) ** 2) / (cx * cx + cy * cy)
+    return math.exp(exposure[3] * q + exposure[4] * q * q)
+
+
+@njit(cache=True, inline="always")
+def corrected(value, factor):  # type: ignore[no-untyped-def]
+    """An encoded grey level whose light is multiplied: `factor` is of the power law's base."""
+    return (value + OFFSET) * factor - OFFSET
+
+
+@njit(cache=True, inline="always")
+def mask_allows(mask, u, v, p):  # type: ignore[no-untyped-def]
+    """Whether the mask (H, W), of the photo's size or a fraction of it, lets a pixel be used; (0, 0) always does."""
+    if mask.shape[0] == 0:
+        return True
+    column = int((u + 0.5) / p[12] * mask.shape[1]) % mask.shape[1]
+    row = min(max(int((v + 0.5) / p[13] * mask.shape[0]), 0), mask.shape[0] - 1)
+    return mask[row, column] != 0
+
+
+@njit(cache=True, inline="always")
+def warped(warp, p, u, v, wrap):  # type: ignore[no-untyped-def]
+    """Where a photo shows what belongs at pixel (u, v): displaced by `warp`, interpolated."""
+    height, width = warp.shape[0], warp.shape[1]
+    x, y = (u + 0.5) * width / p[12] - 0.5, (v + 0.5) * height / p[13] - 0.5
+    x0, y0 = math.floor(x), math.floor(y)
+    fx, fy = x - x0, y - y0
+    a, b = int(x0), int(x0) + 1
+    if wrap:
+        a, b = a % width, b % width
+    else:
+        a, b = min(max(a, 0), width - 1), min(max(b, 0), width - 1)
+    c, d = min(max(int(y0), 0), height - 1), min(max(int(y0) + 1, 0), height - 1)
+    w00, w01, w10, w11 = (1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy
+    du = warp[c, a, 0] * w00 + warp[c, b, 0] * w01 + warp[d, a, 0] * w10 + warp[d, b, 0] * w11
+    dv = warp[c, a, 1] * w00 + warp[c, b, 1] * w01 + warp[d, a, 1] * w10 + warp[d, b, 1] * w11
+    return u + du, v + dv
+
+
 @njit(cache=True, parallel=True)
 def accumulate(  # type: ignore[no-untyped-def]
-    total, owner, faces, flat, corners, normals, photo, mask, model, p, depth, near, depth_p, R, t, pixel,
-    bias, power, feather, min_cos,
+    low_sum, detail_sum, owner, faces, share, flat, corners, normals, photo, low, mask, model, p, depth, near, apart,
+    reach, R, t, pixel, exposure, warp, bias, power, feather, min_cos, band,
 ):  # fmt: skip
     """Add what one photo says to the texels of a page; returns the number of texels that it sees.
 
     Args:
-        total: (H, W, 4) float32, sum of weight times RGB, and of weights; changed in place.
+        low_sum, detail_sum: (H, W, 4) float32, sums of weight times colour, and of weights, of low frequencies and
+            of what is finer; changed in place.
         owner: (H, W) of `owners`.
         faces: (N,) the faces that this photo textures, indices into `flat`.
+        share: (N, 3) how much of the detail it is to give at the faces' corners, 0 to 1.
         flat, corners, normals: (F, 3, 2) texels, (F, 3, 3) metres, (F, 3) unit, of the page's faces.
-        photo: the photo and its halvings, (h, w, 3) uint8 each.
-        mask: (h, w) uint8, 0 where it must not be used; (0, 0) for none.
-        model, p: camera of the photo; `depth`, `depth_p`: range image and its camera.
-        near: the least range around every pixel of `depth`; beside something nearer the photo's own pixels
-            mix both, and its weight falls to `EDGE`.
+        photo, low: `photos.Photo`'s levels and low frequencies.
+        mask: uint8, 0 where it must not be used; (0, 0) for none.
+        model, p: camera of the photo; depth: its range image, of any size.
+        near, apart: the least range around every pixel of `depth`, closely and as far as low frequencies reach;
+            beside something nearer the photo's own pixels mix both, and its weight falls to `EDGE`.
+        reach: pixels of the range image by which `apart` looks around.
         R, t: (3, 3) and (3,), camera from local.
         pixel: radians a pixel of the range image spans.
+        exposure: (5,) of `photos.Exposures.of`.
+        warp: (h, w, 2) pixels to be added to where the photo is looked up; (0, 0, 2) for none.
         bias: metres, of the visibility test.
         power: a photo's weight is (cos / distance^2) to this.
         feather: pixels over which the weight fades towards the photo's border.
         min_cos: as in the choice of views.
+        band: pixels of the photo that part low frequencies from detail; 0: all is detail; -1: nothing is.
     """
     height, width = owner.shape
     wide = model == EQUIRECTANGULAR
     focal = p[12] / (2 * math.pi) if wide else min(p[0], p[1])
+    factors = (math.exp(exposure[0]), math.exp(exposure[1]), math.exp(exposure[2]))
+    coarse_x, coarse_y = low.shape[1] / p[12], low.shape[0] / p[13]
+    fine_x, fine_y = depth.shape[1] / p[12], depth.shape[0] / p[13]
     used = np.zeros(len(faces), np.int64)
     for i in prange(len(faces)):
         f = faces[i]
@@ -149,6 +236,11 @@ def accumulate(  # type: ignore[no-untyped-def]
         o = R @ origin + t
         dx, dy = R @ per_x, R @ per_y
         size = math.sqrt(max((dx * dx).sum(), (dy * dy).sum()))
+        ax, ay = flat[f, 0, 0], flat[f, 0, 1]
+        bx, by = flat[f, 1, 0] - ax, flat[f, 1, 1] - ay
+        cx, cy = flat[f, 2, 0] - ax, flat[f, 2, 1] - ay
+        det = bx * cy - by * cx
+        chosen = share[i, 0] + share[i, 1] + share[i, 2] > 0
         x0, y0, x1, y1 = _box(flat, f, width, height)
         for ty in range(y0, y1 + 1):
             for tx in range(x0, x1 + 1):
@@ -165,18 +257,24 @@ def accumulate(  # type: ignore[no-untyped-def]
                 cos = -(x * n[0] + y * n[1] + z * n[2]) / distance
                 if cos < 0.5 * min_cos:  # the face as a whole passed; its far end may be a little flatter
                     continue
-                if mask.shape[0] > 0:
-                    column = int(math.floor(u + 0.5)) % int(p[12])
-                    if mask[int(math.floor(v + 0.5)), column] == 0:
-                        continue
-                if not is_visible(depth, model, depth_p, pixel, bias, x, y, z, n[0], n[1], n[2]):
+                if not mask_allows(mask, u, v, p):
+                    continue
+                # as `is_visible`, with the projection at hand
+                column = min(max(int((u + 0.5) * fine_x), 0), depth.shape[1] - 1)
+                row = min(max(int((v + 0.5) * fine_y), 0), depth.shape[0] - 1)
+                lean = slope_of(cos) * distance * pixel
+                if distance > depth[row, column] + bias + SLOPE_SHARE * lean:
                     continue
                 border = min(v + 0.5, p[13] - 0.5 - v)
                 if not wide:
                     border = min(border, min(u + 0.5, p[12] - 0.5 - u))
-                w = (cos / d2) ** power * (0.02 + 0.98 * min(1.0, border / feather))
-                if not is_visible(near, model, depth_p, 3.5 * pixel, bias, x, y, z, n[0], n[1], n[2]):
+                whole = (cos * cos / d2) ** power * (0.02 + 0.98 * min(1.0, border / feather))
+                w = whole
+                if distance > apart[row, column] + bias + (reach + 0.5) * lean:
                     w *= EDGE
+                fall = vignette(exposure, p, u, v)
+                if warp.shape[0] > 0:
+                    u, v = warped(warp, p, u, v, wide)
                 # texels wider than the photo's pixels are sampled from a halved photo
                 ratio = size * focal / distance
                 level = 0
@@ -184,26 +282,51 @@ def accumulate(  # type: ignore[no-untyped-def]
                     ratio *= 0.5
                     level += 1
                 scale = 0.5**level
-                r, g, b = _sample(photo[level], (u + 0.5) * scale - 0.5, (v + 0.5) * scale - 0.5, wide)
-                total[ty, tx, 0] += w * r
-                total[ty, tx, 1] += w * g
-                total[ty, tx, 2] += w * b
-                total[ty, tx, 3] += w
+                if level == 0 and (chosen or band < 0):
+                    r, g, b = sample_sharp(photo[0], u, v, wide)
+                else:
+                    r, g, b = sample(photo[level], (u + 0.5) * scale - 0.5, (v + 0.5) * scale - 0.5, wide)
+                if max(r, max(g, b)) > WHITE:  # overexposed: how bright it is, others know better
+                    whole *= EDGE
+                    w *= EDGE
+                if band < 0:
+                    lr, lg, lb = r, g, b
+                elif band > 0:
+                    lr, lg, lb = sample(low, (u + 0.5) * coarse_x - 0.5, (v + 0.5) * coarse_y - 0.5, wide)
+                else:
+                    lr = lg = lb = 0.0
+                low_sum[ty, tx, 3] += w
                 used[i] += 1
+                # detail: the chosen photo's; where it can't see a texel, that of the best others
+                d = 1e-4 * whole
+                if chosen:
+                    s = ((tx - ax) * cy - (ty - ay) * cx) / det
+                    q = (bx * (ty - ay) - by * (tx - ax)) / det
+                    d += max(0.0, share[i, 0] * (1 - s - q) + share[i, 1] * s + share[i, 2] * q)
+                if distance > near[row, column] + bias + 1.5 * lean:
+                    d *= EDGE
+                detail_sum[ty, tx, 3] += d
+                for k in range(3):
+                    value, coarse = (r, lr) if k == 0 else ((g, lg) if k == 1 else (b, lb))
+                    factor = factors[k] * fall
+                    base = corrected(coarse, factor) if band != 0 else 0.0
+                    low_sum[ty, tx, k] += w * base
+                    detail_sum[ty, tx, k] += d * (corrected(value, factor) - base)
     return used.sum()
 
 
 @njit(cache=True, parallel=True)
-def resolve(total, rgb, seen):  # type: ignore[no-untyped-def]
-    """Weighted means of `total` (H, W, 4) into `rgb` (H, W, 3) uint8; `seen` (H, W) becomes 255 where there is one."""
+def resolve(low_sum, detail_sum, rgb, seen):  # type: ignore[no-untyped-def]
+    """Weighted means of both sums (H, W, 4), added, into `rgb` (H, W, 3) uint8; `seen` is 255 where there is one."""
     height, width = seen.shape
     for y in prange(height):
         for x in range(width):
-            w = total[y, x, 3]
+            w, d = low_sum[y, x, 3], detail_sum[y, x, 3]
             if w > 0:
                 seen[y, x] = 255
                 for k in range(3):
-                    rgb[y, x, k] = min(255.0, max(0.0, total[y, x, k] / w + 0.5))
+                    value = low_sum[y, x, k] / w + (detail_sum[y, x, k] / d if d > 0 else 0.0)
+                    rgb[y, x, k] = min(255.0, max(0.0, value + 0.5))
 
 
 @njit(cache=True, parallel=True)

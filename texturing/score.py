@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
 
 from pipeline.classes import GROUPS
 from pipeline.step import Done, Inputs, Params, Report, Step
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from pipeline.types import F32
+
+FIGURES = ("psnr_db", "psnr_gain_db", "ssim", "sharpness")
 
 
 class ScoreParams(Params):
@@ -18,10 +27,12 @@ class ScoreParams(Params):
     Attributes:
         truth_reach: metres from a true surface sample within which the mesh stands for it.
         truth_samples: true samples that are compared, at most.
+        near: metres from a photo within which a true sample is near to it (`truth_psnr_near_db`).
     """
 
     truth_reach: float = Field(0.1, gt=0)
     truth_samples: int = Field(500_000, ge=1000)
+    near: float = Field(15.0, gt=0)
 
 
 def score(inputs: Inputs, params: ScoreParams, out: Path, report: Report) -> Done:
@@ -30,51 +41,119 @@ def score(inputs: Inputs, params: ScoreParams, out: Path, report: Report) -> Don
     Pixels count where another photo saw the surface, and where this one does: not where it shows a car or
     person that the world leaves out (`depth`, the folder of depth maps, tells).
 
-    Facts: `held_out` photos; their mean `psnr_db` (as it is), `psnr_gain_db` (after a gain a channel) and
-    `ssim`, None without any; `photos`, the same for each; `truth_psnr_db` for generated tiles.
+    File: `error`, a folder with a picture of photo, rendering and difference for every held-out photo, and
+    `index.json`, which names them. Facts, None where nothing counts: `held_out` photos; their mean `psnr_db` (as it
+    is), `psnr_gain_db` (after a gain a channel), `ssim` and `sharpness`; `photos`, the same for each; `by_class` and
+    `by_distance`, the same but sharpness of all their pixels; `truth_psnr_db` and `truth_psnr_near_db` for generated
+    tiles.
     """
-    from pipeline.io import views as views_io
-    from texturing.evaluate import held_out
+    import numpy as np
 
-    folders = [inputs[g] for g in GROUPS if g in inputs]
-    views = views_io.load(inputs["views"])
-    index = [i for i, out_ in enumerate(views_io.load_held_out(inputs["views"])) if out_]
-    held = [views[i] for i in index]
+    from pipeline.io import views as views_io
+    from pipeline.steps.pictures import Album
+    from texturing import evaluate
+
+    groups = [g for g in GROUPS if g in inputs]
+    folders = [inputs[g] for g in groups]
+    views, held = views_io.load(inputs["views"]), views_io.load_held_out(inputs["views"])
+    index = [i for i, out_ in enumerate(held) if out_]
     depths = [inputs["depth"] / f"{i}.npy" for i in index]
-    photos: dict[str, dict[str, float]] = {}
-    for i, result in enumerate(held_out(folders, held, depths) if held else ()):
-        report(i / (len(held) + 1), result.view.name)
-        figures = {name: getattr(result, name) for name in ("psnr_db", "psnr_gain_db", "ssim", "coverage")}
-        if not any(math.isnan(value) for value in figures.values()):
-            photos[result.view.name] = {name: round(value, 4) for name, value in figures.items()}
+    album = Album(out / "error")
+    album.folder.mkdir()
+    photos: dict[str, dict[str, float | None]] = {}
+    unread = {views[i].name: views[i].photo for i in index}
+    warnings = []
+    by_class, by_distance = np.zeros((len(groups), 5)), np.zeros((len(evaluate.BAND_NAMES), 5))
+    results = evaluate.held_out(folders, [views[i] for i in index], depths) if index else ()
+    for i, result in enumerate(results):
+        name = result.view.name
+        report(0.9 * i / len(index), name)
+        del unread[name]
+        if not result.mask.any():
+            warnings.append(f"{name}: held out, but shows nothing that another photo saw: it is not scored")
+            continue
+        photos[name] = _rounded({key: getattr(result, key) for key in (*FIGURES, "coverage")})
+        by_class += evaluate.tally(result.errors, result.render.body, len(by_class))
+        by_distance += evaluate.tally(result.errors, np.digitize(result.render.range, evaluate.BANDS), len(by_distance))
+        picture, caption = evaluate.error_picture(result), _caption(photos[name])
+        album.add(f"{i:03d}_{Path(name).name}", picture, "error", name, caption)
+    album.save()
+    warnings += [f"{file}: held out, but it or its mask can't be read: it is not scored" for file in unread.values()]
     facts: dict[str, Any] = {"held_out": len(photos)}
-    for name in ("psnr_db", "psnr_gain_db", "ssim"):
-        values = [figures[name] for figures in photos.values()]
-        facts[name] = round(sum(values) / len(values), 4) if values else None
+    facts |= {key: _mean([figures[key] for figures in photos.values()]) for key in FIGURES}
     facts["photos"] = photos
+    facts["by_class"] = {g: _rounded(evaluate.figures(sums)) for g, sums in zip(groups, by_class, strict=True)}
+    facts["by_distance"] = {
+        band: _rounded(evaluate.figures(sums)) for band, sums in zip(evaluate.BAND_NAMES, by_distance, strict=True)
+    }
     if "truth.points" in inputs:
         report(0.9, "true colours")
-        facts["truth_psnr_db"] = _truth(inputs, folders, params)
-    return Done({}, facts)
+        facts |= _truth(inputs, folders, params)
+    return Done({"error": album.folder}, facts, warnings)
 
 
-def _truth(inputs: Inputs, folders: list[Path], params: ScoreParams) -> float | None:
-    """PSNR of the texture against the true surface colours, where a photo saw it; None where none did."""
+def _rounded(figures: dict[str, Any]) -> dict[str, Any]:
+    """Figures as JSON takes them: None for NaN."""
+    return {name: None if math.isnan(value) else round(value, 4) for name, value in figures.items()}
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return round(sum(known) / len(known), 4) if known else None
+
+
+def _caption(figures: dict[str, float | None]) -> str:
+    gain, ssim, sharp = figures["psnr_gain_db"], figures["ssim"], figures["sharpness"]
+    parts = [f"{gain:.1f} dB after a gain a channel"]
+    parts += [f"SSIM {ssim:.2f}"] if ssim is not None else []
+    parts += [f"{100 * sharp:.0f} % as sharp"] if sharp is not None else []
+    return ", ".join(parts) + "."
+
+
+def _truth(inputs: Inputs, folders: list[Path], params: ScoreParams) -> dict[str, float | None]:
+    """PSNR of the texture against the true surface colours: where a photo saw it, and where one saw it from near.
+
+    None where none did.
+    """
     import numpy as np
 
     from pipeline.io import las
     from pipeline.render import Renderer, textured
+    from texturing.evaluate import psnr
 
     bodies = [textured(folder) for folder in folders]
     truth = las.read(inputs["truth.points"], bodies[0].mesh.frame)
     truth = truth.take(slice(None, None, max(1, len(truth) // params.truth_samples)))
     assert truth.rgb is not None
-    rgb, seen, distance = Renderer(bodies).nearest(truth.xyz)
+    world = Renderer(bodies)
+    rgb, seen, distance = world.nearest(truth.xyz)
+    squared = ((rgb.astype(np.float64) - truth.rgb) ** 2).mean(axis=1)
     counts = (seen == 255) & (distance < params.truth_reach)
-    if not counts.any():
-        return None
-    error = np.mean((rgb[counts].astype(float) - truth.rgb[counts]) ** 2)
-    return round(float(10 * np.log10(255**2 / max(error, 1e-3))), 2)
+    near = counts.copy()
+    near[counts] = _seen_from_near(inputs, *world.nearest_places(truth.xyz[counts]), params.near)
+
+    def over(chosen: npt.NDArray[np.bool_]) -> float | None:
+        return round(psnr(float(squared[chosen].mean())), 2) if chosen.any() else None
+
+    return {"truth_psnr_db": over(counts), "truth_psnr_near_db": over(near)}
 
 
-SCORE = Step("score", 1, score, ScoreParams)
+def _seen_from_near(inputs: Inputs, places: F32, normals: F32, near: float) -> npt.NDArray[np.bool_]:
+    """(N,) which places (N, 3) on the meshes a photo that was not held out sees from `near` metres or nearer."""
+    import numpy as np
+
+    from pipeline.io import views as views_io
+    from pipeline.visibility import load_depth_map, visible
+
+    seen = np.zeros(len(places), bool)
+    for i, (view, held) in enumerate(
+        zip(views_io.load(inputs["views"]), views_io.load_held_out(inputs["views"]), strict=True)
+    ):
+        asked = np.flatnonzero(~seen & (np.linalg.norm(places - view.centre, axis=1) <= near))
+        if len(asked) and not held:
+            depth = load_depth_map(inputs["depth"] / f"{i}.npy", view.camera, view.T_world_cam)
+            seen[asked] = visible(depth, places[asked], normals[asked])
+    return seen
+
+
+SCORE = Step("score", 2, score, ScoreParams)

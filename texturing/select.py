@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit, prange
 
 from pipeline.cameras import MODEL_ID, parameters, pixel_angle
@@ -20,7 +19,7 @@ _SAMPLES = np.array(
 )  # fmt: skip
 
 
-class Choice:
+class Candidates:
     """The best views of every face, found view by view in bounded memory.
 
     Args:
@@ -39,8 +38,9 @@ class Choice:
         self.quality = np.zeros((len(corners), count), np.float32)
 
     def offer(
-        self, index: int, depth: DepthMap, *, bias: float, max_distance: float, min_cos: float, mask: U8 | None = None
-    ) -> int:
+        self, index: int, depth: DepthMap, *, bias: float, max_distance: float, min_cos: float,
+        mask: U8 | None = None, factor: float = 1.0,
+    ) -> int:  # fmt: skip
         """Let a view compete for every face; returns the number of faces that it sees.
 
         Args:
@@ -49,10 +49,11 @@ class Choice:
             bias: metres, of the visibility test.
             max_distance: metres, faces farther away are left to others.
             min_cos: of the angle between the face's normal and the ray; below it the face is left to others.
-            mask: (H, W) of any size, 0 where the photo must not be used.
+            mask: (H, W) of any size, 0 where the photo must not be used; None or (0, 0): nowhere.
+            factor: on the view's quality, less than 1 for a blurred photo.
         """
         image = depth.range
-        if mask is not None:
+        if mask is not None and mask.size:
             import cv2
 
             small = cv2.resize(mask, image.shape[::-1], interpolation=cv2.INTER_NEAREST)
@@ -61,13 +62,9 @@ class Choice:
             self._corners, self._normals, image, MODEL_ID[depth.camera.model], parameters(depth.camera),
             np.linalg.inv(depth.T_world_cam), pixel_angle(depth.camera), bias, max_distance, min_cos, _SAMPLES,
         )  # fmt: skip
+        rated *= np.float32(factor)
         _insert(rated, index, self.view, self.quality)
         return int((rated > 0).sum())
-
-    def users(self, faces: npt.NDArray[np.int64]) -> dict[int, npt.NDArray[np.int64]]:
-        """View index to those of the given faces that it is to texture, ascending."""
-        chosen = self.view[faces]
-        return {int(v): faces[(chosen == v).any(axis=1)] for v in np.unique(chosen) if v >= 0}
 
 
 @njit(cache=True, parallel=True)
@@ -95,7 +92,7 @@ def _rate(corners, normals, depth, model, p, T, pixel, bias, max_distance, min_c
             if cos < min_cos:
                 continue
             if is_visible(depth, model, p, pixel, bias, x, y, z, nx, ny, nz):
-                total += cos / d2
+                total += cos * cos / d2
         quality[f] = total / len(samples)
     return quality
 

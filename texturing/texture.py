@@ -1,8 +1,10 @@
 """Texture: every triangle painted from several photos, warped to its place on the page (D3.2, section 4.2).
 
-Views are weighted by distance (nearer counts more) and angle, and hidden ones left out. What no photo saw
-is coloured from the cloud's points and marked so. Pages are painted one after another and photos read when
-needed, so memory is bounded by one page and a few photos.
+Low frequencies are blended from all candidates of a face, weighted by distance (nearer counts more) and angle;
+what is finer comes from the one chosen photo, faded into its neighbour's over the triangles along a seam. Colour
+is a function of the place on the surface alone, so charts meet without seams. What no photo saw is coloured from
+the cloud's points, else from around, and marked so. Pages are painted in bands of rows and photos read when needed,
+so memory is bounded by a band and a few photos.
 """
 
 from __future__ import annotations
@@ -20,34 +22,37 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from pipeline.types import U8, Mesh, PointCloud, View
+    from pipeline.types import F32, I32, U8, Mesh, PointCloud, View
     from pipeline.visibility import DepthMap
+    from texturing.agreement import Agreement
+    from texturing.choose import Choice
     from texturing.fill import Colours, Page
-    from texturing.select import Choice
+    from texturing.photos import Exposures
 
-CACHE = 300_000_000
-"""Bytes of photos kept in memory between uses."""
 NEIGHBOUR_STEP = 8
 """Where points have no colour, every so many seen texels (each way) lend theirs to the unseen ones."""
+BAND = 8_000_000
+"""Texels of a page that are painted at a time, in whole rows."""
 
 
 class TextureParams(Params):
     """How photos become texture.
 
     Attributes:
-        views_per_face: photos that a triangle is painted from, at most.
-        power: a photo's weight is (cos(angle) / distance^2) to this; 1 blends softly, more is sharper.
-        max_distance: metres beyond which a photo is not used.
+        power: a photo's weight in the low frequencies is (cos(angle) / distance^2) to this.
+        band: pixels of a photo; what is coarser is blended from many photos, what is finer from one. 0: no bands,
+            the chosen photo gives all; -1: all photos give all (a plain blend).
+        fade: let photos fade into each other over the triangles along a seam.
         min_cos: of the angle between surface normal and ray, below which a photo is not used.
         bias: metres that a surface may lie behind what the depth map shows and still count as seen.
         feather: share of a photo's width over which its weight fades towards its border.
         padding: texels that colours are carried on outside of charts, for mip-maps.
     """
 
-    views_per_face: int = Field(4, ge=1, le=16)
-    power: float = Field(3.0, gt=0)
-    max_distance: float = Field(40.0, gt=0)
-    min_cos: float = Field(0.08, ge=0, lt=1)
+    power: float = Field(1.5, gt=0)
+    band: int = Field(2, ge=-1, le=64)
+    fade: bool = True
+    min_cos: float = Field(0.02, ge=0, lt=1)
     bias: float = Field(0.04, ge=0)
     feather: float = Field(0.04, gt=0, le=0.5)
     padding: int = Field(16, ge=2)
@@ -56,8 +61,9 @@ class TextureParams(Params):
 def texture(inputs: Inputs, params: TextureParams, out: Path, report: Report) -> Done:
     """Paint the pages of an unwrapped mesh.
 
-    Inputs: `mesh` (with uv and page), `pages` (their sizes), `views`, `depth` (folder of a depth map for every
-    view), `cloud.*` (coloured points; that of the classes left out, `cloud.rest`, lends no colours).
+    Inputs: `mesh` (with uv and page), `pages` (their sizes), `choice`, `views`, `depth` (folder of a depth map for
+    every view), `exposures`, `agreement`, `cloud.*` (coloured points; that of the classes left out, `cloud.rest`,
+    lends no colours).
     File: `textured`, a folder with `mesh.npz`, `page_<i>.png` and `page_<i>_seen.png` (255 seen by a photo,
     128 coloured from points, 64 filled from neighbours or by class, 0 no surface).
     """
@@ -66,6 +72,9 @@ def texture(inputs: Inputs, params: TextureParams, out: Path, report: Report) ->
     from pipeline.io import image
     from pipeline.io import views as views_io
     from pipeline.types import Mesh
+    from texturing.agreement import Agreement
+    from texturing.choose import Choice
+    from texturing.photos import Exposures
 
     folder = out / "textured"
     folder.mkdir()
@@ -76,146 +85,176 @@ def texture(inputs: Inputs, params: TextureParams, out: Path, report: Report) ->
     assert mesh.page is not None
     sizes = json.loads(inputs["pages"].read_text(encoding="utf-8"))
     views = views_io.load(inputs["views"])
-    painter = Painter(mesh, views, lambda i: inputs["depth"] / f"{i}.npy", params)
-    usable = [i for i, held in enumerate(views_io.load_held_out(inputs["views"])) if not held]
-    for done, i in enumerate(usable):
-        report(0.3 * done / len(usable), views[i].name)
-        painter.offer(i)
+    painter = Painter(
+        mesh, views, Choice.load(inputs["choice"]), lambda i: inputs["depth"] / f"{i}.npy",
+        Exposures.load(inputs["exposures"]), Agreement.load(inputs["agreement"]), params,
+    )  # fmt: skip
     colours, own = _colours_of(inputs)
     texels = np.zeros((len(mesh), 4), np.int64)
     for k, size in enumerate(sizes):
-        report(0.3 + 0.7 * k / len(sizes), f"page {k + 1} of {len(sizes)}")
         faces = np.flatnonzero(mesh.page == k)
-        page = painter.paint(faces, size["width"], size["height"])
+        page = painter.paint(
+            faces, size["width"], size["height"],
+            lambda f, m="", k=k: report((k + f) / len(sizes), f"page {k + 1} of {len(sizes)} {m}"),
+        )  # fmt: skip
         texels[faces] = _finish(page, faces, mesh, colours, own, params)
         image.write(folder / f"page_{k}.png", page.rgb)
         image.write(folder / f"page_{k}_seen.png", page.seen, compression=1)
-    warnings = [f"{name}: not used for texture, other photos stand in" for name in painter.skipped.values()]
+    skipped = sorted(painter.photos.skipped.values())
+    warnings = [f"{reason}: not used for texture, other photos stand in" for reason in skipped]
     return Done({"textured": folder}, _facts(mesh, texels, sizes, painter), warnings)
 
 
 class Painter:
-    """Photos onto pages: the choice of views for all faces, then page by page.
+    """Photos onto pages, band by band.
 
     Args:
         mesh: with uv and page.
         views: all, by index.
+        choice: the photos of every face of the mesh.
         depth_file: index of a view to the file of its depth map.
+        exposures: of the photos.
+        agreement: where photos may be used, and how they are displaced.
         params: of the step.
 
     Attributes:
         used: index of a view to the number of texels that it contributed to.
-        skipped: index of a view to the reason why its photo was left out.
+        photos: the source of photos, which knows those that can't be read.
     """
 
     def __init__(
-        self, mesh: Mesh, views: Sequence[View], depth_file: Callable[[int], Path], params: TextureParams
+        self,
+        mesh: Mesh,
+        views: Sequence[View],
+        choice: Choice,
+        depth_file: Callable[[int], Path],
+        exposures: Exposures,
+        agreement: Agreement,
+        params: TextureParams,
     ) -> None:
-        from functools import lru_cache
-
-        from texturing.select import Choice
+        from texturing.photos import Photos
 
         self._mesh, self._views, self._params = mesh, views, params
         self._corners, self._normals = mesh.corners, mesh.face_normal
-        self._depth_file = depth_file
-        self._choice: Choice = Choice(self._corners, self._normals, params.views_per_face)
-        largest = max((4 * v.camera.width * v.camera.height for v in views), default=1)
-        self._photo = lru_cache(maxsize=max(1, CACHE // largest))(self._read)
+        self._choice, self._depth_file, self._exposures = choice, depth_file, exposures
+        self._mask, self._warp = agreement.mask, agreement.warp
+        self._share = shares(mesh.faces, choice.label, len(mesh.vertices), len(views))
+        self.photos = Photos(views, max(1, params.band))
         self.used: dict[int, int] = {}
-        self.skipped: dict[int, str] = {}
+
+    def paint(self, faces: npt.NDArray[np.int64], width: int, height: int, report: Report) -> Page:
+        """A page painted from photos alone; texels that none saw stay black and unmarked.
+
+        Args:
+            faces: (N,) those on the page.
+            width, height: of the page, texels.
+            report: progress.
+        """
+        import numpy as np
+
+        from texturing import blend
+        from texturing.fill import Page
+
+        assert self._mesh.uv is not None
+        flat = blend.texels(self._mesh.uv[faces], width, height)
+        owner = blend.owners(flat, width, height)
+        page = Page(
+            np.zeros((height, width, 3), np.uint8), np.zeros((height, width), np.uint8), owner, flat,
+            self._corners[faces],
+        )  # fmt: skip
+        low, high = flat[..., 1].min(axis=1), flat[..., 1].max(axis=1)
+        band = max(1, BAND // width)
+        for first in range(0, height, band):
+            report(first / height)
+            rows = slice(first, min(height, first + band))
+            here = np.flatnonzero((high >= rows.start) & (low <= rows.stop))
+            if len(here):
+                self._paint_rows(page, rows, here, faces)
+        return page
+
+    def _paint_rows(self, page: Page, rows: slice, here: npt.NDArray[np.int64], faces: npt.NDArray[np.int64]) -> None:
+        """Paint the rows of a page; `here` are its faces (indices into `faces`) that reach into them."""
+        import numpy as np
+
+        from texturing import blend
+
+        flat = page.flat - np.array([0, rows.start], np.float32)
+        owner = page.owner[rows]
+        low, detail = (np.zeros((*owner.shape, 4), np.float32) for _ in range(2))
+        candidates = self._choice.view[faces[here]]
+        for i in np.unique(candidates[candidates >= 0]).tolist():
+            mine = here[(candidates == i).any(axis=1)]
+            texels = self._look(i, low, detail, owner, mine, faces, flat, page.corners)
+            if texels:
+                self.used[i] = self.used.get(i, 0) + texels
+        blend.resolve(low, detail, page.rgb[rows], page.seen[rows])
+
+    def _look(
+        self, i: int, low: F32, detail: F32, owner: I32, mine: npt.NDArray[np.int64], faces: npt.NDArray[np.int64],
+        flat: F32, corners: F32,
+    ) -> int:  # fmt: skip
+        """Add what photo `i` says of the faces `mine` to the sums; returns the texels it sees."""
+        import cv2
+        import numpy as np
+
+        from pipeline.cameras import MODEL_ID, parameters, pixel_angle
+        from texturing import blend
+
+        photo = self.photos.get(i)
+        if photo is None:
+            return 0
+        p, view, depth = self._params, self._views[i], self._depth(i)
+        camera = view.camera
+        near = np.asarray(cv2.erode(depth.range, np.ones((3, 3))))
+        reach = round(p.band * depth.camera.width / camera.width) if p.band > 0 else 1
+        apart = near if reach == 1 else np.asarray(cv2.erode(depth.range, np.ones((2 * reach + 1, 2 * reach + 1))))
+        T = np.linalg.inv(view.T_world_cam)
+        share = self._share(i)[self._mesh.faces[faces[mine]]] if p.fade else self._alone(i, faces[mine])
+        turn, shift = np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3])
+        texels = blend.accumulate(
+            low, detail, owner, mine, np.ascontiguousarray(share, np.float32), flat, corners, self._normals[faces],
+            photo.levels, photo.low, self._mask(i, view), MODEL_ID[camera.model], parameters(camera), depth.range,
+            near, apart, reach, turn, shift, pixel_angle(depth.camera), self._exposures.of(view), self._warp(i),
+            p.bias, p.power, p.feather * camera.width, p.min_cos, p.band,
+        )  # fmt: skip
+        return int(texels)
+
+    def name(self, i: int) -> str:
+        """Of view `i`."""
+        return self._views[i].name
+
+    def _alone(self, i: int, faces: npt.NDArray[np.int64]) -> F32:
+        import numpy as np
+
+        return np.repeat((self._choice.label[faces] == i).astype(np.float32)[:, None], 3, axis=1)
 
     def _depth(self, i: int) -> DepthMap:
         from pipeline.visibility import load_depth_map
 
         return load_depth_map(self._depth_file(i), self._views[i].camera, self._views[i].T_world_cam)
 
-    def offer(self, i: int) -> None:
-        """Let view `i` compete for the faces that it sees; one whose mask can't be read is left out."""
-        p, view = self._params, self._views[i]
-        mask = None
-        if view.mask is not None:
-            mask = read_mask(view)
-            if mask is None:
-                self.skipped[i] = f"{view.mask}, a mask, can't be read or is not of its photo's size"
-                return
-        self._choice.offer(i, self._depth(i), bias=p.bias, max_distance=p.max_distance, min_cos=p.min_cos, mask=mask)
 
-    def paint(self, faces: npt.NDArray[np.int64], width: int, height: int) -> Page:
-        """A page painted from photos alone; texels that none saw stay black and unmarked.
+def shares(faces: I32, label: I32, vertices: int, views: int) -> Callable[[int], F32]:
+    """How much of the detail a view is to give at every vertex: its share of the labelled faces around.
 
-        Args:
-            faces: (N,) those on the page.
-            width, height: of the page, texels.
-        """
-        import cv2
-        import numpy as np
-
-        from pipeline.cameras import MODEL_ID, parameters, pixel_angle
-        from texturing import blend
-        from texturing.fill import Page
-
-        assert self._mesh.uv is not None
-        p = self._params
-        flat = blend.texels(self._mesh.uv[faces], width, height)
-        owner = blend.owners(flat, width, height)
-        corners, normals = self._corners[faces], self._normals[faces]
-        page = Page(np.zeros((height, width, 3), np.uint8), np.zeros((height, width), np.uint8), owner, flat, corners)
-        users = self._choice.users(faces)
-        if users:
-            total = np.zeros((height, width, 4), np.float32)
-            for i, chosen in users.items():
-                photo = self._photo(i)
-                if photo is None:
-                    continue
-                view, depth = self._views[i], self._depth(i)
-                near = np.asarray(cv2.erode(depth.range, np.ones((3, 3))))
-                T = np.linalg.inv(view.T_world_cam)
-                self.used[i] = self.used.get(i, 0) + int(
-                    blend.accumulate(
-                        total, owner, np.searchsorted(faces, chosen), flat, corners, normals, *photo,
-                        MODEL_ID[view.camera.model], parameters(view.camera), depth.range, near,
-                        parameters(depth.camera),
-                        np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3]), pixel_angle(depth.camera),
-                        p.bias, p.power, p.feather * view.camera.width, p.min_cos,
-                    )
-                )  # fmt: skip
-            blend.resolve(total, page.rgb, page.seen)
-        return page
-
-    def _read(self, i: int) -> tuple[tuple[U8, U8, U8], U8] | None:
-        """Photo `i`, halved once and twice, and its mask ((0, 0) where it has none); None if it can't be used."""
-        import numpy as np
-
-        from pipeline.io import image
-
-        view = self._views[i]
-        size = (view.camera.height, view.camera.width)
-        whole = image.read_rgb(view.photo)
-        if whole is None:
-            self.skipped[i] = f"{view.photo} can't be read"
-            return None
-        if whole.shape[:2] != size:
-            self.skipped[i] = f"{view.photo} is {whole.shape[1]} x {whole.shape[0]} pixels, not {size[1]} x {size[0]}"
-            return None
-        half = _halved(whole)
-        mask = read_mask(view) if view.mask is not None else None
-        return (whole, half, _halved(half)), (np.zeros((0, 0), np.uint8) if mask is None else mask)
-
-
-def _halved(image: U8) -> U8:
-    import cv2
+    Returns:
+        view index to (V,) float32.
+    """
     import numpy as np
+    import scipy.sparse as sp
 
-    size = (max(1, image.shape[1] // 2), max(1, image.shape[0] // 2))
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+    labelled = np.flatnonzero(label >= 0)
+    at, of = faces[labelled].ravel(), np.repeat(label[labelled], 3)
+    count = sp.csc_array((np.ones(len(at), np.float32), (at, of)), shape=(vertices, views))
+    valence = np.maximum(np.bincount(at, minlength=vertices), 1).astype(np.float32)
 
+    def share(i: int) -> F32:
+        out = np.zeros(vertices, np.float32)
+        column = slice(count.indptr[i], count.indptr[i + 1])
+        out[count.indices[column]] = count.data[column]
+        return out / valence
 
-def read_mask(view: View) -> U8 | None:
-    """The view's mask (H, W), 0 where its photo must not be used; None if it can't be read or is of another size."""
-    import cv2
-
-    mask: Any = cv2.imread(str(view.mask), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
-    return mask if mask is not None and mask.shape == (view.camera.height, view.camera.width) else None
+    return share
 
 
 def _colours_of(inputs: Inputs) -> tuple[Colours | None, bool]:
@@ -283,9 +322,9 @@ def _facts(
         "pages": len(sizes),
         "texels": int(texels[:, 0].sum()),
         "photos": len(painter.used),
-        "texels_by_photo": {painter._views[i].name: n for i, n in sorted(painter.used.items())},
-        "skipped": sorted(painter.skipped.values()),
+        "texels_by_photo": {painter.name(i): n for i, n in sorted(painter.used.items())},
+        "skipped": sorted(painter.photos.skipped.values()),
     }
 
 
-TEXTURE = Step("texture", 1, texture, TextureParams)
+TEXTURE = Step("texture", 2, texture, TextureParams)

@@ -1,13 +1,15 @@
 """Unwrap: texture coordinates, on as many pages as the texel density asks for.
 
-A mesh is split in space into blocks, each of which fills one page; every block is unwrapped by itself in a
-child process with a time limit. One that the chosen backend refuses goes to the other one.
+Charts are cut out of the chosen photos (`texturing.photo_charts`). The rest, at a coarser density where no photo
+sees it, or all of it where another backend is asked for, is split in space into blocks, each of which fills one page;
+every block is unwrapped by itself in a child process with a time limit. One that a backend refuses goes to the other.
 """
 
 from __future__ import annotations
 
 import json
 import os
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -33,8 +35,11 @@ class UnwrapParams(Params):
     """How the surface is laid flat.
 
     Attributes:
-        backend: "xatlas" (fast, the same at every run) or "uvatlas" (fewer, larger charts, several times
-            slower, and never quite the same twice); each is the other's fallback.
+        backend: "photo" (charts are what one photo sees), "xatlas" (the same at every run) or "uvatlas" (fewer,
+            larger charts, several times slower, and never quite the same twice); the latter two are each
+            other's fallback, and unwrap what "photo" leaves.
+        unseen: how many times wider texels are where no photo sees the surface: points have no finer colours
+            ("photo" alone knows).
         texel: metres a texel spans; 1 cm, vegetation 3 cm.
         page_size: pages are at most this wide and high, texels.
         gutter: texels between charts; 2 for vegetation, whose charts are small and many.
@@ -42,7 +47,8 @@ class UnwrapParams(Params):
         timeout: seconds that the unwrapping of one block may take, per 10 000 triangles and at least once.
     """
 
-    backend: Literal["xatlas", "uvatlas"] = "xatlas"
+    backend: Literal["photo", "xatlas", "uvatlas"] = "photo"
+    unseen: float = Field(4.0, ge=1)
     texel: float = Field(0.01, gt=0)
     page_size: int = Field(4096, ge=64, le=8192)
     gutter: int = Field(4, ge=1, le=64)
@@ -53,6 +59,7 @@ class UnwrapParams(Params):
 def unwrap(inputs: Inputs, params: UnwrapParams, out: Path, report: Report) -> Done:
     """Give every face of `mesh` its place on a page.
 
+    Inputs: `mesh`; for the backend "photo" also `choice` and `views`.
     Files: `mesh`, with `uv` and `page`; `pages`, JSON list of {"width", "height"} in texels.
 
     Raises:
@@ -63,13 +70,85 @@ def unwrap(inputs: Inputs, params: UnwrapParams, out: Path, report: Report) -> D
     from pipeline.types import Mesh
 
     mesh = Mesh.load(inputs["mesh"])
-    uv = np.zeros((len(mesh), 3, 2), np.float32)
-    page = np.zeros(len(mesh), np.int16)
-    pages: list[dict[str, int]] = []
-    charts, fallbacks = 0, 0
-    waiting = split(mesh, params) if len(mesh) else []
+    laid = Laid(np.zeros((len(mesh), 3, 2), np.float32), np.full(len(mesh), -1, np.int16), [], 0, 0)
+    if len(mesh):
+        if params.backend == "photo":
+            label, centres = _photos(inputs)
+            laid = lay_by_photo(mesh, label, centres, params)
+            seen = label >= 0
+            coarse = params.model_copy(update={"texel": params.texel * params.unseen})
+            laid = lay(mesh, laid, np.flatnonzero((laid.page < 0) & seen), params, report)
+            laid = lay(mesh, laid, np.flatnonzero((laid.page < 0) & ~seen), coarse, report)
+        else:
+            laid = lay(mesh, laid, np.arange(len(mesh)), params, report)
+    uv, page, pages, charts, fallbacks = laid.uv, laid.page, laid.pages, laid.charts, laid.fallbacks
+    (out / "pages.json").write_text(json.dumps(pages), encoding="utf-8")
+    done = Mesh(mesh.frame, mesh.vertices, mesh.faces, mesh.density, uv, page, mesh.label)
+    done.save(out / "mesh.npz")
+    warnings = []
+    if fallbacks:
+        warnings.append(f"{fallbacks} of {len(pages)} blocks were unwrapped by {_other(params)}: they were refused")
+    facts = _facts(done, pages) | {"charts": charts, "backend": params.backend, "fallbacks": fallbacks}
+    return Done({"mesh": out / "mesh.npz", "pages": out / "pages.json"}, facts, warnings)
+
+
+@dataclass(frozen=True)
+class Laid:
+    """Faces laid onto pages so far.
+
+    Attributes:
+        uv: (F, 3, 2) float32.
+        page: (F,) int16, -1 for those that have none yet.
+        pages: width and height of each.
+        charts, fallbacks: number of charts, and of blocks that went to the other backend.
+    """
+
+    uv: npt.NDArray[np.float32]
+    page: npt.NDArray[np.int16]
+    pages: list[dict[str, int]]
+    charts: int
+    fallbacks: int
+
+
+def _photos(inputs: Inputs) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float64]]:
+    """The view (F,) of every face's detail, and the cameras' centres (V, 3)."""
+    import numpy as np
+
+    from pipeline.io import views as views_io
+    from texturing.choose import Choice
+
+    views = views_io.load(inputs["views"])
+    return Choice.load(inputs["choice"]).label, np.array([view.centre for view in views]).reshape(-1, 3)
+
+
+def lay_by_photo(
+    mesh: Mesh, label: npt.NDArray[np.int32], centres: npt.NDArray[np.float64], params: UnwrapParams
+) -> Laid:
+    """Charts as the chosen photos see them; faces that can't be laid so have no page."""
+    import numpy as np
+
+    from texturing import photo_charts
+
+    uv, page = np.zeros((len(mesh), 3, 2), np.float32), np.full(len(mesh), -1, np.int16)
+    charts = photo_charts.cut(mesh, label, centres, params.texel, params.page_size - 2 * params.gutter)
+    place, of, pages = photo_charts.pack(charts.size, params.page_size, params.gutter)
+    flat = charts.flat + place[charts.chart][:, None].astype(np.float32)
+    good = ~photo_charts.overlapping(flat, of[charts.chart], pages)
+    size = np.array(pages, np.float32).reshape(-1, 2)[of[charts.chart]]
+    face = charts.face[good]
+    page[face] = of[charts.chart][good]
+    uv[face] = ((flat + 0.5) / size[:, None])[good]
+    uv[face, :, 1] = 1 - uv[face, :, 1]
+    return Laid(uv, page, [{"width": w, "height": h} for w, h in pages], len(charts.size), 0)
+
+
+def lay(mesh: Mesh, laid: Laid, faces: Index, params: UnwrapParams, report: Report) -> Laid:
+    """Unwrap faces onto pages of their own, after those that are there."""
+    uv, page, pages = laid.uv.copy(), laid.page.copy(), list(laid.pages)
+    charts, fallbacks = laid.charts, laid.fallbacks
+    waiting = split(mesh, params, faces) if len(faces) else []
     while waiting:
-        report(float((page >= 0).mean()) if pages else 0.0, f"{len(waiting)} blocks")
+        report(float((page >= 0).mean()), f"{len(waiting)} blocks")
         again: list[Index] = []
         for block, flat in zip(waiting, _unwrap_all(mesh, waiting, params), strict=True):
             if max(flat.width, flat.height) > params.page_size and len(block) > 1:
@@ -79,23 +158,22 @@ def unwrap(inputs: Inputs, params: UnwrapParams, out: Path, report: Report) -> D
             uv[block] = flat.uv
             pages.append({k: min(getattr(flat, k), params.page_size) for k in ("width", "height")})
             charts += flat.charts
-            fallbacks += flat.backend != params.backend
+            fallbacks += flat.backend != _backend(params)
         waiting = again
-    (out / "pages.json").write_text(json.dumps(pages), encoding="utf-8")
-    done = Mesh(mesh.frame, mesh.vertices, mesh.faces, mesh.density, uv, page, mesh.label)
-    done.save(out / "mesh.npz")
-    warnings = []
-    if fallbacks:
-        other = "xatlas" if params.backend == "uvatlas" else "uvatlas"
-        warnings.append(f"{fallbacks} of {len(pages)} blocks were unwrapped by {other}: {params.backend} refused them")
-    facts = _facts(done, pages) | {"charts": charts, "backend": params.backend, "fallbacks": fallbacks}
-    return Done({"mesh": out / "mesh.npz", "pages": out / "pages.json"}, facts, warnings)
+    return Laid(uv, page, pages, charts, fallbacks)
 
 
-def split(mesh: Mesh, params: UnwrapParams) -> list[Index]:
-    """Compact blocks of faces (indices), each of which should fill one page at the asked density."""
-    import numpy as np
+def _backend(params: UnwrapParams) -> Backend:
+    """The unwrapper of what is not cut out of photos."""
+    return "uvatlas" if params.backend == "uvatlas" else "xatlas"
 
+
+def _other(params: UnwrapParams) -> Backend:
+    return "xatlas" if params.backend == "uvatlas" else "uvatlas"
+
+
+def split(mesh: Mesh, params: UnwrapParams, faces: Index) -> list[Index]:
+    """Compact blocks of the faces (indices), each of which should fill one page at the asked density."""
     area = mesh.face_area
     limit = UTILISATION * (params.page_size * params.texel) ** 2
 
@@ -104,7 +182,7 @@ def split(mesh: Mesh, params: UnwrapParams) -> list[Index]:
             return [block]
         return [part for half in halves(mesh, block) for part in cut(half)]
 
-    return cut(np.arange(len(mesh)))
+    return cut(faces)
 
 
 def halves(mesh: Mesh, block: Index) -> list[Index]:
@@ -125,15 +203,15 @@ def _unwrap_all(mesh: Mesh, blocks: list[Index], params: UnwrapParams) -> list[C
     workers = max(1, min(os.cpu_count() or 1, len(blocks)))
     by_size = sorted(range(len(blocks)), key=lambda i: -len(blocks[i]))
     shares = [by_size[k::workers] for k in range(workers)]
-    other: Backend = "xatlas" if params.backend == "uvatlas" else "uvatlas"
+    own, other = _backend(params), _other(params)
     with ThreadPoolExecutor(workers) as pool:
-        first = pool.map(lambda share: _in_child(mesh, [blocks[i] for i in share], params.backend, params), shares)
+        first = pool.map(lambda share: _in_child(mesh, [blocks[i] for i in share], own, params), shares)
         results: dict[int, Any] = {
             i: one for share, flat in zip(shares, first, strict=True) for i, one in zip(share, flat, strict=True)
         }
-        for backend in (params.backend, other):
+        for backend in (own, other):
             failed = [i for i, flat in results.items() if isinstance(flat, str)]
-            if backend == params.backend:  # one block can take its companions down with it: alone, the others pass
+            if backend == own:  # one block can take its companions down with it: alone, the others pass
                 failed = [i for i in failed if results[i].startswith(CHILD) and len(blocks) > workers]
             retried = pool.map(lambda i, b=backend: _in_child(mesh, [blocks[i]], b, params)[0], failed)
             results.update(zip(failed, retried, strict=True))
@@ -216,7 +294,7 @@ def stretch(corners: npt.NDArray[Any], flat: npt.NDArray[Any]) -> npt.NDArray[An
 
 UNWRAP = Step(
     "unwrap",
-    1,
+    2,
     unwrap,
     UnwrapParams,
     {"vegetation": {"texel": 0.03, "gutter": 2}},

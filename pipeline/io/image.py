@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.errors import InputError
 from pipeline.types import U8, View
 
 
@@ -18,6 +19,20 @@ def read_rgb(path: Path) -> U8 | None:
 
     image = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     return None if image is None else np.ascontiguousarray(image[..., ::-1])
+
+
+def read_grey(path: Path) -> U8:
+    """(H, W) grey levels of a picture that an earlier step wrote.
+
+    Raises:
+        InputError: it can't be read.
+    """
+    import cv2
+
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if image is None:
+        raise InputError(path, "can't be read as an image", "Delete the folder it is in, and run again")
+    return np.asarray(image, np.uint8)
 
 
 def write(path: Path, image: U8, *, quality: int = 90, compression: int = 2) -> None:

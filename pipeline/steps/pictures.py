@@ -52,6 +52,10 @@ class Album:
             entry["other"] = self._write(f"{name}_other", other)
         self.index.append(entry)
 
+    def save(self) -> None:
+        """Write the index beside the pictures: `index.json`."""
+        (self.folder / "index.json").write_text(json.dumps(self.index, indent=1), encoding="utf-8")
+
     def _write(self, name: str, rgb: U8) -> str:
         image.write(self.folder / f"{name}.jpg", rgb, quality=88)
         return f"{name}.jpg"
@@ -143,7 +147,7 @@ def pictures(inputs: Inputs, params: PicturesParams, out: Path, report: Report) 
         album.add(
             f"photo_{i}", resized(photo, small), "compare", views[i].name, f"({how}): drag to compare.", other=shot.rgb
         )
-    (folder / "index.json").write_text(json.dumps(album.index, indent=1), encoding="utf-8")
+    album.save()
     return Done({"pictures": folder}, {"pictures": len(album.index)})
 
 
@@ -254,4 +258,4 @@ def _compared(held: Sequence[bool], filled: Sequence[float], count: int) -> list
     return sorted(range(len(held)), key=lambda i: (not held[i], -filled[i]))[:count]
 
 
-PICTURES = Step("pictures", 1, pictures, PicturesParams)
+PICTURES = Step("pictures", 2, pictures, PicturesParams)

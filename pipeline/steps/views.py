@@ -72,7 +72,8 @@ def views(inputs: Inputs, params: ViewsParams, out: Path, report: Report) -> Don
     if params.poses and not kept:
         raise InputError(inputs["photo.0"], "no photo of the tile can be read", "Put the photos back, or take them out")
     if sees_nothing:
-        warnings.append(f"{len(sees_nothing)} photos see no point of the cloud: {', '.join(sees_nothing[:5])}")
+        many = "1 photo sees" if len(sees_nothing) == 1 else f"{len(sees_nothing)} photos see"
+        warnings.append(f"{many} no point of the cloud: {', '.join(sees_nothing[:5])}")
     held = held_out(kept, params.hold_out)
     if params.hold_out and kept and not any(held):
         warnings.append(f"{len(kept)} photos are too few to hold every {params.hold_out}th out: none is")

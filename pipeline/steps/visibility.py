@@ -44,9 +44,9 @@ def visibility(inputs: Inputs, params: VisibilityParams, out: Path, report: Repo
     hides = kernel.scene(meshes, cloud, radius=params.radius, lacking=params.lacking)
     for i, view in enumerate(views):
         report(i / len(views), view.name)
-        depth = kernel.depth_map(view.camera, view.T_world_cam, hides, pixels=params.pixels)
+        depth = kernel.depth_map(view.camera, view.T_world_cam, hides, time=view.time, pixels=params.pixels)
         np.save(folder / f"{i}.npy", depth.range)
     return Done({"depth": folder}, {"views": len(views), "triangles": hides.triangles, "discs": len(hides.centres)})
 
 
-VISIBILITY = Step("visibility", 1, visibility, VisibilityParams)
+VISIBILITY = Step("visibility", 2, visibility, VisibilityParams)

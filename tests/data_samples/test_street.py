@@ -157,6 +157,29 @@ def test_the_moving_car_leaves_a_trail(longer: tuple[Scene, PointCloud]) -> None
     assert np.ptp(s[in_lane]) > 12 and np.ptp(time) > 1
 
 
+def test_the_moving_car_can_be_left_out(longer: tuple[Scene, PointCloud]) -> None:
+    scene, cloud = longer
+    without = Scene(lay_out(40.0, 0, Style(moving_car=False)))
+    np.testing.assert_array_equal(without.truth_mesh().vertices, scene.truth_mesh().vertices)
+    still = scan(without, plan_drive(without.layout, 60_000), 60_000)
+
+    def in_lanes(points: PointCloud) -> int:
+        assert points.label is not None
+        _, t = scene.layout.axis.locate(points.xyz[points.label == CODE["vehicle"], :2].astype(np.float64))
+        return int((np.abs(t) < scene.layout.lane - 0.3).sum())
+
+    assert in_lanes(cloud) > 0 and in_lanes(still) == 0
+    camera = photo_module.cameras(64)["pano"]
+    drive = plan_drive(scene.layout, 60_000)
+    shot = photo_module.plan_shots(scene.layout, drive, 32, 0.0)[13]
+    with_car, bare, never = (
+        photo_module.render(s, drive, camera, shot.T_world_cam, time).light
+        for s, time in ((scene, shot.time), (scene, None), (without, shot.time))
+    )
+    assert (with_car != bare).any()
+    np.testing.assert_array_equal(never, bare)
+
+
 def test_facades_are_seen_at_the_scanners_own_height_too(longer: tuple[Scene, PointCloud]) -> None:
     scene, cloud = longer
     s, _ = scene.layout.axis.locate(cloud.xyz[cloud.label == CODE["building"], :2].astype(np.float64))

@@ -85,3 +85,49 @@ def test_an_unreadable_page_is_named(tmp_path):
     (tmp_path / "page_0.png").write_bytes(b"no image")
     with pytest.raises(InputError, match="page_0.png"):
         Renderer([Body(square(), (tmp_path / "page_0.png",))]).above((-1, -1, 0), (1, 1, 1), width=10)
+
+
+def checkered(folder, texels=256):
+    """A square of 4 m with a black and white checkerboard, a texel a field."""
+    page = np.indices((texels, texels)).sum(axis=0) % 2 * 255
+    cv2.imwrite(str(folder / "page_0.png"), np.repeat(page[..., None], 3, axis=2).astype(np.uint8))
+    return Body(square(), (folder / "page_0.png",))
+
+
+def test_more_rays_a_pixel_filter_what_is_finer_than_a_pixel(tmp_path):
+    renderer = Renderer([checkered(tmp_path)])
+    camera, pose = pinhole(60, 40, field=40), look_at((0, -6, 5), (0, 0, 0))
+    coarse, fine = renderer.view(camera, pose), renderer.view(camera, pose, samples=6)
+    assert coarse.rgb[coarse.hit].astype(float).std() > 40
+    assert abs(fine.rgb[fine.hit].astype(float) - 127.5).mean() < 15
+    for name in ("hit", "seen", "face", "body", "range", "barycentric"):
+        np.testing.assert_array_equal(getattr(coarse, name), getattr(fine, name))
+
+
+def test_a_picture_is_the_same_in_small_pieces(tmp_path, monkeypatch):
+    camera, pose = pinhole(60, 40, field=90), look_at((0, -6, 1), (0, 0, 1))  # its upper rows see nothing
+    whole = Renderer([checkered(tmp_path)]).view(camera, pose, samples=3)
+    monkeypatch.setattr("pipeline.render.CHUNK", 600)
+    pieces = Renderer([checkered(tmp_path)]).view(camera, pose, samples=3)
+    np.testing.assert_array_equal(whole.rgb, pieces.rgb)
+    np.testing.assert_array_equal(whole.face, pieces.face)
+
+
+@pytest.mark.parametrize("samples", [2, 3])
+def test_sub_rays_mix_no_sky_into_the_edge_of_a_mesh(samples):
+    plain = Body(square(), colour=(10, 20, 30))
+    image = Renderer([plain]).view(
+        pinhole(61, 41), look_at((0, -6, 5), (0, 0, 0)), background=(250, 0, 0), samples=samples
+    )
+    assert (image.rgb[image.hit] == (10, 20, 30)).all() and (image.rgb[~image.hit] == (250, 0, 0)).all()
+    assert image.hit.any() and not image.hit.all()
+
+
+def test_nearest_places_lie_on_the_mesh(painted):
+    points = np.float32([[-1, 1, 0.3], [1, -1, -0.2]])
+    rgb, seen, distance = Renderer([painted]).nearest(points)
+    assert rgb.tolist() == [[255, 0, 0], [255, 255, 255]] and seen.tolist() == [128, 255]
+    np.testing.assert_allclose(distance, [0.3, 0.2], rtol=1e-5)
+    places, normals = Renderer([painted]).nearest_places(points)
+    np.testing.assert_allclose(places, [[-1, 1, 0], [1, -1, 0]], atol=1e-6)
+    np.testing.assert_allclose(abs(normals), [[0, 0, 1], [0, 0, 1]], atol=1e-6)

@@ -92,23 +92,60 @@ def test_leak_and_false_hiding_on_the_ground_are_small_at_grazing_angles(street,
     assert (~seen[truly]).mean() < 0.06
 
 
-def test_points_without_a_mesh_hide_what_is_behind_them(street):
-    pose = forward_pose()
-    y, z = (part.ravel() for part in np.meshgrid(np.arange(-1, 0.5, 0.1), np.arange(0.5, 2.5, 0.1)))
-    car = np.column_stack([np.full(y.size, 4.0), y, z]).astype(np.float32)
-    normal = np.tile(np.float32([-1, 0, 0]), (len(car), 1))
-    ground = np.column_stack([y * 5 + 3, z, np.full(y.size, 0.05)]).astype(np.float32)  # the mesh has it already
-    cloud = PointCloud(
-        Frame(), np.concatenate([car, ground]), normal=np.concatenate([normal, np.tile([0, 0, 1], (len(ground), 1))])
-    )
-    hides = scene(street, cloud)
+def side_of(x, y0, y1, z0, z1, step=0.1):
+    """(N, 3) points every `step` metres on an upright rectangle across the view of `forward_pose`."""
+    y, z = (part.ravel() for part in np.meshgrid(np.arange(y0, y1, step), np.arange(z0, z1, step)))
+    return np.column_stack([np.full(y.size, x), y, z]).astype(np.float32)
+
+
+def cloud_of(*parts, label=None, time=None):
+    """Points that look towards the camera."""
+    xyz = np.concatenate(parts)
+    return PointCloud(Frame(), xyz, normal=np.tile(np.float32([-1, 0, 0]), (len(xyz), 1)), label=label, time=time)
+
+
+WALL = Mesh(Frame(), np.float32([[8, -2, 0], [8, 2, 0], [8, 2, 3], [8, -2, 3]]), np.int32([[0, 2, 1], [0, 3, 2]]))
+ON_WALL = np.array([[8.0, 0.0, 1.5], [8.0, 1.9, 1.5]])
+FACING = np.tile([-1.0, 0, 0], (2, 1))
+
+
+def test_points_without_a_mesh_hide_what_is_behind_them():
+    pose, camera = forward_pose(), CAMERAS["pinhole"]
+    car = side_of(4.0, -1, 0.5, 0.5, 2.5)
+    before_wall = side_of(7.95, -2, 2.05, 0, 3.05)  # the mesh has it already
+    hides = scene([WALL], cloud_of(car, before_wall))
     assert len(hides.centres) == len(car)
-    wall = np.array([[8.0, 0.0, 1.5], [8.0, 1.9, 1.5]])
-    facing = np.array([[-1.0, 0, 0], [-1.0, 0, 0]])
-    camera = CAMERAS["pinhole"]
-    assert visible(depth_map(camera, pose, scene(street)), wall, facing).tolist() == [True, True]
-    assert visible(depth_map(camera, pose, hides), wall, facing).tolist() == [False, True]
-    assert visible(depth_map(camera, pose, hides), car, normal).all()
+    assert visible(depth_map(camera, pose, scene([WALL])), ON_WALL, FACING).tolist() == [True, True]
+    assert visible(depth_map(camera, pose, hides), ON_WALL, FACING).tolist() == [False, True]
+    assert visible(depth_map(camera, pose, hides), car, np.tile([-1.0, 0, 0], (len(car), 1))).all()
+
+
+def test_the_trail_of_what_drove_past_hides_only_while_it_was_there():
+    wall, trail = side_of(8.0, -2, 2.05, 0, 3.05), side_of(4.0, -1, 0.5, 0.5, 2.5)
+    label = np.repeat(np.uint8([6, 66]), [len(wall), len(trail)])
+    passed = np.concatenate([np.full(len(wall), 100.0), np.linspace(100.0, 100.2, len(trail))])
+    stood = np.concatenate([np.full(len(wall), 100.0), np.linspace(100.0, 104.0, len(trail))])
+    camera, pose = CAMERAS["pinhole"], forward_pose()
+
+    def sees_wall(cloud, time):
+        depth = depth_map(camera, pose, scene([WALL], cloud), time=time)
+        return bool(visible(depth, ON_WALL[:1], FACING[:1])[0])
+
+    moving, parked = (cloud_of(wall, trail, label=label, time=t) for t in (passed, stood))
+    assert not sees_wall(moving, 100.2)
+    assert sees_wall(moving, 103.0)
+    assert sees_wall(moving, 97.0)
+    assert not sees_wall(moving, None)  # when it was isn't known: better hidden
+    assert not sees_wall(parked, 110.0)
+
+
+def test_a_bulge_that_no_point_bears_out_hides_nothing():
+    wall, sign = side_of(8.0, -2, 2.05, 0, 3.05), side_of(4.0, -0.3, 0.35, 1.5, 2.1)
+    flat = grid(20, 11, 0.1, (0, 1.8, 0))
+    bulge = Mesh(Frame(), np.roll(flat.vertices, 1, axis=1) + np.float32([4, 0, 0]), flat.faces)
+    depth = depth_map(CAMERAS["pinhole"], forward_pose(), scene([WALL, bulge], cloud_of(wall, sign)))
+    behind = np.array([[8.0, 0.0, 1.6], [8.0, 1.6, 1.6]])  # the sign, and what is left of it
+    assert visible(depth, behind, FACING).tolist() == [False, True]
 
 
 def test_what_is_out_of_the_image_is_not_seen(street):

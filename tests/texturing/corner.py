@@ -13,6 +13,9 @@ from pipeline.render import Body, Renderer, look_at, pinhole
 from pipeline.step import silent
 from pipeline.types import Camera, Frame, Mesh, PointCloud, View
 from pipeline.visibility import depth_map, scene
+from texturing.agreement import AGREEMENT
+from texturing.choose import CHOOSE
+from texturing.exposure import EXPOSURE
 from texturing.texture import TextureParams, texture
 from texturing.unwrap import UnwrapParams, unwrap
 
@@ -98,8 +101,8 @@ class Street:
         self.views.append(view)
         return view
 
-    def run(self, **params):
-        """Unwrap and texture; returns (folder of the textured mesh, what the step said)."""
+    def run(self, exposure=None, agreement=None, choose=None, **params):
+        """Unwrap and texture, settings by step; returns (folder of the textured mesh, what the steps said)."""
         out = self.folder / f"run{self.runs}"
         self.runs += 1
         (out / "depth").mkdir(parents=True)
@@ -110,11 +113,16 @@ class Street:
             np.save(out / "depth" / f"{i}.npy", depth_map(view.camera, view.T_world_cam, hides).range)
         views_io.save(out / "views.json", self.views, self.held_out)
         inputs = {**flat.files, "views": out / "views.json", "depth": out / "depth"}
+        warnings = []
+        for step, given in ((EXPOSURE, exposure), (AGREEMENT, agreement), (CHOOSE, choose)):
+            done = step.run(inputs, step.params(**(given or {})), out, silent)
+            inputs |= done.files
+            warnings += done.warnings
         for name, cloud in self.clouds.items():
             cloud.save(out / f"{name}.npz")
             inputs[f"cloud.{name}"] = out / f"{name}.npz"
         done = texture(inputs, TextureParams(**params), out, silent)
-        return done.files["textured"], done
+        return done.files["textured"], replace(done, warnings=warnings + done.warnings)
 
 
 def points(colour=True, n=40_000, rgb=None):

@@ -118,6 +118,5 @@ def test_the_same_again(tmp_path):
     np.testing.assert_array_equal(first.uv, again.uv)
 
 
-def test_vegetation_goes_to_xatlas_at_three_centimetres():
-    given = UnwrapParams(**UNWRAP.per_class["vegetation"])
-    assert (given.backend, given.texel) == ("xatlas", 0.03)
+def test_vegetation_is_textured_at_three_centimetres():
+    assert UnwrapParams(**UNWRAP.per_class["vegetation"]).texel == 0.03

@@ -1,0 +1,183 @@
+"""Textures as they are usually made, on the same mesh, atlas and photos as ours.
+
+Each writes what the step `texture` writes: `mesh.npz`, `page_<i>.png`, `page_<i>_seen.png`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numba import njit, prange
+
+from bench.texture_scenes import Scene
+from pipeline.cameras import EQUIRECTANGULAR, MODEL_ID, parameters, pixel_angle, project_point
+from pipeline.io import image
+from pipeline.range_image import is_visible
+from pipeline.types import U8, Mesh
+from pipeline.visibility import BIAS, load_depth_map
+from texturing import blend, fill
+
+OPEN3D_SIZE = 4096
+PADDING = 16
+MAX_DISTANCE, MIN_COS = 40.0, 0.08
+"""Metres and cosine (normal to ray) at which a photo is used for a surface at all, as by ours."""
+
+
+def parametrize(scene: Scene, out: Path) -> None:
+    """xatlas' own way of unwrapping, the whole mesh at once; only its time is of interest."""
+    import xatlas
+
+    mesh = Mesh.load(scene.mesh)
+    xatlas.parametrize(mesh.vertices, mesh.faces.astype(np.uint32))
+
+
+def open3d(scene: Scene, out: Path) -> None:
+    """Open3D's `project_images_to_albedo` of the perspective photos, distortion removed; it knows no other cameras.
+
+    It paints one atlas alone: several pages of ours become a grid in it. Black texels are those that it left out.
+    """
+    import cv2
+    import open3d as o3d
+
+    mesh = _one_atlas(Mesh.load(scene.atlas / "mesh.npz"))
+    assert mesh.uv is not None
+    body = o3d.t.geometry.TriangleMesh(mesh.vertices, mesh.faces.astype(np.int64))
+    body.triangle.texture_uvs = o3d.core.Tensor(np.ascontiguousarray(mesh.uv))
+    photos, intrinsics, extrinsics = [], [], []
+    for view in scene.photos(held_out=False).values():
+        camera, photo = view.camera, image.read_rgb(view.photo)
+        if camera.model not in ("pinhole", "opencv") or photo is None:
+            continue
+        k = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
+        if camera.distortion:
+            photo = np.asarray(cv2.undistort(photo, k, np.array(camera.distortion)))
+        photos.append(o3d.t.geometry.Image(np.ascontiguousarray(photo)))
+        intrinsics.append(o3d.core.Tensor(k))
+        extrinsics.append(o3d.core.Tensor(np.linalg.inv(view.T_world_cam)))
+    albedo = body.project_images_to_albedo(photos, intrinsics, extrinsics, OPEN3D_SIZE, True)
+    rgb = np.ascontiguousarray(albedo.as_tensor().numpy()[..., :3])
+    owner = blend.owners(blend.texels(mesh.uv, OPEN3D_SIZE, OPEN3D_SIZE), OPEN3D_SIZE, OPEN3D_SIZE)
+    seen = np.where((owner >= 0) & rgb.any(axis=2), 255, 0).astype(np.uint8)
+    mesh.save(out / "mesh.npz")
+    _write(out, 0, rgb, seen)
+
+
+def _one_atlas(mesh: Mesh) -> Mesh:
+    """The mesh with its pages laid out as the cells of a square grid on one."""
+    from dataclasses import replace
+
+    assert mesh.uv is not None and mesh.page is not None
+    side = math.ceil(math.sqrt(int(mesh.page.max()) + 1))
+    cell = np.stack([mesh.page % side, mesh.page // side], axis=1)[:, None]
+    return replace(mesh, uv=((mesh.uv + cell) / side).astype(np.float32), page=np.zeros_like(mesh.page))
+
+
+def nearest(scene: Scene, out: Path) -> None:
+    """Every texel from the nearest photo that sees it."""
+    _paint(scene, out, only_nearest=True)
+
+
+def inverse_square(scene: Scene, out: Path) -> None:
+    """Every texel the mean of all photos that see it, weighted by the inverse square of their distance."""
+    _paint(scene, out, only_nearest=False)
+
+
+def _paint(scene: Scene, out: Path, *, only_nearest: bool) -> None:
+    mesh = Mesh.load(scene.atlas / "mesh.npz")
+    assert mesh.uv is not None and mesh.page is not None
+    corners, normals = mesh.corners, mesh.face_normal
+    for k, size in enumerate(json.loads((scene.atlas / "pages.json").read_text())):
+        width, height = size["width"], size["height"]
+        faces = np.flatnonzero(mesh.page == k)
+        flat = blend.texels(mesh.uv[faces], width, height)
+        owner = blend.owners(flat, width, height)
+        at = np.nonzero(owner >= 0)
+        face = owner[at]
+        places = _places(flat, corners[faces], face, *at)
+        total = np.zeros((len(face), 4), np.float32)
+        for i, view in scene.photos(held_out=False).items():
+            photo = image.read_rgb(view.photo)
+            assert photo is not None
+            depth = load_depth_map(scene.depth / f"{i}.npy", view.camera, view.T_world_cam)
+            _add(
+                total, places, normals[faces], face, photo, MODEL_ID[view.camera.model], parameters(view.camera),
+                depth.range, parameters(depth.camera), pixel_angle(depth.camera), np.linalg.inv(view.T_world_cam),
+                BIAS, MAX_DISTANCE, MIN_COS, only_nearest,
+            )  # fmt: skip
+        rgb, seen = np.zeros((height, width, 3), np.uint8), np.zeros((height, width), np.uint8)
+        rgb[at] = np.rint(total[:, :3] / np.maximum(total[:, 3:], 1e-12))
+        seen[at] = np.where(total[:, 3] > 0, 255, 0)
+        _write(out, k, rgb, seen)
+    mesh.save(out / "mesh.npz")
+
+
+def _write(out: Path, page: int, rgb: U8, seen: U8) -> None:
+    fill.pad(rgb, seen, PADDING)
+    image.write(out / f"page_{page}.png", rgb)
+    image.write(out / f"page_{page}_seen.png", seen)
+
+
+@njit(cache=True, parallel=True)
+def _places(flat, corners, face, rows, columns):  # type: ignore[no-untyped-def]
+    """(N, 3) float32: where the texels lie in space."""
+    out = np.empty((len(face), 3), np.float32)
+    for i in prange(len(face)):
+        origin, per_x, per_y, _ = blend.frame(flat, corners, face[i])
+        for k in range(3):
+            out[i, k] = origin[k] + columns[i] * per_x[k] + rows[i] * per_y[k]
+    return out
+
+
+@njit(cache=True)
+def _bilinear(photo, u, v, k):  # type: ignore[no-untyped-def]
+    """A channel of a photo (H, W, 3) between its pixels; held at the borders, a panorama's seam too."""
+    height, width = photo.shape[:2]
+    a, c = int(min(max(math.floor(u), 0), width - 2)), int(min(max(math.floor(v), 0), height - 2))
+    x, y = min(max(u - a, 0.0), 1.0), min(max(v - c, 0.0), 1.0)
+    upper = photo[c, a, k] * (1 - x) + photo[c, a + 1, k] * x
+    lower = photo[c + 1, a, k] * (1 - x) + photo[c + 1, a + 1, k] * x
+    return upper * (1 - y) + lower * y
+
+
+@njit(cache=True)
+def _turned(T, a, w):  # type: ignore[no-untyped-def]
+    """The point (w 1) or direction (w 0) in the axes that T leads to."""
+    return (
+        T[0, 0] * a[0] + T[0, 1] * a[1] + T[0, 2] * a[2] + T[0, 3] * w,
+        T[1, 0] * a[0] + T[1, 1] * a[1] + T[1, 2] * a[2] + T[1, 3] * w,
+        T[2, 0] * a[0] + T[2, 1] * a[1] + T[2, 2] * a[2] + T[2, 3] * w,
+    )
+
+
+@njit(cache=True, parallel=True)
+def _add(  # type: ignore[no-untyped-def]
+    total, places, normals, face, photo, model, p, depth, depth_p, pixel, T, bias, max_distance, min_cos, only_nearest
+):
+    """Add a photo's weighted colour to the texels (N, 4) that it sees, or put it in the place of a farther one's."""
+    for i in prange(len(places)):
+        x, y, z = _turned(T, places[i], 1.0)
+        nx, ny, nz = _turned(T, normals[face[i]], 0.0)
+        d2 = x * x + y * y + z * z
+        if d2 > max_distance * max_distance or -(x * nx + y * ny + z * nz) < min_cos * math.sqrt(d2):
+            continue
+        u, v, ok = project_point(model, p, x, y, z)
+        wide = model == EQUIRECTANGULAR
+        if not ok or v < -0.5 or v >= p[13] - 0.5 or ((u < -0.5 or u >= p[12] - 0.5) and not wide):
+            continue
+        if not is_visible(depth, model, depth_p, pixel, bias, x, y, z, nx, ny, nz):
+            continue
+        w = 1.0 / d2
+        if only_nearest:
+            if w <= total[i, 3]:
+                continue
+            total[i, :] = 0
+        for k in range(3):
+            total[i, k] += w * _bilinear(photo, u, v, k)
+        total[i, 3] += w
+
+
+BASELINES: dict[str, Any] = {"open3d": open3d, "nearest": nearest, "inverse_square": inverse_square}

@@ -1,0 +1,300 @@
+"""Who sees what, against the truth of a generated street: leaks and false hiding of the depth maps.
+
+`python -m bench.visibility [--length 40 --points 1.5e6 --photos 16 --width 1024 --seed 0] [--out bench-out]`.
+
+Our steps make meshes, clouds and depth maps of the street. The meshes are sampled evenly, as texels do, within
+reach of each photo; what the depth map says of every sample is compared with rays cast in the true street, parked
+cars and the moving car (where it was at that moment) included. Beside ours, what others draw depth maps from.
+
+- leak: of the samples that are truly hidden, those taken as seen.
+- false hiding: of the samples that are truly visible, those taken as hidden.
+- wrong: of the samples taken as seen, those that are truly hidden: they get the texture of something else.
+
+A mesh is some centimetres off; at the edges of what hides, no test of it can know the truth. So the shares are given
+twice: of the samples around which the truth is the same (clear), and of all. Ends with `RESULT {json}`, totals over
+the classes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from bench.tile import ROOT
+from data_samples.layout import FRAME, lay_out
+from data_samples.scanner import plan_drive
+from data_samples.scene import Scene
+from data_samples.street import generate
+from flows.execute import execute, plan
+from flows.recipe import Node, Output, recipe
+from flows.settings import Settings
+from pipeline import visibility
+from pipeline.cameras import inside, project
+from pipeline.classes import CLASSES, GROUPS
+from pipeline.io.tile import read_tile
+from pipeline.steps.visibility import VisibilityParams
+from pipeline.store import Store
+from pipeline.types import F32, F64, U8, Frame, Mesh, PointCloud, Tile, View
+from pipeline.visibility import DepthMap
+
+OURS = "mesh + discs (ours)"
+SPLAT = 8
+"""Pixels to a side of the boxes that points are splatted as, for comparison."""
+SPLAT_BIAS = 0.3
+"""Metres that a sample may lie behind such a box besides: a box is as near all over as the point in its middle."""
+REACH = 40.0
+"""Metres beyond which a photo isn't used."""
+FLATTEST = 0.08
+"""Cosine of the angle between normal and ray below which a photo isn't used."""
+ASTRAY = 0.15
+"""Metres to the nearest true surface beyond which a sample has no true place, and isn't counted."""
+EDGE = 0.05
+"""Metres, about what the mesh is off the true surface: where so small a shift of the ray decides, nobody can know."""
+RELIEF = 0.10
+"""Metres, the voxel size: what stands out of the surface around a sample by less is its roughness and hides nothing."""
+
+Mask = npt.NDArray[np.bool_]
+Tally = npt.NDArray[np.int64]
+Method = Callable[[View], DepthMap]
+
+
+@dataclass(frozen=True)
+class Made:
+    """What our steps made of the street: a mesh a class, the whole thinned cloud, the views."""
+
+    meshes: dict[str, Mesh]
+    cloud: PointCloud
+    views: tuple[View, ...]
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Places on a mesh that a view would texture if nothing hid them.
+
+    Attributes:
+        points, normals: (N, 3) local metres, and unit.
+        hidden: (N,) whether the true street hides them.
+        clear: (N,) whether it does, or doesn't, around the sample as well; the others lie at an edge of what hides.
+        blocker: (N,) LAS class of what hides; 0 for the visible ones.
+    """
+
+    points: F32
+    normals: F32
+    hidden: Mask
+    clear: Mask
+    blocker: U8
+
+
+def main() -> None:
+    """Make the street and its meshes, draw depth maps by all methods, print shares."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--length", type=float, default=40.0)
+    parser.add_argument("--points", type=float, default=1.5e6)
+    parser.add_argument("--photos", type=int, default=16)
+    parser.add_argument("--width", type=int, default=1024)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--samples", type=int, default=60_000, help="of a class for every view")
+    parser.add_argument("--out", type=Path, default=ROOT / "bench-out")
+    a = parser.parse_args()
+    street = a.out / f"seen_{a.length:g}_{a.points:g}_{a.photos}_{a.width}_{a.seed}"
+    if not (street / "tile.toml").is_file():
+        generate(street, length=a.length, points=a.points, photos=a.photos, photo_width=a.width, seed=a.seed)
+    tile = read_tile(street / "tile.toml")
+    made = make(tile, street / "steps")
+    truth = Truth(a.length, a.points, a.seed, tile.frame)
+
+    methods = methods_of(made)
+    counts: dict[str, dict[str, Tally]] = {
+        name: {group: np.zeros((2, 4), np.int64) for group in GROUPS} for name in methods
+    }
+    seconds: dict[str, list[float]] = {name: [] for name in methods}
+    blockers = np.zeros((2, 256), np.int64)
+    for i, view in enumerate(made.views):
+        samples = {g: truth.judge(*drawn, view) for g, drawn in draw(made.meshes, view, a.samples, seed=i)}
+        for name, method in methods.items():
+            began = time.perf_counter()
+            depth = method(view)
+            seconds[name].append(time.perf_counter() - began)
+            for group, s in samples.items():
+                seen = visibility.visible(depth, s.points, s.normals)
+                counts[name][group] += [tally(seen[k], s.hidden[k]) for k in (s.clear, slice(None))]
+                if name == OURS:
+                    of = s.hidden & s.clear
+                    blockers += [np.bincount(s.blocker[of & m], minlength=256) for m in (of, seen)]
+    print_methods(counts, {name: float(np.median(s)) for name, s in seconds.items()})
+    print_blockers(*blockers)
+    (leak, false_hiding, _), (leak_all, hiding_all, _) = (shares(tallied) for tallied in total(counts[OURS]))
+    result = {
+        "leak": leak,
+        "false_hiding": false_hiding,
+        "leak_edges_too": leak_all,
+        "false_hiding_edges_too": hiding_all,
+    }
+    print("RESULT " + json.dumps({name: round(share, 4) for name, share in result.items()}))
+
+
+def make(tile: Tile, out: Path) -> Made:
+    """Run our recipe up to what depth maps are drawn from; what an earlier run has finished is kept."""
+    meshes, clouds = [f"decimate.{g}" for g in GROUPS], [f"voxel.{part}" for part in (*GROUPS, "rest")]
+    store = Store(out)
+    planned = plan(needed(recipe(tile, Settings()), {*meshes, *clouds}), store)
+    execute(planned, store, jobs=2, watch=lambda node, event, fraction, message: None)
+    folder = {p.node.label: store.folder(p.node.label, p.key) for p in planned}
+    return Made(
+        {g: Mesh.load(folder[label] / "mesh.npz") for g, label in zip(GROUPS, meshes, strict=True)},
+        PointCloud.join([PointCloud.load(folder[label] / "cloud.npz") for label in clouds]),
+        tile.views,
+    )
+
+
+def needed(nodes: list[Node], labels: set[str]) -> list[Node]:
+    """Of a recipe, the nodes of these labels and all that they depend on, in order."""
+    for node in reversed(nodes):
+        if node.label in labels:
+            labels = labels | {source.node for source in node.inputs.values() if isinstance(source, Output)}
+    return [node for node in nodes if node.label in labels]
+
+
+def draw(meshes: dict[str, Mesh], view: View, count: int, seed: int) -> Iterator[tuple[str, tuple[F32, F32]]]:
+    """Class, and (N, 3) points and normals spread evenly over its mesh that the view could texture, of `count`."""
+    rng = np.random.default_rng(seed)
+    for group, mesh in meshes.items():
+        area = np.cumsum(mesh.face_area, dtype=np.float64)
+        face = np.searchsorted(area, rng.uniform(0, area[-1], count)).clip(max=len(mesh) - 1)
+        u, v = np.sqrt(rng.uniform(size=(count, 1))), rng.uniform(size=(count, 1))
+        a, b, c = np.moveaxis(mesh.corners[face].astype(np.float64), 1, 0)
+        points, normals = (1 - u) * a + u * (1 - v) * b + u * v * c, mesh.face_normal[face]
+        to = view.centre - points
+        distance = np.linalg.norm(to, axis=1)
+        uv, valid = project(view.camera, -to @ view.T_world_cam[:3, :3])
+        facing = np.einsum("ij,ij->i", to, normals) > FLATTEST * distance
+        keep = valid & inside(view.camera, uv) & facing & (distance < REACH)
+        yield group, (points[keep].astype(np.float32), normals[keep])
+
+
+class Truth:
+    """The street that the tile was made of.
+
+    Args:
+        length, points, seed: as it was generated with.
+        frame: of the samples and views.
+    """
+
+    def __init__(self, length: float, points: float, seed: int, frame: Frame) -> None:
+        import open3d as o3d
+
+        layout = lay_out(length, seed)
+        self.scene, self.drive = Scene(layout), plan_drive(layout, points)
+        self._shift = np.subtract(frame.origin, FRAME.origin)
+        still = self.scene.truth_mesh()
+        self._still = o3d.t.geometry.RaycastingScene()
+        self._still.add_triangles(still.vertices, still.faces.astype(np.uint32))
+
+    def judge(self, points: F32, normals: F32, view: View) -> Samples:
+        """What the true street hides from the view, of points (N, 3) with normals (N, 3); those astray are left out.
+
+        A sample's true place is the nearest on the true static surface. Lifted off it by `RELIEF`, along the
+        sample's normal, it is hidden if the ray to it from the camera meets something more than `RELIEF` before it.
+        That is clear if four rays, moved aside by `EDGE`, say the same.
+        """
+        moved = (points + self._shift).astype(np.float32)
+        true = self._still.compute_closest_points(moved)["points"].numpy()
+        near = np.linalg.norm(true - moved, axis=1) < ASTRAY
+        points, normals = points[near], normals[near]
+        to = true[near] + RELIEF * normals - (view.centre + self._shift)
+        right = np.cross(to, [0.0, 0.0, 1.0])
+        right *= EDGE / np.linalg.norm(right, axis=1, keepdims=True)
+        up = np.cross(right, to / np.linalg.norm(to, axis=1, keepdims=True))
+        blocker, *around = (self._blocker(view, to + aside) for aside in (0, right, -right, up, -up))
+        clear = np.all([(other > 0) == (blocker > 0) for other in around], axis=0)
+        return Samples(points, normals, blocker > 0, clear, blocker)
+
+    def _blocker(self, view: View, to: F64) -> U8:
+        """(N,) LAS class of what the rays from the view to camera + `to` (N, 3) meet before their ends; 0: nothing."""
+        distance = np.linalg.norm(to, axis=1)
+        assert view.time is not None
+        car = self.drive.car(self.scene, np.array([view.time])).repeated(len(to))
+        origins = np.broadcast_to((view.centre + self._shift).astype(np.float32), to.shape)
+        hits = self.scene.cast(origins, (to / distance[:, None]).astype(np.float32), car)
+        hidden = hits.distance < distance - RELIEF
+        return np.where(hidden, self.scene.surface.label[hits.face], 0).astype(np.uint8)
+
+
+def methods_of(made: Made) -> dict[str, Method]:
+    """Name to a function that draws the depth map of a view."""
+    p, meshes = VisibilityParams.model_validate({}), list(made.meshes.values())
+
+    def of(hides: visibility.Scene) -> Method:
+        return lambda view: visibility.depth_map(view.camera, view.T_world_cam, hides, time=view.time, pixels=p.pixels)
+
+    return {
+        f"boxes of points, {SPLAT} px": lambda view: boxes(made.cloud, view),
+        "discs of points": of(visibility.scene([], made.cloud, radius=p.radius)),
+        "mesh": of(visibility.scene(meshes)),
+        OURS: of(visibility.scene(meshes, made.cloud, radius=p.radius, lacking=p.lacking)),
+    }
+
+
+def boxes(cloud: PointCloud, view: View) -> DepthMap:
+    """A depth map of the photo's size: every point a box of `SPLAT` pixels at its distance, the nearest kept."""
+    import cv2
+
+    camera = view.camera
+    local = (cloud.xyz - view.centre) @ view.T_world_cam[:3, :3]
+    uv, valid = project(camera, local)
+    keep = valid & inside(camera, uv)
+    column, row = np.floor(uv[keep] + 0.5).astype(int).T
+    depth = np.full((camera.height, camera.width), np.inf, np.float32)
+    np.minimum.at(depth, (row, column), np.linalg.norm(local[keep], axis=1).astype(np.float32))
+    splats = np.asarray(cv2.erode(depth, np.ones((SPLAT, SPLAT))), np.float32)
+    return DepthMap(camera, view.T_world_cam, splats + np.float32(SPLAT_BIAS))
+
+
+def tally(seen: Mask, hidden: Mask) -> Tally:
+    """(4,) samples: hidden and seen, hidden, visible and not seen, visible."""
+    return np.array([(hidden & seen).sum(), hidden.sum(), (~hidden & ~seen).sum(), (~hidden).sum()])
+
+
+def total(counts: dict[str, Tally]) -> Tally:
+    """Tallies of all classes, summed: (2, 4), those of clear samples and those of all."""
+    return np.sum(list(counts.values()), axis=0)
+
+
+def shares(tallied: Tally) -> tuple[float, float, float]:
+    """Leak, false hiding, and wrong: see the top of this file."""
+    leaked, hidden, missed, visible = (int(n) for n in tallied)
+    seen = leaked + visible - missed
+    return leaked / max(1, hidden), missed / max(1, visible), leaked / max(1, seen)
+
+
+def print_methods(counts: dict[str, dict[str, Tally]], seconds: dict[str, float]) -> None:
+    """A line a method and class, shares in percent: of the clear samples, and of all, those at edges too."""
+    print(f"{'':<34}{'clear samples':>33}{'':>18} |{'those at edges too':>27}")
+    titles = f"{'leak %':>8}{'false hiding %':>16}{'wrong %':>9}"
+    print(f"{'method':<22}{'class':<12}{titles}{'hidden':>9}{'visible':>9} |{titles}{'edges %':>9}")
+    for name, of in counts.items():
+        for group, (clear, every) in {**of, "all": total(of)}.items():
+            columns = [f"{100 * a:>8.2f}{100 * b:>16.2f}{100 * c:>9.2f}" for a, b, c in (shares(clear), shares(every))]
+            edges = 100 * (1 - (clear[1] + clear[3]) / max(1, every[1] + every[3]))
+            print(f"{name:<22}{group:<12}{columns[0]}{clear[1]:>9,}{clear[3]:>9,} |{columns[1]}{edges:>9.1f}")
+        print(f"{'':<22}{seconds[name]:.2f} s a view")
+
+
+def print_blockers(hidden: Tally, leaked: Tally) -> None:
+    """A line for every class of things that hides: what it hides, and what leaks through it."""
+    print(f"\n{'hidden by':<22}{'samples':>10}{'leaked':>9}{'leak %':>8}{'of all leaks %':>16}")
+    for c in CLASSES:
+        if hidden[c.code]:
+            leak, part = 100 * leaked[c.code] / hidden[c.code], 100 * leaked[c.code] / max(1, leaked.sum())
+            print(f"{c.name:<22}{hidden[c.code]:>10,}{leaked[c.code]:>9,}{leak:>8.2f}{part:>16.1f}")
+
+
+if __name__ == "__main__":
+    main()

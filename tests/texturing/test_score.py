@@ -1,0 +1,98 @@
+"""The step `score` on a made-up street corner: what it tells of held-out photos and of the truth."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.io import image, las
+from pipeline.render import look_at
+from pipeline.step import silent
+from pipeline.types import Frame, PointCloud
+from tests.texturing.corner import CAMERAS, POSES, Street, paint, points
+from texturing.score import ScoreParams, score
+
+
+def inputs_of(street):
+    """Texture the street and give what the step reads."""
+    street.texel = 0.04
+    folder, _ = street.run()
+    return {"terrain": folder, "views": folder.parent / "views.json", "depth": folder.parent / "depth"}
+
+
+@pytest.fixture(scope="module")
+def textured(tmp_path_factory):
+    """What the step reads of a textured street of which the second of four photos is held out."""
+    street = Street(tmp_path_factory.mktemp("street"))
+    for pose in POSES:
+        street.add(CAMERAS["pinhole"], pose)
+    street.held_out = (False, True, False, False)
+    street.clouds["terrain"] = points()
+    return inputs_of(street)
+
+
+@pytest.fixture(scope="module")
+def scored(textured, tmp_path_factory):
+    """What the step says of it."""
+    return score(textured, ScoreParams(), tmp_path_factory.mktemp("score"), silent)
+
+
+def strict(facts):
+    """The facts as JSON keeps them, which knows no NaN."""
+    return json.loads(json.dumps(facts, allow_nan=False))
+
+
+def test_a_held_out_photo_is_told_by_class_and_by_distance(scored):
+    facts = strict(scored.facts)
+    assert facts["held_out"] == 1 and list(facts["photos"]) == ["photo1"]
+    assert facts["psnr_db"] > 28 and facts["ssim"] > 0.85 and 0.7 < facts["sharpness"] < 1.1
+    assert facts["photos"]["photo1"]["psnr_db"] == facts["psnr_db"] == facts["by_class"]["terrain"]["psnr_db"]
+    bands = facts["by_distance"]
+    assert list(bands) == ["0-5 m", "5-10 m", "10-20 m", "20-40 m", "40+ m"]
+    assert sum(band["pixels"] for band in bands.values()) == facts["by_class"]["terrain"]["pixels"] > 10_000
+    assert bands["0-5 m"]["psnr_gain_db"] > 25
+    assert bands["40+ m"] == {"psnr_db": None, "psnr_gain_db": None, "ssim": None, "pixels": 0}
+    assert not scored.warnings
+
+
+def test_every_held_out_photo_has_its_error_picture(scored):
+    folder = scored.files["error"]
+    (entry,) = json.loads((folder / "index.json").read_text())
+    assert (entry["role"], entry["title"]) == ("error", "photo1") and "dB" in entry["caption"]
+    picture = image.read_rgb(folder / entry["file"])
+    assert picture is not None and picture.shape[1] <= 1600
+
+
+def test_without_held_out_photos_figures_are_none(street, tmp_path):
+    street.add(CAMERAS["pinhole"], POSES[0])
+    done = score(inputs_of(street), ScoreParams(), tmp_path, silent)
+    facts = strict(done.facts)
+    assert facts["held_out"] == 0 and facts["psnr_db"] is None and facts["sharpness"] is None
+    assert json.loads((done.files["error"] / "index.json").read_text()) == []
+
+
+def test_held_out_photos_that_cannot_be_scored_are_named(street, tmp_path):
+    away = look_at((-4, 0, 1.8), (-9, 0, 4))  # at the sky
+    for pose in (POSES[0], POSES[1], away):
+        street.add(CAMERAS["pinhole"], pose)
+    street.held_out = (False, True, True)
+    inputs = inputs_of(street)
+    Path(street.views[1].photo).write_bytes(b"no photo")
+    done = score(inputs, ScoreParams(), tmp_path, silent)
+    assert strict(done.facts)["held_out"] == 0
+    assert len(done.warnings) == 2
+    assert "photo2" in done.warnings[0] and "shows nothing" in done.warnings[0]
+    assert "photo1.png" in done.warnings[1] and "can't be read" in done.warnings[1]
+
+
+def test_what_photos_saw_from_near_is_held_against_the_truth_apart(textured, tmp_path):
+    """The truth is made wrong beyond 5 m of every photo that was not held out."""
+    truth = points()
+    eyes = np.array([pose[:3, 3] for i, pose in enumerate(POSES) if i != 1])
+    near = np.linalg.norm(truth.xyz[:, None] - eyes, axis=2).min(axis=1) <= 5
+    rgb = np.where(near[:, None], np.clip(paint(truth.xyz), 0, 255), 255).astype(np.uint8)
+    las.write(tmp_path / "truth.laz", PointCloud(Frame(), truth.xyz, rgb))
+    inputs = {**textured, "truth.points": tmp_path / "truth.laz"}
+    facts = strict(score(inputs, ScoreParams(near=4.9), tmp_path, silent).facts)
+    assert facts["truth_psnr_near_db"] > 28 > 20 > facts["truth_psnr_db"]

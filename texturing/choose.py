@@ -1,0 +1,130 @@
+"""Choose: which photos colour a face, and which one gives its detail.
+
+Candidates are the best few that see a face; the one for the detail comes from a Markov random field over the
+faces (`texturing.labels`), so that neighbours share a photo where it costs little.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pydantic import Field
+
+from pipeline.step import Done, Inputs, Params, Report, Step
+
+if TYPE_CHECKING:
+    from pipeline.types import F32, I32, U8, Mesh, View
+    from pipeline.visibility import DepthMap
+
+
+class ChooseParams(Params):
+    """How photos are chosen.
+
+    Attributes:
+        views_per_face: photos that a triangle's low frequencies are blended from, at most.
+        smoothness: price of a seam against a photo's quality; 0: each triangle its own best photo.
+        max_distance: metres beyond which a photo is not used.
+        min_cos: of the angle between surface normal and ray, below which a photo is not used.
+        bias: metres that a surface may lie behind what the depth map shows and still count as seen.
+    """
+
+    views_per_face: int = Field(8, ge=1, le=32)
+    smoothness: float = Field(0.3, ge=0)
+    max_distance: float = Field(100.0, gt=0)
+    min_cos: float = Field(0.02, ge=0, lt=1)
+    bias: float = Field(0.04, ge=0)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Photos of faces.
+
+    Attributes:
+        view: (F, K) int32 candidates, best first, -1 where fewer see the face.
+        quality: (F, K) float32 of each, 1/m2 (cos / distance^2, where seen); 0 where there is none.
+        label: (F,) int32, the view that gives the detail, -1 where none sees the face.
+    """
+
+    view: I32
+    quality: F32
+    label: I32
+
+    def save(self, path: Path) -> None:
+        """Write as .npz."""
+        import numpy as np
+
+        np.savez(path, view=self.view, quality=self.quality, label=self.label)
+
+    @classmethod
+    def load(cls, path: Path) -> Choice:
+        """Read what `save` wrote."""
+        import numpy as np
+
+        with np.load(path) as data:
+            return cls(data["view"], data["quality"], data["label"])
+
+
+def choose(inputs: Inputs, params: ChooseParams, out: Path, report: Report) -> Done:
+    """Choose the photos of every face of `mesh`.
+
+    Inputs: `mesh`, `views`, `depth` (folder of depth maps), `agreement` (which views may be used, and where).
+    File: `choice`, a `Choice`.
+    """
+    from pipeline.io import views as views_io
+    from pipeline.types import Mesh
+    from pipeline.visibility import load_depth_map
+    from texturing.agreement import Agreement
+
+    mesh = Mesh.load(inputs["mesh"])
+    views = views_io.load(inputs["views"])
+    agreement = Agreement.load(inputs["agreement"])
+
+    def depth(i: int) -> DepthMap:
+        return load_depth_map(inputs["depth"] / f"{i}.npy", views[i].camera, views[i].T_world_cam)
+
+    usable = [i for i in range(len(views)) if agreement.usable[i]]
+    choice, seams = choose_views(mesh, views, usable, depth, agreement.mask, agreement.sharpness, params, report)
+    choice.save(out / "choice.npz")
+    seen = float((choice.label >= 0).mean()) if len(mesh) else 0.0
+    return Done({"choice": out / "choice.npz"}, {"faces": len(mesh), "seen": round(seen, 4), "seam_share": seams})
+
+
+def choose_views(
+    mesh: Mesh,
+    views: Any,
+    usable: list[int],
+    depth: Callable[[int], DepthMap],
+    mask: Callable[[int, View], U8],
+    sharpness: Callable[[int], float],
+    params: ChooseParams,
+    report: Report,
+) -> tuple[Choice, float]:
+    """The choice for all faces, and the share of the edges' length that is a seam."""
+    import numpy as np
+
+    from texturing.labels import adjacent, label
+    from texturing.select import Candidates
+
+    best = Candidates(mesh.corners, mesh.face_normal, params.views_per_face)
+    for done, i in enumerate(usable):
+        report(0.7 * done / len(usable), views[i].name)
+        best.offer(
+            i, depth(i), bias=params.bias, max_distance=params.max_distance, min_cos=params.min_cos,
+            mask=mask(i, views[i]), factor=sharpness(i),
+        )  # fmt: skip
+    report(0.7, "seams")
+    pairs, edge = adjacent(mesh.faces)
+    length = np.linalg.norm(mesh.vertices[edge[:, 0]] - mesh.vertices[edge[:, 1]], axis=1)
+    price = (params.smoothness * length / max(float(np.median(length)) if len(length) else 1.0, 1e-9)).astype(
+        np.float32
+    )
+    chosen = label(best.view, best.quality, pairs, np.minimum(price, 4 * params.smoothness).astype(np.float32))
+    apart = (chosen[pairs[:, 0]] != chosen[pairs[:, 1]]) & (chosen[pairs] >= 0).all(axis=1)
+    share = float(length[apart].sum() / max(float(length.sum()), 1e-9))
+    return Choice(best.view, best.quality, chosen), round(share, 4)
+
+
+CHOOSE = Step("choose", 1, choose, ChooseParams)

@@ -1,0 +1,247 @@
+"""What the other photos say a photo should show: each is predicted from those around it. Import late: loads numba.
+
+Through the depth map, every pixel of a photo is a place on the surface; the others that see that place tell
+its colour. Where a photo disagrees with what the others agree on, something stood there that is no part of the
+street (a ghost), or its pose is off.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit, prange
+
+from pipeline.cameras import EQUIRECTANGULAR, MODEL_ID, parameters, pixel_angle, pixel_rays, project_point
+from pipeline.range_image import is_visible
+from pipeline.types import F32, F64, U8, Camera
+from pipeline.visibility import DepthMap
+from texturing.blend import corrected, mask_allows, sample, vignette
+from texturing.photos import Photo
+
+ALIKE = 28.0
+"""Grey levels within which photos agree on a colour."""
+
+
+@dataclass(frozen=True)
+class Surface:
+    """What a view's pixels show.
+
+    Attributes:
+        camera: the view's, scaled to the prediction's size.
+        T_world_cam: (4, 4).
+        points, normals: (H, W, 3) float32 in camera axes; points NaN where there is no surface.
+    """
+
+    camera: Camera
+    T_world_cam: F64
+    points: F32
+    normals: F32
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """A photo as the others show it.
+
+    Attributes:
+        rgb: (H, W, 3) float32, corrected exposure.
+        support: (H, W) uint8, photos that agree on it.
+        others: (H, W) uint8, photos that see the place.
+    """
+
+    rgb: F32
+    support: U8
+    others: U8
+
+
+def surface(camera: Camera, depth: DepthMap) -> Surface:
+    """The surface that a camera (the view's, scaled to the size wanted) sees, from the view's depth map."""
+    rays = pixel_rays(camera)
+    rows = np.clip(np.round((np.arange(camera.height) + 0.5) * depth.camera.height / camera.height - 0.5), 0, None)
+    columns = np.clip(np.round((np.arange(camera.width) + 0.5) * depth.camera.width / camera.width - 0.5), 0, None)
+    ranges = depth.range[np.ix_(rows.astype(int), columns.astype(int))]
+    points = rays * np.where(np.isfinite(ranges), ranges, np.nan).astype(np.float32)[..., None]
+    return Surface(camera, depth.T_world_cam, points, _normals(points))
+
+
+class Predictor:
+    """Collects what other photos show of a surface.
+
+    Args:
+        surface: of the view that is predicted.
+        count: photos that will be asked.
+        max_distance, min_cos, bias: as for texturing.
+    """
+
+    def __init__(self, surface: Surface, count: int, *, max_distance: float, min_cos: float, bias: float) -> None:
+        h, w = surface.points.shape[:2]
+        self._surface = surface
+        self._rgb = np.zeros((count, h, w, 3), np.uint8)
+        self._weight = np.zeros((count, h, w), np.float32)
+        self._limits = (max_distance, min_cos, bias)
+        self._asked = 0
+
+    def ask(self, photo: Photo, camera: Camera, T_world_cam: F64, depth: DepthMap, exposure: F64) -> None:
+        """Add what one photo shows; `exposure` (5,) of `Exposures.of`."""
+        s, (max_distance, min_cos, bias) = self._surface, self._limits
+        T = np.linalg.inv(T_world_cam) @ s.T_world_cam
+        _look(
+            self._rgb[self._asked], self._weight[self._asked], s.points, s.normals, np.ascontiguousarray(T),
+            photo.levels, photo.mask, MODEL_ID[camera.model], parameters(camera), depth.range,
+            parameters(depth.camera), pixel_angle(depth.camera), pixel_angle(camera), pixel_angle(s.camera),
+            exposure, max_distance, min_cos, bias,
+        )  # fmt: skip
+        self._asked += 1
+
+    def result(self) -> Prediction:
+        """What those asked agree on."""
+        h, w = self._weight.shape[1:]
+        rgb = np.zeros((h, w, 3), np.float32)
+        support, others = np.zeros((h, w), np.uint8), np.zeros((h, w), np.uint8)
+        _agree(self._rgb[: self._asked], self._weight[: self._asked], rgb, support, others, ALIKE)
+        return Prediction(rgb, support, others)
+
+
+@njit(cache=True, parallel=True)
+def _normals(points):  # type: ignore[no-untyped-def]
+    """(H, W, 3) unit normals towards the camera, from each pixel's nearer neighbours; along the ray at borders."""
+    height, width = points.shape[:2]
+    out = np.zeros((height, width, 3), np.float32)
+    for v in prange(height):
+        a, b = np.zeros(3), np.zeros(3)
+        for u in range(width):
+            p = points[v, u]
+            r2 = p[0] * p[0] + p[1] * p[1] + p[2] * p[2]
+            if not r2 > 0:
+                continue
+            least_a = least_b = 1e9
+            for step in (-1, 1):
+                if 0 <= u + step < width:
+                    q = points[v, u + step]
+                    d = (q[0] - p[0]) ** 2 + (q[1] - p[1]) ** 2 + (q[2] - p[2]) ** 2
+                    if d < least_a:
+                        least_a = d
+                        for k in range(3):
+                            a[k] = (q[k] - p[k]) * step
+                if 0 <= v + step < height:
+                    q = points[v + step, u]
+                    d = (q[0] - p[0]) ** 2 + (q[1] - p[1]) ** 2 + (q[2] - p[2]) ** 2
+                    if d < least_b:
+                        least_b = d
+                        for k in range(3):
+                            b[k] = (q[k] - p[k]) * step
+            nx, ny, nz = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+            n = math.sqrt(nx * nx + ny * ny + nz * nz)
+            if least_a > 1e8 or least_b > 1e8 or n < 1e-12:
+                r = math.sqrt(r2)
+                out[v, u, 0], out[v, u, 1], out[v, u, 2] = -p[0] / r, -p[1] / r, -p[2] / r
+                continue
+            if nx * p[0] + ny * p[1] + nz * p[2] > 0:
+                n = -n
+            out[v, u, 0], out[v, u, 1], out[v, u, 2] = nx / n, ny / n, nz / n
+    return out
+
+
+@njit(cache=True, parallel=True)
+def _look(  # type: ignore[no-untyped-def]
+    rgb, weight, points, normals, T, photo, mask, model, p, depth, depth_p, depth_pixel, pixel, own_pixel,
+    exposure, max_distance, min_cos, bias,
+):  # fmt: skip
+    height, width = weight.shape
+    wide = model == EQUIRECTANGULAR
+    factors = (math.exp(exposure[0]), math.exp(exposure[1]), math.exp(exposure[2]))
+    for row in prange(height):
+        for column in range(width):
+            a, n = points[row, column], normals[row, column]
+            r2 = a[0] * a[0] + a[1] * a[1] + a[2] * a[2]
+            if not 0.01 < r2 < max_distance * max_distance:
+                continue
+            x = T[0, 0] * a[0] + T[0, 1] * a[1] + T[0, 2] * a[2] + T[0, 3]
+            y = T[1, 0] * a[0] + T[1, 1] * a[1] + T[1, 2] * a[2] + T[1, 3]
+            z = T[2, 0] * a[0] + T[2, 1] * a[1] + T[2, 2] * a[2] + T[2, 3]
+            d2 = x * x + y * y + z * z
+            if not 0.01 < d2 < max_distance * max_distance:
+                continue
+            u, v, ok = project_point(model, p, x, y, z)
+            if not ok or v < -0.5 or v >= p[13] - 0.5 or ((u < -0.5 or u >= p[12] - 0.5) and not wide):
+                continue
+            nx = T[0, 0] * n[0] + T[0, 1] * n[1] + T[0, 2] * n[2]
+            ny = T[1, 0] * n[0] + T[1, 1] * n[1] + T[1, 2] * n[2]
+            nz = T[2, 0] * n[0] + T[2, 1] * n[1] + T[2, 2] * n[2]
+            distance = math.sqrt(d2)
+            cos = -(x * nx + y * ny + z * nz) / distance
+            if cos < min_cos or not mask_allows(mask, u, v, p):
+                continue
+            if not is_visible(depth, model, depth_p, depth_pixel, bias, x, y, z, nx, ny, nz):
+                continue
+            ratio = math.sqrt(r2) * own_pixel / (distance * pixel)
+            share = min(ratio, 1.0)
+            level = 0
+            while level + 1 < len(photo) and ratio >= 1.6:
+                ratio *= 0.5
+                level += 1
+            scale = 0.5**level
+            r, g, b = sample(photo[level], (u + 0.5) * scale - 0.5, (v + 0.5) * scale - 0.5, wide)
+            fall = vignette(exposure, p, u, v)
+            rgb[row, column, 0] = min(255.0, max(0.0, corrected(r, factors[0] * fall) + 0.5))
+            rgb[row, column, 1] = min(255.0, max(0.0, corrected(g, factors[1] * fall) + 0.5))
+            rgb[row, column, 2] = min(255.0, max(0.0, corrected(b, factors[2] * fall) + 0.5))
+            weight[row, column] = cos * share * share + 1e-3
+
+
+@njit(cache=True, parallel=True)
+def _agree(rgb, weight, out, support, others, alike):  # type: ignore[no-untyped-def]
+    """The mean of those that are alike the sample which most are alike to."""
+    count, height, width = weight.shape
+    for row in prange(height):
+        for column in range(width):
+            best, least, seen = -1, 1e30, 0
+            for i in range(count):
+                if weight[i, row, column] == 0:
+                    continue
+                seen += 1
+                total = 0.0
+                for j in range(count):
+                    if j != i and weight[j, row, column] > 0:
+                        total += weight[j, row, column] * min(alike, _apart(rgb[i, row, column], rgb[j, row, column]))
+                total -= weight[i, row, column] * alike  # of two that are alone, the better
+                if total < least:
+                    best, least = i, total
+            others[row, column] = seen
+            if best < 0:
+                continue
+            w = 0.0
+            for i in range(count):
+                if weight[i, row, column] > 0:
+                    d = _apart(rgb[best, row, column], rgb[i, row, column])
+                    if d < alike:
+                        support[row, column] += 1
+                        w += weight[i, row, column]
+                        for k in range(3):
+                            out[row, column, k] += weight[i, row, column] * rgb[i, row, column, k]
+            for k in range(3):
+                out[row, column, k] /= w
+
+
+@njit(cache=True, inline="always")
+def _apart(a, b):  # type: ignore[no-untyped-def]
+    """How far two colours are apart: the mean over channels, grey levels."""
+    return (
+        abs(np.float32(a[0]) - np.float32(b[0]))
+        + abs(np.float32(a[1]) - np.float32(b[1]))
+        + abs(np.float32(a[2]) - np.float32(b[2]))
+    ) / 3.0
+
+
+def corrected_photo(photo: npt.NDArray[np.uint8], camera: Camera, exposure: F64) -> F32:
+    """The photo (H, W, 3), of a camera scaled to it, with its exposure corrected; (H, W, 3) float32, unclipped."""
+    from texturing.photos import OFFSET
+
+    v, u = np.mgrid[: camera.height, : camera.width].astype(np.float32)
+    cx, cy = (camera.width - 1) / 2, (camera.height - 1) / 2
+    q = ((u - cx) ** 2 + (v - cy) ** 2) / (cx * cx + cy * cy)
+    fall = exposure[3] * q + exposure[4] * q * q
+    factor = np.exp(fall[..., None] + exposure[:3]).astype(np.float32)
+    return (photo.astype(np.float32) + np.float32(OFFSET)) * factor - np.float32(OFFSET)
