@@ -38,6 +38,8 @@ SLACK = 2
 """Pixels (of the compared size) by which edges may be displaced and still agree."""
 SPECK = 60
 """Pixels of the smallest ghost."""
+HAUNTED = 0.25
+"""Share of a photo beyond which what disagrees is no ghost: the photo as a whole is displaced."""
 WHITE = 250
 """Grey level from which a pixel counts as overexposed."""
 SHARP = 0.6
@@ -247,9 +249,10 @@ def compare(
     if sure.sum() < 2000:
         return Compared(figures)
     mine = np.clip(corrected_photo(own, small, exposures.of(views[i])), 0, 255).astype(np.float32)
-    ghosts = ghost_mask(mine, predicted, own.max(axis=2) >= WHITE)
+    ghosts = ghost_mask(mine, predicted, own >= WHITE)
     figures["ghost_share"] = round(float(ghosts.mean()), 4)
-    told, warp = _shift(mine, predicted, sure & ~ghosts, camera.width / small.width)
+    displaced = ghosts[sure].mean() > HAUNTED
+    told, warp = _shift(mine, predicted, sure if displaced else sure & ~ghosts, camera.width / small.width)
     return Compared(figures | told, ghosts, warp)
 
 
@@ -307,7 +310,7 @@ def ghost_mask(mine: F32, predicted: Prediction, white: npt.NDArray[np.bool_]) -
     Args:
         mine: the photo (h, w, 3), exposure corrected.
         predicted: what the others show.
-        white: where it is overexposed, and can't tell.
+        white: (h, w, 3) where it is overexposed: as bright as it shows, or brighter.
     """
     import cv2
     import numpy as np
@@ -316,8 +319,9 @@ def ghost_mask(mine: F32, predicted: Prediction, white: npt.NDArray[np.bool_]) -
     theirs = np.where(sure[..., None], predicted.rgb, mine)
     a, b = cv2.blur(mine, (3, 3)), cv2.blur(theirs, (3, 3))
     kernel = np.ones((2 * SLACK + 1, 2 * SLACK + 1))
-    apart = np.maximum(a - cv2.dilate(b, kernel), cv2.erode(b, kernel) - a).max(axis=2)
-    apart[~sure | white] = 0
+    darker = np.where(white, 0, cv2.erode(b, kernel) - a)
+    apart = np.maximum(a - cv2.dilate(b, kernel), darker).max(axis=2)
+    apart[~sure] = 0
     seeds = cv2.morphologyEx((apart > SEED).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3)))
     grown = cv2.morphologyEx((apart > GROWN).astype(np.uint8) | seeds, cv2.MORPH_CLOSE, np.ones((7, 7)))
     n, label, stats, _ = cv2.connectedComponentsWithStats(grown, connectivity=8)

@@ -21,6 +21,8 @@ COARSE = 4
 """xatlas packs in steps of this many texels at most: its search for places slows with their number."""
 CHART = 30_000
 """xatlas' charts are at most this many texels: growing one takes the square of its faces."""
+FINEST = 0.01
+"""Metres of a texel; wider ones don't make charts larger, for the same reason."""
 
 
 @dataclass(frozen=True)
@@ -142,7 +144,7 @@ def _xatlas(vertices: F32, faces: I32, texel: float, gutter: int) -> Chartered:
     atlas = xatlas.Atlas()
     atlas.add_mesh(np.ascontiguousarray(vertices), np.ascontiguousarray(faces, dtype=np.uint32))
     chart, pack = xatlas.ChartOptions(), xatlas.PackOptions()
-    chart.max_chart_area = CHART * texel**2
+    chart.max_chart_area = CHART * min(texel, FINEST) ** 2
     coarse = min(COARSE, gutter)
     pack.padding, pack.texels_per_unit = math.ceil(gutter / coarse), 1.0 / (coarse * texel)
     atlas.generate(chart, pack)

@@ -131,7 +131,7 @@ def test_plan_says_what_a_setting_changes(street: Path, world: Path) -> None:
     )
     again = {line.split()[0] for line in text.splitlines() if " yes " in line}
     assert "trim.building" in again and "texture.terrain" in again  # buildings hide what is behind them
-    assert not again & {"ingest", "poisson.building", "trim.terrain", "unwrap.terrain"}
+    assert not again & {"ingest", "poisson.building", "trim.terrain", "decimate.terrain"}
 
 
 def test_inspect_tells_of_cloud_tile_mesh_and_world(street: Path, world: Path) -> None:

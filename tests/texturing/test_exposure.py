@@ -1,0 +1,102 @@
+"""Exposures solved jointly, against those that photos were taken with."""
+
+import numpy as np
+import pytest
+
+from pipeline.errors import InputError
+from pipeline.io import views as views_io
+from pipeline.step import silent
+from pipeline.visibility import depth_map, scene
+from tests.texturing.corner import CAMERAS, POSES, photograph
+from texturing.exposure import ExposureParams, exposure
+from texturing.photos import Exposures, camera_of
+
+STOPS = [0.5, -0.7, 0.2, 0.0]
+
+
+def exposed(image, stops, tint=(0, 0, 0), corners=0.0):
+    """A photo with its light times 2^stops (channels: times 2^tint), and 2^-corners times that in its corners."""
+    x = image / 255.0
+    light = np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
+    v, u = np.mgrid[-1 : 1 : image.shape[0] * 1j, -1 : 1 : image.shape[1] * 1j]
+    q = (u * u * image.shape[1] ** 2 + v * v * image.shape[0] ** 2) / (image.shape[1] ** 2 + image.shape[0] ** 2)
+    light = light * 2.0 ** (stops + np.asarray(tint) - corners * q[..., None])
+    x = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.clip(light, 1e-9, None) ** (1 / 2.4) - 0.055)
+    return np.clip(np.round(255 * x), 0, 255).astype(np.uint8)
+
+
+def solved(street, out, prior=None, **params):
+    """Run the step; the exposures it found, and its facts."""
+    hides = scene(street.occluders)
+    (out / "depth").mkdir(parents=True)
+    for i, view in enumerate(street.views):
+        np.save(out / "depth" / f"{i}.npy", depth_map(view.camera, view.T_world_cam, hides).range)
+    views_io.save(out / "views.json", street.views, street.held_out)
+    inputs = {"views": out / "views.json", "depth": out / "depth"}
+    if prior is not None:
+        inputs["prior"] = prior
+    done = exposure(inputs, ExposureParams(**params), out, silent)
+    return Exposures.load(done.files["exposures"]), done.facts
+
+
+@pytest.fixture
+def taken(street):
+    """Four photos of different exposure, one of them bluish."""
+    for pose, stops in zip(POSES, STOPS, strict=True):
+        tint = (-0.1, 0, 0.1) if stops == 0.2 else (0, 0, 0)
+        street.add(CAMERAS["pinhole"], pose, exposed(photograph(CAMERAS["pinhole"], pose), stops - 0.5, tint))
+    return street
+
+
+def stops_of(exposures, street):
+    return np.array([np.log2(exposures.gain[view.name]) for view in street.views])
+
+
+def test_exposures_and_tints_are_found(taken, tmp_path):
+    found, facts = solved(taken, tmp_path / "x")
+    relative = stops_of(found, taken)
+    relative -= relative.mean()
+    true = -np.array([[s] * 3 for s in STOPS])
+    true[2] += (0.1, 0, -0.1)
+    np.testing.assert_allclose(relative, true - true.mean(), atol=0.08)
+    assert facts["disagreement_after"] < 0.3 * facts["disagreement_before"]
+
+
+def test_the_whole_stays_as_bright_as_the_photos_are(taken, tmp_path):
+    found, _ = solved(taken, tmp_path / "x")
+    assert abs(stops_of(found, taken).mean()) < 0.05
+
+
+def test_what_an_earlier_tile_found_stays(taken, tmp_path):
+    first, _ = solved(taken, tmp_path / "x")
+    brighter = Exposures({taken.views[1].name: tuple(2 * g for g in first.gain[taken.views[1].name])}, {})
+    brighter.save(tmp_path / "prior.json")
+    found, _ = solved(taken, tmp_path / "y", tmp_path / "prior.json")
+    np.testing.assert_allclose(stops_of(found, taken), stops_of(first, taken) + 1, atol=0.1)
+
+
+def test_vignetting_is_found_where_there_is_some(street, tmp_path):
+    for pose in POSES:
+        street.add(CAMERAS["pinhole"], pose, exposed(photograph(CAMERAS["pinhole"], pose), -0.2, corners=0.8))
+    found, _ = solved(street, tmp_path / "x")
+    a, b = found.vignetting[camera_of(street.views[0])]
+    assert (a + b) / np.log(2) == pytest.approx(0.8, abs=0.25)
+
+
+def test_photos_alike_are_left_alone(street, tmp_path):
+    for pose in POSES:
+        street.add(CAMERAS["pinhole"], pose)
+    found, _ = solved(street, tmp_path / "x")
+    assert np.abs(stops_of(found, street)).max() < 0.02 and not found.vignetting
+
+
+def test_switched_off_or_alone_nothing_changes(taken, tmp_path):
+    assert not solved(taken, tmp_path / "x", solve=False)[0].gain
+    taken.views = taken.views[:1]
+    assert not solved(taken, tmp_path / "y")[0].gain
+
+
+def test_no_exposure_file_is_refused_by_name(tmp_path):
+    (tmp_path / "prior.json").write_text('{"gain": {"a": [1, 1]}}')
+    with pytest.raises(InputError, match=r"prior\.json"):
+        Exposures.load(tmp_path / "prior.json")

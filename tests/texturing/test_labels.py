@@ -1,0 +1,54 @@
+"""The choice of one photo a face, against exhaustive search."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from texturing.labels import adjacent, label
+
+
+def energy(labels, view, cost, pairs, price):
+    """What a labelling costs: photos worse than the best, and seams."""
+    own = sum(cost[i, list(view[i]).index(labels[i])] for i in range(len(labels)))
+    return own + sum(price[k] for k, (a, b) in enumerate(pairs) if labels[a] != labels[b])
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_no_labelling_is_much_better(seed):
+    rng = np.random.default_rng(seed)
+    view = np.array([rng.choice(4, 3, replace=False) for _ in range(7)], np.int32)
+    quality = (rng.random((7, 3)) + 0.01).astype(np.float32)
+    pairs = np.array([(i, i + 1) for i in range(6)] + [(0, 3), (2, 6)], np.int32)
+    price = (0.5 * rng.random(len(pairs))).astype(np.float32)
+    cost = 1 - np.sqrt(quality / quality.max(axis=1, keepdims=True))
+    found = energy(label(view, quality, pairs, price), view, cost, pairs, price)
+    best = min(energy(x, view, cost, pairs, price) for x in itertools.product(*view))
+    assert found <= 1.15 * best + 1e-6
+
+
+def test_seams_that_cost_are_fewer():
+    rng = np.random.default_rng(0)
+    n = 400
+    view = np.tile(np.int32([0, 1]), (n, 1))
+    quality = (1 + 0.3 * rng.random((n, 2))).astype(np.float32)
+    pairs = np.column_stack([np.arange(n - 1), np.arange(1, n)]).astype(np.int32)
+
+    def seams(price):
+        labels = label(view, quality, pairs, np.full(n - 1, price, np.float32))
+        return (labels[1:] != labels[:-1]).sum()
+
+    assert seams(0.0) > 100 and seams(0.02) < seams(0.0) / 2 and seams(10.0) == 0
+
+
+def test_unseen_faces_have_no_photo_and_bind_nobody():
+    view = np.int32([[0, 1], [-1, -1], [1, -1]])
+    quality = np.float32([[1, 0.9], [0, 0], [1, 0]])
+    pairs = np.int32([[0, 1], [1, 2]])
+    assert label(view, quality, pairs, np.float32([9, 9])).tolist() == [0, -1, 1]
+
+
+def test_neighbours_share_an_edge():
+    pairs, edge = adjacent(np.int32([[0, 1, 2], [2, 1, 3], [3, 1, 4]]))
+    assert sorted(map(tuple, pairs.tolist())) == [(0, 1), (1, 2)]
+    assert {tuple(sorted(e)) for e in edge.tolist()} == {(1, 2), (1, 3)}

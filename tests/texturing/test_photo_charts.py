@@ -1,0 +1,66 @@
+"""Charts cut out of photos: metric, without overlaps, on pages of the size asked for."""
+
+import numpy as np
+
+from pipeline.types import Mesh
+from tests.texturing.corner import BOX, GROUND, join
+from texturing import photo_charts
+
+CENTRES = np.array([[-4.0, -2.0, 1.8], [-4.0, 2.0, 1.8]])
+
+
+def both():
+    """Ground and box as one mesh; its left half belongs to the first camera, its right half to the second."""
+    mesh = join((GROUND.vertices, GROUND.faces), (BOX.vertices, BOX.faces))
+    middle = mesh.corners.mean(axis=1)
+    label = (middle[:, 1] > 0).astype(np.int32)
+    towards = CENTRES[label] - middle
+    label[np.einsum("ij,ij->i", towards, mesh.face_normal) <= 0] = -1
+    return mesh, label
+
+
+def test_charts_are_metric_and_seen_faces_are_laid():
+    mesh, label = both()
+    charts = photo_charts.cut(mesh, label, CENTRES, 0.02, 2000)
+    assert len(charts.face) > 0.95 * (label >= 0).sum()
+    a, b = charts.flat[:, 1] - charts.flat[:, 0], charts.flat[:, 2] - charts.flat[:, 0]
+    drawn = (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2 * 0.02**2
+    assert (drawn > 0).all()
+    np.testing.assert_allclose(drawn.sum(), mesh.face_area[charts.face].sum(), rtol=0.02)
+    assert (charts.flat >= 0).all() and (charts.flat.max(axis=1) <= charts.size[charts.chart]).all()
+    assert (label[charts.face] >= 0).all()
+
+
+def test_a_chart_belongs_to_one_photo():
+    mesh, label = both()
+    charts = photo_charts.cut(mesh, label, CENTRES, 0.02, 2000)
+    for k in np.unique(charts.chart):
+        assert len(np.unique(label[charts.face[charts.chart == k]])) == 1
+
+
+def test_rectangles_never_meet_and_stay_on_their_page():
+    rng = np.random.default_rng(0)
+    size = rng.integers(1, 90, (300, 2))
+    place, page, pages = photo_charts.pack(size, 256, 3)
+    assert len(pages) > 1 and all(w <= 256 and h <= 256 for w, h in pages)
+    for k, (width, height) in enumerate(pages):
+        taken = np.zeros((height, width), int)
+        for i in np.flatnonzero(page == k):
+            (x, y), (w, h) = place[i], size[i]
+            assert x >= 3 and y >= 3 and x + w + 3 <= width and y + h + 3 <= height
+            taken[y - 3 : y + h + 3, x - 3 : x + w + 3] += 1
+        assert taken.max() <= 2  # two gutters may share their room's border, no more
+        assert (place[page == k] >= 0).all()
+
+
+def test_faces_under_others_are_told():
+    flat = np.float32([[[0, 0], [20, 0], [0, 20]], [[0, 0], [20, 0], [0, 20]], [[30, 30], [50, 30], [30, 50]]])
+    covered = photo_charts.overlapping(flat, np.zeros(3, int), [(64, 64)])
+    assert covered.tolist() == [False, True, False]
+
+
+def test_no_seen_face_no_chart():
+    mesh, label = both()
+    charts = photo_charts.cut(mesh, np.full_like(label, -1), CENTRES, 0.02, 2000)
+    assert len(charts.face) == 0 and photo_charts.pack(charts.size, 256, 3)[2] == []
+    assert isinstance(mesh, Mesh)
