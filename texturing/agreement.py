@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from texturing.photos import Exposures, Photos
     from texturing.predict import Prediction
 
-PIXELS = 450_000
+PIXELS = 250_000
 """Photos are compared at this size at most."""
 SAMPLES = 300
 MAX_WARP, SMOOTH, FAINT = 5.0, 5.0, 8.0
@@ -242,7 +242,7 @@ def compare(
         if other is not None:
             predictor.ask(other, views[j].camera, views[j].T_world_cam, depth(j), exposures.of(views[j]))
     there = np.isfinite(shows.points[..., 0])
-    burnt = float((own[there].min(axis=1) >= WHITE).mean()) if there.any() else 0.0
+    burnt = float(np.all(own[there] >= WHITE, axis=1).mean()) if there.any() else 0.0
     figures: dict[str, Any] = {"overexposed": round(burnt, 3)}
     predicted = predictor.result()
     sure = predicted.support >= 2
@@ -320,7 +320,8 @@ def ghost_mask(mine: F32, predicted: Prediction, white: npt.NDArray[np.bool_]) -
     a, b = cv2.blur(mine, (3, 3)), cv2.blur(theirs, (3, 3))
     kernel = np.ones((2 * SLACK + 1, 2 * SLACK + 1))
     darker = np.where(white, 0, cv2.erode(b, kernel) - a)
-    apart = np.maximum(a - cv2.dilate(b, kernel), darker).max(axis=2)
+    channels = cv2.split(np.maximum(a - cv2.dilate(b, kernel), darker))
+    apart = cv2.max(cv2.max(channels[0], channels[1]), channels[2])
     apart[~sure] = 0
     seeds = cv2.morphologyEx((apart > SEED).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3)))
     grown = cv2.morphologyEx((apart > GROWN).astype(np.uint8) | seeds, cv2.MORPH_CLOSE, np.ones((7, 7)))

@@ -98,15 +98,24 @@ def pad(rgb: U8, seen: U8, reach: int) -> None:
     distance, label = cv2.distanceTransformWithLabels(
         (~painted).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
     )
-    nearest = np.zeros(int(label.max()) + 1, np.int64)
-    at = np.flatnonzero(painted)
-    nearest[label.ravel()[at]] = at
-    flat = rgb.reshape(-1, 3)
-    mean = flat[at[:: max(1, len(at) // 100_000)]].mean(axis=0)
-    near = np.flatnonzero(~painted.ravel() & (distance.ravel() <= reach))
-    beyond = np.flatnonzero(distance.ravel() > reach)
-    flat[near] = flat[nearest[label.ravel()[near]]]
-    flat[beyond] = np.round(mean).astype(np.uint8)
+    mean = rgb[::97, ::97][painted[::97, ::97]].mean(axis=0) if painted[::97, ::97].any() else np.full(3, 128.0)
+    _carry(rgb, painted, distance, label, reach, np.round(mean).astype(np.uint8))
+
+
+@njit(cache=True, parallel=True)
+def _carry(rgb, painted, distance, label, reach, beyond):  # type: ignore[no-untyped-def]
+    height, width = painted.shape
+    row, column = np.zeros(label.max() + 1, np.int32), np.zeros(label.max() + 1, np.int32)
+    for y in prange(height):
+        for x in range(width):
+            if painted[y, x]:  # every painted texel has a label of its own
+                row[label[y, x]], column[label[y, x]] = y, x
+    for y in prange(height):
+        for x in range(width):
+            if painted[y, x]:
+                continue
+            for k in range(3):
+                rgb[y, x, k] = rgb[row[label[y, x]], column[label[y, x]], k] if distance[y, x] <= reach else beyond[k]
 
 
 @njit(cache=True, parallel=True)

@@ -11,6 +11,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,8 +33,11 @@ if TYPE_CHECKING:
 
 NEIGHBOUR_STEP = 8
 """Where points have no colour, every so many seen texels (each way) lend theirs to the unseen ones."""
-BAND = 8_000_000
+BAND = 6_000_000
 """Texels of a page that are painted at a time, in whole rows."""
+
+KEPT = 8
+"""Depth maps kept in memory."""
 
 
 class TextureParams(Params):
@@ -69,7 +74,6 @@ def texture(inputs: Inputs, params: TextureParams, out: Path, report: Report) ->
     """
     import numpy as np
 
-    from pipeline.io import image
     from pipeline.io import views as views_io
     from pipeline.types import Mesh
     from texturing.agreement import Agreement
@@ -91,6 +95,7 @@ def texture(inputs: Inputs, params: TextureParams, out: Path, report: Report) ->
     )  # fmt: skip
     colours, own = _colours_of(inputs)
     texels = np.zeros((len(mesh), 4), np.int64)
+    writer = Writer()
     for k, size in enumerate(sizes):
         faces = np.flatnonzero(mesh.page == k)
         page = painter.paint(
@@ -98,11 +103,37 @@ def texture(inputs: Inputs, params: TextureParams, out: Path, report: Report) ->
             lambda f, m="", k=k: report((k + f) / len(sizes), f"page {k + 1} of {len(sizes)} {m}"),
         )  # fmt: skip
         texels[faces] = _finish(page, faces, mesh, colours, own, params)
-        image.write(folder / f"page_{k}.png", page.rgb)
-        image.write(folder / f"page_{k}_seen.png", page.seen, compression=1)
+        writer.write(folder / f"page_{k}", page)
+        del page
+    writer.finish()
     skipped = sorted(painter.photos.skipped.values())
     warnings = [f"{reason}: not used for texture, other photos stand in" for reason in skipped]
     return Done({"textured": folder}, _facts(mesh, texels, sizes, painter), warnings)
+
+
+class Writer:
+    """Writes a page while the next one is painted: one at a time, so that memory holds two pages at most."""
+
+    def __init__(self) -> None:
+        self._pool = ThreadPoolExecutor(1)
+        self._last: Future[None] | None = None
+
+    def write(self, path: Path, page: Page) -> None:
+        """Begin `path`.png and `path`_seen.png, once the page before is written."""
+        self.finish()
+        self._last = self._pool.submit(_write, path, page.rgb, page.seen)
+
+    def finish(self) -> None:
+        """Wait; raises what went wrong."""
+        if self._last is not None:
+            self._last.result()
+
+
+def _write(path: Path, rgb: U8, seen: U8) -> None:
+    from pipeline.io import image
+
+    image.write(path.with_name(f"{path.name}.png"), rgb)
+    image.write(path.with_name(f"{path.name}_seen.png"), seen, compression=1)
 
 
 class Painter:
@@ -139,6 +170,8 @@ class Painter:
         self._choice, self._depth_file, self._exposures = choice, depth_file, exposures
         self._mask, self._warp = agreement.mask, agreement.warp
         self._share = shares(mesh.faces, choice.label, len(mesh.vertices), len(views))
+        self._backwards = True
+        self._ranges = lru_cache(maxsize=KEPT)(self._read_ranges)
         self.photos = Photos(views, max(1, params.band))
         self.used: dict[int, int] = {}
 
@@ -182,7 +215,9 @@ class Painter:
         owner = page.owner[rows]
         low, detail = (np.zeros((*owner.shape, 4), np.float32) for _ in range(2))
         candidates = self._choice.view[faces[here]]
-        for i in np.unique(candidates[candidates >= 0]).tolist():
+        order = np.unique(candidates[candidates >= 0]).tolist()
+        self._backwards = not self._backwards  # what the last band read last is still in memory
+        for i in reversed(order) if self._backwards else order:
             mine = here[(candidates == i).any(axis=1)]
             texels = self._look(i, low, detail, owner, mine, faces, flat, page.corners)
             if texels:
@@ -194,7 +229,6 @@ class Painter:
         flat: F32, corners: F32,
     ) -> int:  # fmt: skip
         """Add what photo `i` says of the faces `mine` to the sums; returns the texels it sees."""
-        import cv2
         import numpy as np
 
         from pipeline.cameras import MODEL_ID, parameters, pixel_angle
@@ -203,11 +237,9 @@ class Painter:
         photo = self.photos.get(i)
         if photo is None:
             return 0
-        p, view, depth = self._params, self._views[i], self._depth(i)
+        p, view = self._params, self._views[i]
         camera = view.camera
-        near = np.asarray(cv2.erode(depth.range, np.ones((3, 3))))
-        reach = round(p.band * depth.camera.width / camera.width) if p.band > 0 else 1
-        apart = near if reach == 1 else np.asarray(cv2.erode(depth.range, np.ones((2 * reach + 1, 2 * reach + 1))))
+        depth, near, apart, reach = self._ranges(i)
         T = np.linalg.inv(view.T_world_cam)
         share = self._share(i)[self._mesh.faces[faces[mine]]] if p.fade else self._alone(i, faces[mine])
         turn, shift = np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3])
@@ -228,10 +260,19 @@ class Painter:
 
         return np.repeat((self._choice.label[faces] == i).astype(np.float32)[:, None], 3, axis=1)
 
-    def _depth(self, i: int) -> DepthMap:
+    def _read_ranges(self, i: int) -> tuple[DepthMap, F32, F32, int]:
+        """A view's depth map, and what `blend.accumulate` calls near, apart and reach."""
+        import cv2
+        import numpy as np
+
         from pipeline.visibility import load_depth_map
 
-        return load_depth_map(self._depth_file(i), self._views[i].camera, self._views[i].T_world_cam)
+        view, band = self._views[i], self._params.band
+        depth = load_depth_map(self._depth_file(i), view.camera, view.T_world_cam)
+        near = np.asarray(cv2.erode(depth.range, np.ones((3, 3))), np.float32)
+        reach = round(band * depth.camera.width / view.camera.width) if band > 0 else 1
+        around = np.ones((2 * reach + 1, 2 * reach + 1))
+        return depth, near, near if reach == 1 else np.asarray(cv2.erode(depth.range, around), np.float32), reach
 
 
 def shares(faces: I32, label: I32, vertices: int, views: int) -> Callable[[int], F32]:
