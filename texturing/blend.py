@@ -6,19 +6,117 @@ Texel (x, y) of a page of W x H has its centre at u = (x + 0.5) / W, v = 1 - (y 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
+import numpy.typing as npt
 from numba import njit, prange
 
 from pipeline.cameras import EQUIRECTANGULAR, project_point
 from pipeline.range_image import SLOPE_SHARE, slope_of
-from pipeline.types import F32, I32
-from texturing.photos import OFFSET
+from pipeline.types import F32, F64, I32, U8
+from texturing.photos import OFFSET, Photo
 
 BAND = 32
 WHITE = 251.0
 EDGE = 0.01
 """Share of its weight that a photo keeps beside something that hides what is behind."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """All that a view brings: its photo, camera, pose, and where it may be used.
+
+    Attributes:
+        photo: ready to be sampled.
+        mask: (h, w) uint8, 0 where it must not be used; (0, 0) for none.
+        model, parameters: of the camera.
+        depth: range image, of any size.
+        near, apart: the least range around every pixel of `depth`, closely and as far as low frequencies reach;
+            beside something nearer the photo's own pixels mix both, and its weight falls to `EDGE`.
+        reach: pixels of the range image by which `apart` looks around.
+        R, t: (3, 3) and (3,), camera from local.
+        pixel: radians a pixel of the range image spans.
+        exposure: (5,) of `photos.Exposures.of`.
+        warp: (h, w, 2) pixels to be added to where the photo is looked up; (0, 0, 2) for none.
+    """
+
+    photo: Photo
+    mask: U8
+    model: int
+    parameters: F64
+    depth: F32
+    near: F32
+    apart: F32
+    reach: int
+    R: F64
+    t: F64
+    pixel: float
+    exposure: F64
+    warp: F32
+
+
+@dataclass(frozen=True)
+class Weighing:
+    """How photos are weighed.
+
+    Attributes:
+        bias: metres, of the visibility test.
+        power: a photo's weight is (cos / distance^2) to this.
+        feather: pixels over which the weight fades towards the photo's border.
+        min_cos: as in the choice of views.
+        band: pixels of the photo that part low frequencies from detail; 0: all is detail; -1: nothing is.
+    """
+
+    bias: float
+    power: float
+    feather: float
+    min_cos: float
+    band: int
+
+
+class Rows(Protocol):
+    """Rows of a page that photos are added to, one after another."""
+
+    def add(self, faces: npt.NDArray[np.int64], share: F32, look: Look, weighing: Weighing) -> int:
+        """Add what one photo says of `faces` (N,); returns the texels that it sees.
+
+        Args:
+            faces: indices into the page's faces.
+            share: (N, 3) how much of the detail it is to give at the faces' corners, 0 to 1.
+            look: the photo.
+            weighing: of it.
+        """
+
+    def resolve(self, rgb: U8, seen: U8) -> None:
+        """Weighted means into `rgb` (H, W, 3); `seen` (H, W) is 255 where there is one."""
+
+
+class NumbaRows:
+    """`Rows` on the processors.
+
+    Args:
+        owner: (H, W) the face of each texel, index into the next three; -1 where none.
+        flat, corners, normals: (F, 3, 2) texels, (F, 3, 3) metres and (F, 3) unit.
+    """
+
+    def __init__(self, owner: I32, flat: F32, corners: F32, normals: F32) -> None:
+        self._owner, self._flat, self._corners, self._normals = owner, flat, corners, normals
+        self._low, self._detail = (np.zeros((*owner.shape, 4), np.float32) for _ in range(2))
+
+    def add(self, faces: npt.NDArray[np.int64], share: F32, look: Look, weighing: Weighing) -> int:
+        """See `Rows`."""
+        return int(accumulate(
+            self._low, self._detail, self._owner, faces, share, self._flat, self._corners, self._normals,
+            look.photo.levels, look.photo.low, look.mask, look.model, look.parameters, look.depth, look.near,
+            look.apart, look.reach, look.R, look.t, look.pixel, look.exposure, look.warp, weighing.bias,
+            weighing.power, weighing.feather, weighing.min_cos, weighing.band,
+        ))  # fmt: skip
+
+    def resolve(self, rgb: U8, seen: U8) -> None:
+        """See `Rows`."""
+        resolve(self._low, self._detail, rgb, seen)
 
 
 def texels(uv: F32, width: int, height: int) -> F32:
@@ -195,30 +293,11 @@ def accumulate(  # type: ignore[no-untyped-def]
     low_sum, detail_sum, owner, faces, share, flat, corners, normals, photo, low, mask, model, p, depth, near, apart,
     reach, R, t, pixel, exposure, warp, bias, power, feather, min_cos, band,
 ):  # fmt: skip
-    """Add what one photo says to the texels of a page; returns the number of texels that it sees.
+    """`NumbaRows.add`: see `Look` and `Weighing`.
 
     Args:
         low_sum, detail_sum: (H, W, 4) float32, sums of weight times colour, and of weights, of low frequencies and
             of what is finer; changed in place.
-        owner: (H, W) of `owners`.
-        faces: (N,) the faces that this photo textures, indices into `flat`.
-        share: (N, 3) how much of the detail it is to give at the faces' corners, 0 to 1.
-        flat, corners, normals: (F, 3, 2) texels, (F, 3, 3) metres, (F, 3) unit, of the page's faces.
-        photo, low: `photos.Photo`'s levels and low frequencies.
-        mask: uint8, 0 where it must not be used; (0, 0) for none.
-        model, p: camera of the photo; depth: its range image, of any size.
-        near, apart: the least range around every pixel of `depth`, closely and as far as low frequencies reach;
-            beside something nearer the photo's own pixels mix both, and its weight falls to `EDGE`.
-        reach: pixels of the range image by which `apart` looks around.
-        R, t: (3, 3) and (3,), camera from local.
-        pixel: radians a pixel of the range image spans.
-        exposure: (5,) of `photos.Exposures.of`.
-        warp: (h, w, 2) pixels to be added to where the photo is looked up; (0, 0, 2) for none.
-        bias: metres, of the visibility test.
-        power: a photo's weight is (cos / distance^2) to this.
-        feather: pixels over which the weight fades towards the photo's border.
-        min_cos: as in the choice of views.
-        band: pixels of the photo that part low frequencies from detail; 0: all is detail; -1: nothing is.
     """
     height, width = owner.shape
     wide = model == EQUIRECTANGULAR

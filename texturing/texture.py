@@ -9,7 +9,9 @@ so memory is bounded by a band and a few photos.
 
 from __future__ import annotations
 
+import importlib.util
 import json
+import shutil
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import lru_cache
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
     from pipeline.types import F32, I32, U8, Mesh, PointCloud, View
     from pipeline.visibility import DepthMap
     from texturing.agreement import Agreement
+    from texturing.blend import Rows
     from texturing.choose import Choice
     from texturing.fill import Colours, Page
     from texturing.photos import Exposures
@@ -52,6 +55,8 @@ class TextureParams(Params):
         bias: metres that a surface may lie behind what the depth map shows and still count as seen.
         feather: share of a photo's width over which its weight fades towards its border.
         padding: texels that colours are carried on outside of charts, for mip-maps.
+        device: what paints: "numba" the processors, "cuda" (or another device of torch) a GPU, to within one grey
+            level the same; "auto": a GPU where torch and one are there.
     """
 
     power: float = Field(1.5, gt=0)
@@ -61,6 +66,7 @@ class TextureParams(Params):
     bias: float = Field(0.04, ge=0)
     feather: float = Field(0.04, gt=0, le=0.5)
     padding: int = Field(16, ge=2)
+    device: str = "auto"
 
 
 def texture(inputs: Inputs, params: TextureParams, out: Path, report: Report) -> Done:
@@ -170,7 +176,7 @@ class Painter:
         self._choice, self._depth_file, self._exposures = choice, depth_file, exposures
         self._mask, self._warp = agreement.mask, agreement.warp
         self._share = shares(mesh.faces, choice.label, len(mesh.vertices), len(views))
-        self._backwards = True
+        self._backwards, self._device = True, params.device if params.device != "auto" else best_device()
         self._ranges = lru_cache(maxsize=KEPT)(self._read_ranges)
         self.photos = Photos(views, max(1, params.band))
         self.used: dict[int, int] = {}
@@ -209,47 +215,50 @@ class Painter:
         """Paint the rows of a page; `here` are its faces (indices into `faces`) that reach into them."""
         import numpy as np
 
-        from texturing import blend
-
         flat = page.flat - np.array([0, rows.start], np.float32)
         owner = page.owner[rows]
-        low, detail = (np.zeros((*owner.shape, 4), np.float32) for _ in range(2))
+        band = self._rows(owner, flat, page.corners, self._normals[faces])
         candidates = self._choice.view[faces[here]]
         order = np.unique(candidates[candidates >= 0]).tolist()
-        self._backwards = not self._backwards  # what the last band read last is still in memory
+        self._backwards = not self._backwards  # what the last rows read last is still in memory
         for i in reversed(order) if self._backwards else order:
             mine = here[(candidates == i).any(axis=1)]
-            texels = self._look(i, low, detail, owner, mine, faces, flat, page.corners)
+            texels = self._look(i, band, mine, faces[mine])
             if texels:
                 self.used[i] = self.used.get(i, 0) + texels
-        blend.resolve(low, detail, page.rgb[rows], page.seen[rows])
+        band.resolve(page.rgb[rows], page.seen[rows])
 
-    def _look(
-        self, i: int, low: F32, detail: F32, owner: I32, mine: npt.NDArray[np.int64], faces: npt.NDArray[np.int64],
-        flat: F32, corners: F32,
-    ) -> int:  # fmt: skip
-        """Add what photo `i` says of the faces `mine` to the sums; returns the texels it sees."""
+    def _rows(self, owner: I32, flat: F32, corners: F32, normals: F32) -> Rows:
+        """What paints, on this machine's GPU or its processors."""
+        if self._device == "numba":
+            from texturing.blend import NumbaRows
+
+            return NumbaRows(owner, flat, corners, normals)
+        from texturing.blend_torch import TorchRows
+
+        return TorchRows(owner, flat, corners, normals, self._device)
+
+    def _look(self, i: int, rows: Rows, mine: npt.NDArray[np.int64], faces: npt.NDArray[np.int64]) -> int:
+        """Add what photo `i` says of the page's faces `mine`, the mesh's `faces`; returns the texels it sees."""
         import numpy as np
 
         from pipeline.cameras import MODEL_ID, parameters, pixel_angle
-        from texturing import blend
+        from texturing.blend import Look, Weighing
 
         photo = self.photos.get(i)
         if photo is None:
             return 0
         p, view = self._params, self._views[i]
-        camera = view.camera
         depth, near, apart, reach = self._ranges(i)
         T = np.linalg.inv(view.T_world_cam)
-        share = self._share(i)[self._mesh.faces[faces[mine]]] if p.fade else self._alone(i, faces[mine])
-        turn, shift = np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3])
-        texels = blend.accumulate(
-            low, detail, owner, mine, np.ascontiguousarray(share, np.float32), flat, corners, self._normals[faces],
-            photo.levels, photo.low, self._mask(i, view), MODEL_ID[camera.model], parameters(camera), depth.range,
-            near, apart, reach, turn, shift, pixel_angle(depth.camera), self._exposures.of(view), self._warp(i),
-            p.bias, p.power, p.feather * camera.width, p.min_cos, p.band,
+        share = self._share(i)[self._mesh.faces[faces]] if p.fade else self._alone(i, faces)
+        look = Look(
+            photo, self._mask(i, view), MODEL_ID[view.camera.model], parameters(view.camera), depth.range, near, apart,
+            reach, np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3]), pixel_angle(depth.camera),
+            self._exposures.of(view), self._warp(i),
         )  # fmt: skip
-        return int(texels)
+        weighing = Weighing(p.bias, p.power, p.feather * view.camera.width, p.min_cos, p.band)
+        return rows.add(mine, np.ascontiguousarray(share, np.float32), look, weighing)
 
     def name(self, i: int) -> str:
         """Of view `i`."""
@@ -261,7 +270,7 @@ class Painter:
         return np.repeat((self._choice.label[faces] == i).astype(np.float32)[:, None], 3, axis=1)
 
     def _read_ranges(self, i: int) -> tuple[DepthMap, F32, F32, int]:
-        """A view's depth map, and what `blend.accumulate` calls near, apart and reach."""
+        """A view's depth map, and `near`, `apart` and `reach` of `blend.Look`."""
         import cv2
         import numpy as np
 
@@ -273,6 +282,15 @@ class Painter:
         reach = round(band * depth.camera.width / view.camera.width) if band > 0 else 1
         around = np.ones((2 * reach + 1, 2 * reach + 1))
         return depth, near, near if reach == 1 else np.asarray(cv2.erode(depth.range, around), np.float32), reach
+
+
+def best_device() -> str:
+    """The device that "auto" stands for here."""
+    if shutil.which("nvidia-smi") is None or importlib.util.find_spec("torch") is None:
+        return "numba"
+    import torch
+
+    return "cuda" if torch.cuda.is_available() else "numba"
 
 
 def shares(faces: I32, label: I32, vertices: int, views: int) -> Callable[[int], F32]:

@@ -50,6 +50,18 @@ def write(path: Path, image: U8, *, quality: int = 90, compression: int = 2) -> 
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
 
+def copy(source: Path, path: Path, *, quality: int = 90) -> None:
+    """Write a picture of an earlier step in another format, as `write`.
+
+    Raises:
+        InputError: it can't be read.
+    """
+    pixels = read_rgb(source)
+    if pixels is None:
+        raise InputError(source, "can't be read as an image", "Delete the folder it is in, and run again")
+    write(path, pixels, quality=quality)
+
+
 def read_mask(view: View) -> U8 | None:
     """The view's mask (H, W), 0 where its photo must not be used; None if it can't be read or is of another size."""
     import cv2

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
 
@@ -27,7 +27,8 @@ class ExportParams(Params):
             faster than Collada, or Collada where OBJ is off.
         friction: Coulomb friction coefficient of the ground; 0.9 is rubber on dry asphalt.
         max_visual_triangles: of one OBJ or Collada file; larger groups are written in parts.
-        jpeg_quality: of the GLB's textures.
+        pages: "png", lossless, or "jpeg", a sixth or so of its size, for the texture pages of OBJ and Collada.
+        jpeg_quality: of the GLB's textures, and of JPEG pages.
         world_origin: metres in the CRS; several tiles with the same one share their georeference.
             Default: the tile's own origin.
     """
@@ -39,6 +40,7 @@ class ExportParams(Params):
     gazebo: bool = True
     friction: float = Field(0.9, ge=0, le=10)
     max_visual_triangles: int = Field(200_000, ge=1_000)
+    pages: Literal["png", "jpeg"] = "png"
     jpeg_quality: int = Field(90, ge=1, le=100)
     world_origin: tuple[float, float, float] | None = None
 
@@ -47,7 +49,7 @@ def export(inputs: Inputs, params: ExportParams, out: Path, report: Report) -> D
     """Write the textured groups and the collision mesh as a world.
 
     Layout below `world/`: `<name>.sdf`, `<name>.glb`, `metadata.json`, and `models/<name>/` with
-    `model.sdf`, `model.config` and `meshes/` (OBJ, MTL, Collada, one PNG for every texture page, and
+    `model.sdf`, `model.config` and `meshes/` (OBJ, MTL, Collada, one PNG or JPEG for every texture page, and
     `collision.obj`). Where a list of `plants` and `plants_csv` is given, it is put beside the world.
     OBJ and Collada are z-up in the tile's local metres; the tile's place is in the
     world's pose and `spherical_coordinates` and in `metadata.json` alone.
@@ -124,14 +126,17 @@ def _write_group(folder: Path, group: str, surface: Textured, params: ExportPara
     """Write a group's OBJ and Collada files and their images; triangles of every mesh file."""
     import shutil
 
-    from pipeline.io import collada, obj
+    from pipeline.io import collada, image, obj
 
     if not (params.obj or params.collada):
         return {}
     materials = [f"{group}_{page}" for page in range(len(surface.pages))]
-    images = [f"{name}.png" for name in materials]
+    images = [f"{name}.{'png' if params.pages == 'png' else 'jpg'}" for name in materials]
     for page in surface.used_pages:
-        shutil.copyfile(surface.pages[page], folder / images[page])
+        if params.pages == "png":
+            shutil.copyfile(surface.pages[page], folder / images[page])
+        else:
+            image.copy(surface.pages[page], folder / images[page], quality=params.jpeg_quality)
     if params.obj:
         obj.write_mtl(folder / f"{group}.mtl", {materials[p]: images[p] for p in surface.used_pages})
     counts = {}

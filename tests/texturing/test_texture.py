@@ -5,6 +5,7 @@ import json
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from pipeline.io import views as views_io
 from pipeline.render import Renderer, look_at, textured
@@ -222,3 +223,23 @@ def test_views_survive_their_json(street, tmp_path):
     np.testing.assert_array_equal(read.T_world_cam, view.T_world_cam)
     assert views_io.load_held_out(tmp_path / "v.json") == (True,)
     assert json.loads(json.dumps(views_io.to_json(view, with_paths=False)))["photo"] == view.photo.name
+
+
+@pytest.mark.parametrize("kind", ["16 bit", "grey", "cmyk"])
+def test_photos_of_other_kinds_are_read(street, kind):
+    for pose in POSES:
+        view = street.add(CAMERAS["pinhole"], pose)
+        rgb = photograph(CAMERAS["pinhole"], pose)
+        if kind == "16 bit":
+            cv2.imwrite(str(view.photo), rgb[..., ::-1].astype(np.uint16) * 257)
+        elif kind == "grey":
+            cv2.imwrite(str(view.photo), cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY))
+        else:
+            Image.fromarray(rgb).convert("CMYK").save(view.photo, "JPEG", quality=95)
+    folder, done = street.run()
+    rgb, seen, truth, x, y = from_above(folder)
+    near = (seen == 255) & (x < 1) & apart_from_the_box(x, y) & (abs(y) < 4.9)
+    if kind == "grey":
+        truth = np.repeat((truth @ [0.299, 0.587, 0.114])[..., None], 3, axis=-1)
+    assert near.mean() > 0.2 and done.facts["photos"] == 4
+    assert psnr(rgb[near], truth[near]) > 28

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from pipeline.errors import DataError, InputError, SettingError
 from pipeline.step import silent
@@ -160,6 +161,18 @@ def test_pictures_are_copied_as_they_are(tmp_path: Path) -> None:
         copy = world / f"models/street/meshes/terrain_{page}.png"
         assert copy.read_bytes() == (tmp_path / f"terrain/page_{page}.png").read_bytes()
         assert copy.stat().st_ino != (tmp_path / f"terrain/page_{page}.png").stat().st_ino  # may be edited freely
+
+
+def test_pages_as_jpeg(tmp_path: Path) -> None:
+    world = made_up.world(tmp_path, pages="jpeg").files["world"]
+    meshes = world / "models/street/meshes"
+    assert not list(meshes.glob("*.png"))
+    assert (
+        "terrain_0.jpg" in (meshes / "terrain.mtl").read_text()
+        and "terrain_0.jpg" in (meshes / "terrain.dae").read_text()
+    )
+    with Image.open(meshes / "terrain_0.jpg") as copy, Image.open(tmp_path / "terrain/page_0.png") as page:
+        assert copy.format == "JPEG" and copy.size == page.size
 
 
 def test_normals_and_uv_have_no_nan(tmp_path: Path) -> None:

@@ -1,0 +1,35 @@
+"""The GPU's painting against the processors', on torch's own CPU."""
+
+import numpy as np
+import pytest
+
+from pipeline.errors import InputError
+from pipeline.io import image
+from tests.texturing.corner import CAMERAS, POSES, photograph, points
+
+pytest.importorskip("torch", reason="torch is not installed (pip install 'scan2sim[gpu]')")
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+@pytest.mark.parametrize("band", [2, 0, -1])
+def test_torch_paints_the_same(street, name, band):
+    camera = CAMERAS[name]
+    mask = np.full((camera.height, camera.width), 255, np.uint8)
+    mask[: camera.height // 3, : camera.width // 4] = 0
+    for i, pose in enumerate(POSES):
+        street.add(camera, pose, photograph(camera, pose, gain=1 + 0.1 * i), mask if i == 1 else None)
+    street.clouds["terrain"] = points()
+    mine, done = street.run(band=band, device="numba")
+    theirs, told = street.run(band=band, device="cpu")
+    for page in range(done.facts["pages"]):
+        a, b = (image.read_rgb(folder / f"page_{page}.png").astype(int) for folder in (mine, theirs))
+        seen = [image.read_grey(folder / f"page_{page}_seen.png") for folder in (mine, theirs)]
+        assert (seen[0] == seen[1]).mean() > 0.99999
+        assert (abs(a - b).max(axis=2) <= 1).mean() > 0.99999
+    assert told.facts["coverage"] == pytest.approx(done.facts["coverage"], abs=1e-4)
+
+
+def test_a_device_that_is_not_there_is_named(street):
+    street.add(CAMERAS["pinhole"], POSES[0])
+    with pytest.raises(InputError, match="xpu:7"):
+        street.run(device="xpu:7")
