@@ -7,7 +7,7 @@ OUT ?= demo-out
 .PHONY: demo test test-all lint bench sample-tile
 
 demo: .venv/.installed
-	$(BIN)/scan2sim run $(TILE) --out $(OUT) --hold-out 8
+	$(BIN)/scan2sim run $(TILE) --out $(OUT) --hold-out 8 --set segment.overwrite=true
 
 test: .venv/.installed-dev lint
 	$(BIN)/python -m pytest -m "not slow" -n 2 --dist loadfile
@@ -28,7 +28,7 @@ sample-tile: .venv/.installed
 
 .venv/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e .
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[segmentation]'
 	@$(BIN)/python -c "import open3d" || { \
 		echo "Open3D can't be loaded: on Debian or Ubuntu, apt-get install $$(tr '\n' ' ' < packages.txt)"; exit 1; }
 	touch $@

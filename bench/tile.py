@@ -24,7 +24,7 @@ ROOT = Path(__file__).resolve().parent.parent
 SAMPLES = 200_000
 # our steps beside the naive chain's
 STEPS = {
-    "read": ("ingest", "segment"),
+    "read": ("ingest", "label", "segment"),
     "split": ("split",),
     "voxel": ("voxel", "path"),
     "normals": (),  # ours are a part of voxel
@@ -33,7 +33,7 @@ STEPS = {
     "islands": ("islands",),
     "decimate": ("decimate",),
     "unwrap": ("unwrap",),
-    "texture": ("views", "visibility", "texture"),
+    "texture": ("views", "visibility", "exposure", "agreement", "choose", "texture"),
     "(ours only)": ("collision", "export", "geometry", "score", "pictures"),
 }
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
+from typer.core import TyperGroup
 
 app = typer.Typer(
     name="scan2sim",
@@ -17,6 +18,21 @@ app = typer.Typer(
 )
 imports = typer.Typer(no_args_is_help=True, help="Make a tile from your files.")
 app.add_typer(imports, name="import")
+
+
+class _TileIsDefault(TyperGroup):
+    """`segment TILE` is `segment tile TILE`."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        if args and args[0] not in self.commands:
+            args = ["tile", *args]
+        return super().resolve_command(ctx, args)
+
+
+segments = typer.Typer(
+    cls=_TileIsDefault, no_args_is_help=True, help="Classes of a tile's points and photos: `segment TILE --out DIR`."
+)
+app.add_typer(segments, name="segment")
 
 INTERRUPTED = 130  # as typer turns Ctrl-C into
 
@@ -107,6 +123,49 @@ def sample(
     with progress("street") as report:
         path = generate(out, length=length, points=points, photos=photos, seed=seed, report=report)
     typer.echo(f"Tile: {path}")
+
+
+@segments.command("tile")
+def segment_a_tile(
+    tile: TilePath,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for clouds, labels, masks and kept results.")],
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Tell classes anew where the cloud has some.")] = False,
+    set_: Sets = None,
+    config: Config = None,
+) -> None:
+    """Classify a tile's points from its photos; write LAZ, label pictures and masks."""
+    from flows.segment import segment_tile
+
+    segment_tile(
+        tile, out, _settings([*(set_ or []), *(["segment.overwrite=true"] if overwrite else [])], config, None)
+    )
+
+
+@segments.command("train")
+def segment_train(
+    folder: Annotated[Path, typer.Argument(help="Of images/ and labels/ (docs/segmentation.md).")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="File of the weights.")] = Path("street.safetensors"),
+    minutes: Annotated[float, typer.Option(help="At most; 0: no limit.")] = 0,
+    steps: Annotated[int, typer.Option(help="Of the optimiser.")] = 3000,
+    seed: Annotated[int, typer.Option(help="Of weights, crops and looks.")] = 0,
+) -> None:
+    """Train the project's own network on labelled photos."""
+    from flows.segment import train_network
+
+    train_network(folder, out, minutes=minutes, steps=steps, seed=seed)
+
+
+@segments.command("evaluate")
+def segment_evaluate(
+    path: Annotated[Path, typer.Argument(help="A tile whose cloud has classes, or a folder of labelled photos.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for a tile's results.")] = Path("segment-out"),
+    set_: Sets = None,
+    config: Config = None,
+) -> None:
+    """Print how classes that are told compare with those that are known."""
+    from flows.segment import evaluate
+
+    evaluate(path, out, _settings([*(set_ or []), "segment.overwrite=true"], config, None))
 
 
 @imports.command("kitti-raw")

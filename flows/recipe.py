@@ -27,6 +27,7 @@ from pipeline.steps.views import VIEWS
 from pipeline.steps.visibility import VISIBILITY
 from pipeline.steps.voxel import VOXEL
 from pipeline.types import Tile
+from segmentation.label import LABEL
 from segmentation.segment import SEGMENT
 from texturing.agreement import AGREEMENT
 from texturing.choose import CHOOSE
@@ -36,7 +37,7 @@ from texturing.texture import TEXTURE
 from texturing.unwrap import UNWRAP
 
 STEPS: tuple[Step, ...] = (
-    INGEST, PATH, SEGMENT, SPLIT, VOXEL, POISSON, TRIM, ISLANDS, DECIMATE, PLANTS, VIEWS, UNWRAP,
+    INGEST, PATH, VIEWS, LABEL, SEGMENT, SPLIT, VOXEL, POISSON, TRIM, ISLANDS, DECIMATE, PLANTS, UNWRAP,
     VISIBILITY, EXPOSURE, AGREEMENT, CHOOSE, TEXTURE, COLLISION, EXPORT, GEOMETRY, SCORE, PICTURES,
 )  # fmt: skip
 PER_CLASS: tuple[Step, ...] = (VOXEL, POISSON, TRIM, ISLANDS, DECIMATE, CHOOSE, UNWRAP, TEXTURE)
@@ -82,15 +83,22 @@ def recipe(tile: Tile, settings: Settings) -> list[Node]:
 
     frame: dict[str, Any] = {"crs": tile.frame.crs, "origin": tile.frame.origin, "unit": tile.frame.unit}
     add(INGEST, {f"cloud.{i:04d}": path for i, path in enumerate(tile.clouds)}, **frame)
-    add(SEGMENT, {"cloud": Output("ingest", "cloud")})
-    add(SPLIT, {"cloud": Output("segment", "cloud")})
+    whole = {"cloud": Output("ingest", "cloud")}
     path = scanner_path(tile)
     if path:
         add(PATH, {}, **path)
+    scanner = {"path": Output("path", "path")} if path else {}
+    photos: dict[str, Path | Output] = {f"photo.{i}": view.photo for i, view in enumerate(tile.views)}
+    masks: dict[str, Path | Output] = {f"mask.{i}": view.mask for i, view in enumerate(tile.views) if view.mask}
+    add(VIEWS, photos | masks | whole, poses=tuple(views_io.to_json(view, with_paths=False) for view in tile.views))
+    seen: dict[str, Path | Output] = {"views": Output("views", "views")}
+    if tile.views:
+        add(LABEL, whole | seen | _weights(settings), **_kept(settings))
+    add(SEGMENT, whole | scanner | ({**seen, "labels": Output("label", "labels")} if tile.views else {}))
+    add(SPLIT, {"cloud": Output("segment", "cloud")})
 
     vegetation = settings.params(SPLIT).vegetation
     groups = [g for g in GROUPS if g != "vegetation" or vegetation != "locations"]
-    scanner = {"path": Output("path", "path")} if path else {}
     for part in (*GROUPS, "rest"):
         add(VOXEL, {"cloud": Output("split", part)} | scanner, part)
     for group in groups:
@@ -106,10 +114,6 @@ def recipe(tile: Tile, settings: Settings) -> list[Node]:
         add(PLANTS, {name: Output(f"voxel.{name}", "cloud") for name in ("vegetation", "terrain")})
         plants = {"plants": Output("plants", "geojson"), "plants_csv": Output("plants", "csv")}
 
-    photos: dict[str, Path | Output] = {f"photo.{i}": view.photo for i, view in enumerate(tile.views)}
-    masks: dict[str, Path | Output] = {f"mask.{i}": view.mask for i, view in enumerate(tile.views) if view.mask}
-    add(VIEWS, photos | masks | clouds, poses=tuple(views_io.to_json(view, with_paths=False) for view in tile.views))
-    seen: dict[str, Path | Output] = {"views": Output("views", "views")}
     add(VISIBILITY, meshes | clouds | seen)
     seen = seen | {"depth": Output("visibility", "depth")}
     prior = settings.params(EXPOSURE).prior
@@ -137,6 +141,18 @@ def recipe(tile: Tile, settings: Settings) -> list[Node]:
     stages = {f"decimate.{g}": Output(f"decimate.{g}", "mesh") for g in groups}
     add(PICTURES, textured | stages | clouds | {"views": seen["views"]} | scanner)
     return nodes
+
+
+def _weights(settings: Settings) -> dict[str, Path | Output]:
+    """The user's weights as an input: others make other classes."""
+    weights = settings.params(LABEL).weights
+    return {"weights": weights} if weights and weights.is_file() else {}
+
+
+def _kept(settings: Settings) -> dict[str, Any]:
+    """When photos are looked at for classes: `segment` says so, for both steps."""
+    given = settings.params(SEGMENT)
+    return {"overwrite": given.overwrite, "min_classified": given.min_classified, "photos": given.photos}
 
 
 def scanner_path(tile: Tile) -> dict[str, Any]:

@@ -7,6 +7,8 @@ import os
 import shutil
 import time
 import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from rich.markup import escape
@@ -44,36 +46,42 @@ def run_tile(
         log = Log(out / "run.log")
         log.write(f"tile {tile.path}, settings {json.dumps(settings.values)}, versions {json.dumps(versions())}")
         missing = sum(p.reason is not None for p in planned)
-        try:
-            with RunDisplay(len(planned)) as display:
-
-                def watch(node: Node, event: Event, fraction: float, message: str) -> None:
-                    display.watch(node, event, fraction, message)
-                    if event != "progress":
-                        log.write(f"{node.label}: {event}")
-
-                done = execute(planned, store, jobs=jobs or default_jobs(), watch=watch)
-            for label, manifest in done.items():
-                told = [manifest.facts["told"]] if "told" in manifest.facts else []
-                for line in told + [f"warning: {text}" for text in manifest.warnings]:
-                    log.write(f"{label}: {line}")
+        with log.errors(out):
+            done = execute_shown(planned, store, log, jobs)
             _publish(store, planned, done, out, tile, settings)
             report = write_report(tile, planned, done, store, out, seconds=time.perf_counter() - began)
-        except ScanError as error:
-            log.write(f"error: {error}", *getattr(error, "__notes__", traceback.format_exception(error)))
-            raise
-        except OSError as error:
-            raise from_os_error(error, out) from error
         store.sweep({p.node.label: p.key for p in planned})
-    for label, manifest in done.items():
-        for warning in manifest.warnings:
-            console.print(f"[yellow]warning:[/] {label}: {escape(warning)}", highlight=False, soft_wrap=True)
+    show_warnings(done)
     console.print(f"World:  {out / 'world'}\nReport: {report}", highlight=False, soft_wrap=True, markup=False)
     if missing == 0:
         console.print(
             f"[dim]nothing to do: all is as the tile and the settings say ({time.perf_counter() - began:.1f} s)"
         )
     return report
+
+
+def execute_shown(planned: list[Planned], store: Store, log: Log, jobs: int = 0) -> dict[str, Manifest]:
+    """`execute`, with bars on the screen and lines in the log."""
+    with RunDisplay(len(planned)) as display:
+
+        def watch(node: Node, event: Event, fraction: float, message: str) -> None:
+            display.watch(node, event, fraction, message)
+            if event != "progress":
+                log.write(f"{node.label}: {event}")
+
+        done = execute(planned, store, jobs=jobs or default_jobs(), watch=watch)
+    for label, manifest in done.items():
+        told = [manifest.facts["told"]] if "told" in manifest.facts else []
+        for line in told + [f"warning: {text}" for text in manifest.warnings]:
+            log.write(f"{label}: {line}")
+    return done
+
+
+def show_warnings(done: dict[str, Manifest]) -> None:
+    """What the steps warned of, on the screen."""
+    for label, manifest in done.items():
+        for warning in manifest.warnings:
+            console.print(f"[yellow]warning:[/] {label}: {escape(warning)}", highlight=False, soft_wrap=True)
 
 
 def show_plan(path: Path, out: Path, settings: Settings, *, force: bool = False, start: str | None = None) -> None:
@@ -154,3 +162,14 @@ class Log:
         """Append lines, the first with the time."""
         with open(self.path, "a", encoding="utf-8") as file:
             file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} " + "".join(f"{line.rstrip()}\n" for line in lines))
+
+    @contextmanager
+    def errors(self, out: Path) -> Iterator[None]:
+        """Write down what goes wrong within, and pass it on; an error of the system becomes one of ours about `out`."""
+        try:
+            yield
+        except ScanError as error:
+            self.write(f"error: {error}", *getattr(error, "__notes__", traceback.format_exception(error)))
+            raise
+        except OSError as error:
+            raise from_os_error(error, out) from error

@@ -115,7 +115,7 @@ def scene(
         near = casting.compute_distance(np.ascontiguousarray(cloud.xyz)).numpy()
         cloud = cloud.take(near > np.where(_of_class(cloud, FOLIAGE), LOOSE * lacking, lacking))
     assert cloud.normal is not None
-    return Scene(casting, triangles, cloud.xyz, cloud.normal, _radii(cloud, radius), _times_of_moving(cloud))
+    return Scene(casting, triangles, cloud.xyz, cloud.normal, _radii(cloud, radius), times_of_moving(cloud))
 
 
 def _of_class(cloud: PointCloud, codes: tuple[int, ...]) -> npt.NDArray[np.bool_]:
@@ -151,7 +151,7 @@ def _radii(cloud: PointCloud, radius: float) -> F32:
     return radii
 
 
-def _times_of_moving(cloud: PointCloud) -> F64:
+def times_of_moving(cloud: PointCloud) -> F64:
     """(N,) seconds: when points of moving things were scanned; NaN for all that stands, or of which it isn't known.
 
     The scanner sees what stands for seconds while it drives by, and what drives past only for a moment at each place.

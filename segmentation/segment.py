@@ -1,74 +1,154 @@
-"""Segment: a class for every point, the cloud's own where it has them."""
+"""Segment: a class for every point: the cloud's own, else from the photos and the points' shape (D3.2, section 4.2)."""
 
 from __future__ import annotations
 
 import os
 import shutil
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
 
 from pipeline.step import Done, Inputs, Params, Report, Step
+
+if TYPE_CHECKING:
+    from pipeline.types import U8, PointCloud
+
+PHOTO, SHAPE, OWN = 1, 2, 3
+"""What a point's class is told from: photos that see it (with its shape and neighbours), those alone, the cloud."""
 
 
 class SegmentParams(Params):
     """Where classes come from.
 
     Attributes:
-        overwrite: classify by shape even if the cloud has classes.
+        overwrite: tell classes anew even if the cloud has some.
         min_classified: share of points with a class (other than never classified and unclassified)
             from which on the cloud's own are kept.
+        size: metres of the voxels that photos are asked about.
         voxel: metres, detail of the classification by shape (`segmentation.geometric`).
+        photos: use what the photos say; False tells classes from shape alone.
     """
 
     overwrite: bool = False
     min_classified: float = Field(0.2, ge=0, le=1)
+    size: float = Field(0.1, gt=0)
     voxel: float = Field(0.2, gt=0)
+    photos: bool = True
 
 
 def segment(inputs: Inputs, params: SegmentParams, out: Path, report: Report) -> Done:
-    """Keep the classes of `cloud`, or give it classes by shape where it has none."""
+    """Keep the classes of `cloud`, or tell them from `labels` (of the step `label`, for `views`) and shape.
+
+    Inputs: `cloud`; `views` and `labels`; `path`, the scanner's, where it is known.
+    Files: `cloud`; `confidence`, .npz with `confidence` (N,) uint8, 255 sure, and `source` (N,) uint8
+    (`PHOTO`, `SHAPE` or `OWN`).
+    """
     from dataclasses import replace
 
     import numpy as np
 
-    from pipeline.classes import CLASSES, UNKNOWN, group_of
+    from pipeline.classes import CLASSES, group_of
     from pipeline.types import PointCloud
+    from segmentation.label import classified
 
     report(0.0, "reading")
     cloud = PointCloud.load(inputs["cloud"])
-    file = out / "cloud.npz"
-    own = 0.0 if cloud.label is None else float(np.mean(~np.isin(cloud.label, UNKNOWN)))
+    file, beside = out / "cloud.npz", out / "confidence.npz"
+    own = classified(cloud.label)
+    told: dict[str, Any] = {}
     if cloud.label is not None and own >= params.min_classified and not params.overwrite:
         try:
             os.link(inputs["cloud"], file)
         except OSError:  # another disk, or a file system without links
             shutil.copyfile(inputs["cloud"], file)
         label, source = cloud.label, "cloud"
+        kinds, sure = np.full(len(cloud), OWN, np.uint8), np.full(len(cloud), 255, np.uint8)
     else:
-        from segmentation.geometric import classify
-
-        label = classify(cloud, lambda f, m="": report(0.05 + 0.85 * f, m), voxel=params.voxel)
-        report(0.9, "writing")
+        label, sure, kinds, told = tell(cloud, inputs, params, report)
+        report(0.95, "writing")
         replace(cloud, label=label).save(file)
-        source = "geometry"
+        source = "photos and shape" if told else "shape"
+    np.savez(beside, confidence=sure, source=kinds)
     count = np.bincount(label, minlength=256)
     names = {c.code: c.name for c in CLASSES}
     facts = {
         "source": source,
         "own_classes": round(own, 4),
         "points": {names.get(code, str(code)): int(count[code]) for code in np.flatnonzero(count).tolist()},
-    }
+    } | told
     warnings = []
-    group = group_of()
-    if source == "geometry":
+    if source == "shape":
         why = "they were told anew" if own else "The cloud has none of its own: they were told"
-        warnings.append(f"classes: {why} from shape, which confuses some things")
-    elif not np.isin(group[np.flatnonzero(count)], (1, 2)).any():
+        warnings.append(f"classes: {why} from shape alone, which confuses some things")
+    elif source == "cloud" and not np.isin(group_of()[np.flatnonzero(count)], (1, 2)).any():
         warnings.append(
             "the cloud classifies neither buildings nor vegetation; --set segment.overwrite=true finds them"
         )
-    return Done({"cloud": file}, facts, warnings)
+    elif told and told["sky_share"] > SKY_LIMIT:
+        warnings.append(
+            f"{told['sky_share']:.0%} of the sightings take points for sky: are poses and clocks of photos right?"
+        )
+    return Done({"cloud": file, "confidence": beside}, facts, warnings)
 
 
-SEGMENT = Step("segment", 1, segment, SegmentParams)
+SKY_LIMIT = 0.15
+"""Share of sightings that say sky above which a run warns."""
+
+
+def tell(cloud: PointCloud, inputs: Inputs, params: SegmentParams, report: Report) -> tuple[U8, U8, U8, dict[str, Any]]:
+    """LAS codes, confidence (255: sure) and source of every point (N,), and facts where photos told something."""
+    import numpy as np
+
+    from pipeline.io import views as views_io
+    from pipeline.normals import oriented_normals
+    from pipeline.steps.voxel import sample, voxel_groups
+    from pipeline.types import Trajectory
+    from segmentation.geometric import classify
+
+    n = len(cloud)
+    views = views_io.load(inputs["views"]) if "views" in inputs else ()
+    asked = params.photos and "labels" in inputs and any(inputs["labels"].glob("*.npy"))
+    if not asked:
+        label = classify(cloud, lambda f, m="": report(0.05 + 0.85 * f, m), voxel=params.voxel)
+        return label, np.full(n, 128, np.uint8), np.full(n, SHAPE, np.uint8), {}
+    report(0.05, "thinning")
+    order, starts = voxel_groups(cloud.xyz, params.size)
+    voxel = np.empty(n, np.int64)
+    voxel[order] = np.repeat(np.arange(len(starts)), np.diff(np.append(starts, n)))
+    thin = sample(cloud, params.size)
+    report(0.15, "normals")
+    thin = oriented_normals(thin, 12, Trajectory.load(inputs["path"]) if "path" in inputs else None)
+    report(0.25, "shape")
+    shape = classify(thin, lambda f, m="": report(0.25 + 0.25 * f, m), voxel=params.voxel)
+    code, sure, seen, told = _from_photos(thin, shape, views, inputs["labels"], params, report)
+    return code[voxel], sure[voxel], np.where(seen, PHOTO, SHAPE).astype(np.uint8)[voxel], told
+
+
+def _from_photos(
+    thin: PointCloud, shape: U8, views: Any, labels: Path, params: SegmentParams, report: Report
+) -> tuple[U8, U8, U8, dict[str, Any]]:
+    """LAS codes, confidence and whether a photo sees it, by voxel; and facts."""
+    import json
+
+    import numpy as np
+
+    from segmentation.geometric import split_ground
+    from segmentation.labels import code_of_index
+    from segmentation.moving import moving
+    from segmentation.smooth import decide
+    from segmentation.votes import vote
+
+    votes = vote(thin, views, labels, radius=0.8 * params.size, report=lambda f, m="": report(0.5 + 0.3 * f, m))
+    report(0.8, "smoothing")
+    tells = json.loads((labels / "network.json").read_text(encoding="utf-8"))["tells"]
+    height, ground = split_ground(thin.xyz)
+    moved = moving(thin, height, ground)
+    best, sure = decide(votes, shape, height, moved, thin, low_told="low_vegetation" in tells)
+    seen = votes.weight > 0
+    told = {"seen_share": round(float(seen.mean()), 4), "sky_share": round(votes.sky, 4)}
+    told["moving_share"] = round(float(moved.mean()), 4)
+    return code_of_index()[best], np.round(255 * sure).astype(np.uint8), seen.astype(np.uint8), told
+
+
+SEGMENT = Step("segment", 2, segment, SegmentParams)

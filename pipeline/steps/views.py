@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from pipeline.types import F32, View
 
 REACH = 100.0  # metres; a photo further than this from every point sees nothing of the tile
-SAMPLE = 50_000  # points that are looked for in the photos
+SAMPLE = 500_000  # points that are looked for in the photos
 
 
 class ViewsParams(Params):
@@ -33,7 +33,7 @@ class ViewsParams(Params):
 def views(inputs: Inputs, params: ViewsParams, out: Path, report: Report) -> Done:
     """Check that photos can be opened, have their camera's size, and meet the cloud; skip those that don't.
 
-    Inputs are `photo.N` and `mask.N` by the views' index, and the clouds `cloud.*`.
+    Inputs are `photo.N` and `mask.N` by the views' index, and the cloud.
 
     Raises:
         InputError: a photo's size is not its camera's; no photo can be read at all.
@@ -46,7 +46,7 @@ def views(inputs: Inputs, params: ViewsParams, out: Path, report: Report) -> Don
     from pipeline.io import views as views_io
     from pipeline.types import PointCloud
 
-    clouds = [PointCloud.load(path).xyz for name, path in inputs.items() if name.startswith("cloud.")]
+    clouds = [PointCloud.load(path).xyz for name, path in inputs.items() if name.startswith("cloud")]
     points = np.concatenate(clouds)
     points = points[:: max(1, len(points) // SAMPLE)]
     kept: list[View] = []
@@ -146,4 +146,4 @@ def _sees(view: View, points: F32) -> bool:
     return bool((inside & valid).any())
 
 
-VIEWS = Step("views", 1, views, ViewsParams)
+VIEWS = Step("views", 2, views, ViewsParams)

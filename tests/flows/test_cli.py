@@ -156,7 +156,7 @@ def test_a_cloud_alone_without_colours_or_classes(street: Path, tmp_path: Path) 
     good(scan2sim("import", "las", tmp_path / "plain.laz", "--out", tmp_path / "tile"))
     good(scan2sim("run", tmp_path / "tile", "--out", tmp_path / "out", *SMALL))
     report = json.loads((tmp_path / "out" / "report.json").read_text())
-    assert report["texture"]["coverage"] == 0 and report["steps"]["segment"]["facts"]["source"] == "geometry"
+    assert report["texture"]["coverage"] == 0 and report["steps"]["segment"]["facts"]["source"] == "shape"
 
 
 def test_truncated_cloud(damaged: Path, tmp_path: Path) -> None:

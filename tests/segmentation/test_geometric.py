@@ -124,14 +124,14 @@ def test_a_cloud_keeps_its_own_classes_unless_told_otherwise(tmp_path: Path) -> 
     assert np.array_equal(kept.label, truth) and facts["source"] == "cloud"
     assert facts["points"]["terrain"] == int((truth == 2).sum())
     anew, facts = run("anew", overwrite=True)
-    assert facts["source"] == "geometry" and not np.array_equal(anew.label, truth)
+    assert facts["source"] == "shape" and not np.array_equal(anew.label, truth)
     assert np.array_equal(anew.time, cloud.time) and np.array_equal(anew.xyz, xyz)
 
     replace(cloud, label=np.where(np.arange(len(xyz)) % 10 == 0, truth, 1).astype(np.uint8)).save(inputs["cloud"])
-    assert run("few")[1]["source"] == "geometry"  # a tenth of the points is too little
+    assert run("few")[1]["source"] == "shape"  # a tenth of the points is too little
     assert run("enough", min_classified=0.05)[1]["source"] == "cloud"
     replace(cloud, label=None).save(inputs["cloud"])
-    assert run("none", min_classified=0.0)[1]["source"] == "geometry"
+    assert run("none", min_classified=0.0)[1]["source"] == "shape"
     assert SEGMENT.name == "segment"
 
 

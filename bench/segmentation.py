@@ -1,0 +1,203 @@
+"""Classes told from photos and shape against classes known, beside shape alone; on streets never trained on.
+
+`python -m bench.segmentation [--parts streets time kitti semkitti mesh] [--out bench-out/segmentation]`
+
+- streets: three streets of seeds below those of training: the default European town, and two with looks drawn anew.
+  point_miou is the mean over the streets of the mean over road, terrain, building, low and high vegetation.
+  geometry: classes from shape alone, ground by a surface search and the rest by height above it and shape.
+- time: a street of nine million points and forty photos, from tile to classes, everything included.
+- mesh: distance of the truth to the meshes made by true classes and by those told (the first street).
+- semkitti: shape alone on a labelled sweep (one; no photo). kitti: pixels against polygons drawn on three photos.
+
+Ends with `RESULT {json}`; null where a part was left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bench.measure import measure
+from pipeline.classes import CODE
+from segmentation.score import MEAN_OF, Confusion, confusion
+
+ROOT = Path(__file__).resolve().parent.parent
+DATA = ROOT.parent / "shared" / "data"
+POLYGONS = ROOT / "tests" / "segmentation" / "kitti_polygons.json"
+STREETS = (901, 902, 903)
+SEMKITTI = {
+    40: "road", 44: "road", 60: "road", 48: "sidewalk", 49: "sidewalk", 72: "terrain", 50: "building",
+    51: "wall_or_fence", 70: "high_vegetation", 71: "high_vegetation", 80: "pole", 81: "road_sign",
+    10: "vehicle", 11: "vehicle", 13: "vehicle", 15: "vehicle", 18: "vehicle", 20: "vehicle", 252: "vehicle",
+    30: "person", 254: "person",
+}  # fmt: skip
+PARTS = ("streets", "time", "kitti", "semkitti", "mesh")
+
+
+def scan2sim(*arguments: object) -> float:
+    """Run the command; seconds."""
+    measured = measure([str(Path(sys.executable).parent / "scan2sim"), *map(str, arguments)])
+    if measured.status:
+        sys.exit(f"scan2sim {arguments[0]} failed with exit status {measured.status}")
+    return measured.seconds
+
+
+def street(out: Path, seed: int) -> Path:
+    """A held-out street's tile, made if absent."""
+    from data_samples.layout import Style
+    from data_samples.street import generate
+    from data_samples.training import any_style
+
+    folder = out / f"street_{seed}"
+    if not (folder / "tile.toml").is_file():
+        style = Style() if seed == STREETS[0] else any_style(np.random.default_rng([seed, 11]))
+        generate(folder, length=60, points=2e6, photos=24, seed=seed, style=style)
+    return folder
+
+
+def told(tile: Path, out: Path, *settings: str) -> tuple[Confusion, float]:
+    """Run `scan2sim segment` anew on a tile whose cloud has classes; what it told, and seconds."""
+    from pipeline.io import las
+    from pipeline.io.tile import read_tile
+
+    shutil.rmtree(out, ignore_errors=True)
+    seconds = scan2sim("segment", tile, "--out", out, "--overwrite", *(x for s in settings for x in ("--set", s)))
+    read = read_tile(tile)
+    known = las.read(read.clouds[0], read.frame).label
+    found = las.read(out / "classified" / f"{read.clouds[0].stem}.laz", read.frame).label
+    assert known is not None and found is not None
+    return confusion(known, found), seconds
+
+
+def streets(out: Path) -> dict[str, float]:
+    """Figures on the held-out streets, by photos and by shape alone."""
+    rows: dict[str, list[Confusion]] = {"photos": [], "shape": []}
+    for seed in STREETS:
+        tile = street(out, seed)
+        for kind, settings in (("photos", ()), ("shape", ("segment.photos=false",))):
+            found, seconds = told(tile, out / f"told_{seed}_{kind}", *settings)
+            rows[kind].append(found)
+            sign = found.iou.get("road_sign", float("nan"))
+            print(f"\nstreet {seed}, {kind}: mIoU {found.mean():.3f}, signs {sign:.3f}, {seconds:.0f} s")
+            print(found.table(), flush=True)
+    return {
+        "point_miou": float(np.mean([c.mean() for c in rows["photos"]])),
+        "sign_iou": float(np.mean([c.iou["road_sign"] for c in rows["photos"] if "road_sign" in c.iou])),
+        "geometry_miou": float(np.mean([c.mean() for c in rows["shape"]])),
+    }
+
+
+def time_of_nine_million(out: Path) -> float:
+    """Minutes from tile to classes."""
+    tile = out.parent / "street_100_9e+06_40"
+    if not (tile / "tile.toml").is_file():
+        scan2sim("sample", "--length=100", "--points=9e6", "--photos=40", "--seed=0", tile)
+    found, seconds = told(tile, out / "told_9m")
+    print(f"\n9 million points, 40 photos: {seconds:.0f} s, mIoU {found.mean():.3f}\n{found.table()}", flush=True)
+    return seconds / 60
+
+
+def mesh(out: Path) -> dict[str, float]:
+    """Metres from the truth to the meshes, by true classes and by those told."""
+    tile, figures = street(out, STREETS[0]), {}
+    for kind, settings in (("true", []), ("told", ["--set", "segment.overwrite=true"])):
+        folder = out / f"world_{kind}"
+        scan2sim("run", tile, "--out", folder, "--set", "unwrap.texel=0.05", *settings)
+        for group, value in json.loads((folder / "report.json").read_text())["geometry"]["truth_mean_m"].items():
+            figures[f"{kind}_{group}"] = value
+    print(f"\nmesh to truth (m): {figures}", flush=True)
+    return figures
+
+
+def semkitti() -> Confusion:
+    """Shape alone on a labelled sweep."""
+    from pipeline.types import Frame, PointCloud
+    from segmentation.geometric import classify
+
+    folder = DATA / "semkitti"
+    xyz = np.fromfile(folder / "00_000000.bin", np.float32).reshape(-1, 4)[:, :3]
+    label = np.fromfile(folder / "00_000000.label", np.uint32) & 0xFFFF
+    table = np.zeros(65536, np.uint8)
+    for code, name in SEMKITTI.items():
+        table[code] = CODE[name]
+    found = confusion(table[label], classify(PointCloud(Frame(), np.ascontiguousarray(xyz))))
+    print(f"\nsemkitti, shape alone: mIoU {found.mean():.3f}\n{found.table()}", flush=True)
+    return found
+
+
+def kitti(pictures: Path) -> Confusion:
+    """The shipped network's pixels on three photos, against polygons; overlays of every fifth photo in `pictures`."""
+    import cv2
+
+    from pipeline.classes import colour_of
+    from pipeline.io import image
+    from pipeline.types import Camera
+    from segmentation.backends import load
+    from segmentation.labels import CLASSES, code_of_index
+    from segmentation.photos import Labeller, labels_of
+
+    labeller = Labeller(load("street", None), "street")
+    truth = json.loads(POLYGONS.read_text(encoding="utf-8"))["photos"]
+    known, found = [], []
+    pictures.mkdir(parents=True, exist_ok=True)
+    colours = colour_of()
+    colours[0] = (135, 190, 230)
+    for i, path in enumerate(sorted((DATA / "kitti_raw0009_f00-24").rglob("image_02/data/*"))):
+        if path.name not in truth and i % 5:
+            continue
+        rgb = image.read_rgb(path)
+        assert rgb is not None
+        h, w = rgb.shape[:2]
+        camera = Camera("pinhole", w, h, 721.5, 721.5, 609.6, 172.9)
+        best, _ = labels_of(labeller.probabilities(rgb, camera), (h, w))
+        image.write(pictures / f"{path.stem}.png", (0.5 * rgb + 0.5 * colours[code_of_index()[best]]).astype(np.uint8))
+        if path.name in truth:
+            drawn = np.full((h, w), 255, np.uint8)
+            for polygon in truth[path.name]["polygons"]:
+                points = np.array(polygon["points"], np.float64).round().astype(np.int32)
+                cv2.fillPoly(drawn, [points], CLASSES.index(polygon["class"]))
+            some = drawn != 255
+            known.append(drawn[some])
+            found.append(best[some])
+    codes = code_of_index()
+    codes[CLASSES.index("sky")] = 200
+    result = confusion(codes[np.concatenate(known)], codes[np.concatenate(found)])
+    print(f"\nKITTI pixels (200 is sky): mIoU {np.mean(list(result.iou.values())):.3f}\n{result.table()}", flush=True)
+    return result
+
+
+def main() -> None:
+    """Run the parts, print tables and the result."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--out", type=Path, default=ROOT / "bench-out" / "segmentation")
+    arguments = parser.parse_args()
+    out: Path = arguments.out
+    out.mkdir(parents=True, exist_ok=True)
+    result: dict[str, Any] = dict.fromkeys(("point_miou", "sign_iou", "geometry_miou", "minutes_9m"))
+    print(f"mean over {', '.join(MEAN_OF)}")
+    if "streets" in arguments.parts:
+        result |= streets(out)
+    if "time" in arguments.parts:
+        result["minutes_9m"] = time_of_nine_million(out)
+    if "mesh" in arguments.parts:
+        mesh(out)
+    for part, needed, work in (
+        ("semkitti", "semkitti", semkitti),
+        ("kitti", "kitti_raw0009_f00-24", lambda: kitti(out / "overlays")),
+    ):
+        if part in arguments.parts and (DATA / needed).is_dir():
+            work()
+        elif part in arguments.parts:
+            print(f"{part}: left out, there is no {DATA / needed}")
+    print("RESULT " + json.dumps({k: None if v is None else round(v, 3) for k, v in result.items()}))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,153 @@
+"""`scan2sim segment`: classes for a tile's points and photos, training, and figures; the recipe's first steps."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from flows.display import console, progress
+from flows.execute import locked, plan
+from flows.recipe import Node, Output, recipe
+from flows.run import STORE, Log, execute_shown, show_warnings
+from flows.settings import Settings
+from pipeline.errors import DataError
+from pipeline.io import image, las
+from pipeline.io import views as views_io
+from pipeline.io.las_classes import write_classified
+from pipeline.io.tile import read_tile
+from pipeline.store import Store
+from pipeline.types import PointCloud, Tile
+from segmentation.score import confusion
+
+CLOUDS = (".las", ".laz", ".copc")
+
+
+def segment_tile(path: Path, out: Path, settings: Settings) -> None:
+    """Write `classified/*.laz`, `labels/*.png` (LAS codes a pixel) and `masks/*.png` of the tile at `path`.
+
+    Results are kept in `out/steps`, so that `scan2sim run --out` the same folder goes on from there.
+
+    Raises:
+        ScanError: see `pipeline.errors`; earlier results stay.
+    """
+    tile = read_tile(path)
+    with locked(out):
+        store = Store(out / STORE)
+        nodes = up_to("segment", recipe(tile, settings))
+        planned = plan(nodes, store)
+        log = Log(out / "run.log")
+        log.write(f"segment {tile.path}, settings {json.dumps(settings.values)}")
+        with log.errors(out):
+            done = execute_shown(planned, store, log)
+        keys = {p.node.label: p.key for p in planned}
+        files = {
+            (label, name): store.folder(label, keys[label]) / file
+            for label, manifest in done.items()
+            for name, file in manifest.files.items()
+        }
+        told, own = PointCloud.load(files["segment", "cloud"]).label, PointCloud.load(files["ingest", "cloud"]).label
+        assert told is not None
+        with np.load(files["segment", "confidence"]) as beside:
+            _write_clouds(tile, out / "classified", told, beside["confidence"], beside["source"])
+        if ("label", "labels") in files:
+            _write_pictures(files["views", "views"], files["label", "labels"], out)
+    show_warnings(done)
+    console.print(json.dumps(done["segment"].facts, indent=1), highlight=False, markup=False)
+    if own is not None and done["segment"].facts["source"] != "cloud" and done["segment"].facts["own_classes"] > 0:
+        console.print(confusion(own, told).table(), highlight=False, markup=False, soft_wrap=True)
+    console.print(f"Clouds: {out / 'classified'}", highlight=False, soft_wrap=True, markup=False)
+
+
+def up_to(last: str, nodes: list[Node]) -> list[Node]:
+    """The nodes that one needs, and itself, in order."""
+    wanted = {last}
+    for node in reversed(nodes):
+        if node.label in wanted:
+            wanted |= {source.node for source in node.inputs.values() if isinstance(source, Output)}
+    return [node for node in nodes if node.label in wanted]
+
+
+def _write_clouds(tile: Tile, out: Path, code: np.ndarray, confidence: np.ndarray, source: np.ndarray) -> None:
+    """Every cloud of the tile with its points' classes."""
+    out.mkdir(parents=True, exist_ok=True)
+    counts = [las.read_header(path)[0] if path.suffix.lower() in CLOUDS else 0 for path in tile.clouds]
+    if 0 in counts or sum(counts) != len(code):
+        raise DataError(
+            tile.path, "has clouds that aren't LAS, or points that aren't finite", "Convert the clouds to LAZ first"
+        )
+    for path, n, start in zip(tile.clouds, counts, np.cumsum([0, *counts]), strict=False):
+        here = slice(int(start), int(start) + n)
+        write_classified(path, out / f"{path.stem}.laz", code[here], confidence[here], source[here])
+
+
+def _write_pictures(views: Path, labels: Path, out: Path) -> None:
+    """Codes of every pixel, and masks: 0 on vehicles, people and the sky, 255 elsewhere."""
+    from segmentation.labels import CLASSES, code_of_index
+    from segmentation.photos import labels_of
+
+    away = np.isin(np.arange(len(CLASSES)), [CLASSES.index(name) for name in ("vehicle", "person", "sky")])
+    for folder in (out / "labels", out / "masks"):
+        folder.mkdir(exist_ok=True)
+    for i, view in enumerate(views_io.load(views)):
+        if (labels / f"{i}.npy").is_file():
+            best, _ = labels_of(np.load(labels / f"{i}.npy"), (view.camera.height, view.camera.width))
+            name = f"{Path(view.name).stem}.png"
+            image.write(out / "labels" / name, code_of_index()[best])
+            image.write(out / "masks" / name, np.where(away[best], 0, 255).astype(np.uint8))
+
+
+def train_network(folder: Path, weights: Path, *, minutes: float, steps: int, seed: int) -> None:
+    """Train the project's own network on a folder of labelled photos, and write its weights."""
+    from segmentation.backends.street import save
+    from segmentation.train import Recipe, train
+
+    recipe_ = Recipe(steps=steps, minutes=minutes, seed=seed)
+    with progress("training") as report:
+        trained = train(folder, recipe_, report)
+    save(trained.network, weights, {"recipe": str(recipe_), "iou": trained.iou})
+    _print_iou(trained.iou)
+    console.print(f"Weights: {weights}", highlight=False, soft_wrap=True, markup=False)
+
+
+def evaluate(path: Path, out: Path, settings: Settings) -> None:
+    """Print figures: of a folder of labelled photos, by pixel; of a tile whose cloud has classes, by point."""
+    if (path / "labels").is_dir():
+        _print_iou(_pixels(path, settings))
+        return
+    segment_tile(path, out, settings)
+
+
+def _pixels(folder: Path, settings: Settings) -> dict[str, float]:
+    """Intersection over union of a network's pixels, by class; photos taken as they are."""
+    from pipeline.types import Camera
+    from segmentation.backends import load
+    from segmentation.label import LABEL
+    from segmentation.labels import CLASSES, IGNORED, code_of_index
+    from segmentation.photos import Labeller, labels_of
+    from segmentation.train import pairs, read
+
+    given = settings.params(LABEL)
+    network = load(given.network, given.weights, given.device)
+    labeller = Labeller(network, str(given.weights or network.facts.name))
+    resolution = network.facts.pixels_a_radian or 1.0
+    known, told = [], []
+    for rgb, truth in (read(*pair) for pair in pairs(folder)):
+        h, w = truth.shape
+        camera = Camera("pinhole", w, h, resolution, resolution, (w - 1) / 2, (h - 1) / 2)
+        best, _ = labels_of(labeller.probabilities(rgb, camera), (h, w))
+        some = truth != IGNORED
+        known.append(truth[some])
+        told.append(best[some])
+    codes = code_of_index()
+    codes[CLASSES.index("sky")] = 255  # a code of its own: 0 says unknown
+    found = confusion(codes[np.concatenate(known)], codes[np.concatenate(told)]).iou
+    return {("sky" if name == "255" else name): value for name, value in found.items()}
+
+
+def _print_iou(iou: dict[str, float]) -> None:
+    for name, value in iou.items():
+        console.print(f"{name:18s}{value:7.3f}", highlight=False)
+    if iou:
+        console.print(f"{'mean':18s}{sum(iou.values()) / len(iou):7.3f}", highlight=False)

@@ -1,0 +1,157 @@
+"""Any segmentation network in an ONNX file of the user's, by onnxruntime.
+
+The file has one input, (1, 3, H, W) float RGB, and one output, (1, C, h, w) logits or probabilities. Its
+`metadata_props` may tell, as JSON: "labels", names of the C channels in order (else `<name>.labels.txt` beside it, one
+a line); "mean" and "std" that the input, 1 for white, is normalised with (else ImageNet's). "license" is told on.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.errors import InputError, SettingError
+from pipeline.types import F32, U8
+from segmentation.backends import Facts
+from segmentation.backends.segformer import MEAN, STD, numbers
+
+FLOATS = {"tensor(float)": "float32", "tensor(float16)": "float16"}
+CUDA = "CUDAExecutionProvider"
+REMEDY = "Export the network with one input (1, 3, H, W) of floats and one output (1, C, h, w)"
+
+
+def available() -> str | None:
+    """What to install, or None."""
+    return None if importlib.util.find_spec("onnxruntime") else "onnxruntime"
+
+
+def load(weights: Path | None, device: str) -> Network:
+    """The network of an ONNX file.
+
+    Raises:
+        SettingError: no file is given, or onnxruntime can't use the device.
+        InputError: it is missing, damaged, has other inputs or outputs, or doesn't name its labels.
+    """
+    if weights is None:
+        raise SettingError("label.weights", "'onnx' comes without weights", "Give an ONNX file")
+    return Network(weights, device)
+
+
+class Network:
+    """See `segmentation.backends.Network`; h, w are what the file gives, also where it wants photos of a fixed size."""
+
+    def __init__(self, path: Path, device: str) -> None:
+        self._path = path
+        self._session = _session(path, device)
+        inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
+        if len(inputs) != 1 or len(outputs) != 1:
+            names = ", ".join(value.name for value in [*inputs, *outputs])
+            raise InputError(path, f"has {len(inputs)} inputs and {len(outputs)} outputs ({names})", REMEDY)
+        (given,), (got,) = inputs, outputs
+        wanted, told = _sizes(given.shape), _sizes(got.shape)
+        fits = len(wanted) == 4 and wanted[0] in (1, None) and wanted[1] in (3, None)
+        if given.type not in FLOATS or not fits:
+            raise InputError(path, f"takes {given.type} of {given.shape}", REMEDY)
+        if got.type not in FLOATS or (got.shape and len(told) != 4):
+            raise InputError(path, f"gives {got.type} of {got.shape}", REMEDY)
+        self._input, self._type, self._size = given.name, FLOATS[given.type], wanted[2:]
+        meta = self._session.get_modelmeta().custom_metadata_map
+        labels = _labels(path, meta)
+        if got.shape and told[1] not in (None, len(labels)):
+            raise InputError(path, f"gives {told[1]} channels, but {len(labels)} labels are named", "Name one each")
+        self._mean = numbers(_json(meta.get("mean"), MEAN), 3, path, least=-np.inf)
+        self._std = numbers(_json(meta.get("std"), STD), 3, path)
+        digest = hashlib.sha256(path.read_bytes())
+        beside = path.with_name(path.name + ".data")  # where exporters put large weights
+        if beside.is_file():
+            digest.update(beside.read_bytes())
+        licence = meta.get("license") or "not told"
+        self.facts = Facts(f"onnx ({path.name})", labels, digest.hexdigest(), licence, None)
+
+    def probabilities(self, rgb: U8) -> F32:
+        """See `segmentation.backends.Network`.
+
+        Raises:
+            InputError: the network can't take a photo of this size, or gives something else than it should.
+        """
+        import cv2
+
+        height, width = (fixed or own for fixed, own in zip(self._size, rgb.shape[:2], strict=True))
+        if (height, width) != rgb.shape[:2]:
+            smaller = height * width < rgb.shape[0] * rgb.shape[1]
+            rgb = cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)
+        x = (rgb.astype(np.float32) / 255 - self._mean) / self._std
+        try:
+            (out,) = self._session.run(None, {self._input: x.transpose(2, 0, 1)[None].astype(self._type)})
+        except Exception as error:  # onnxruntime's errors have no kind in common
+            raise _told(error, self._path, f"fails on a photo of {width} x {height}", REMEDY) from None
+        if out.ndim != 4 or out.shape[:2] != (1, len(self.facts.labels)):
+            cause = f"gives {out.shape} for {len(self.facts.labels)} labels"
+            raise InputError(self._path, cause, "Name a label for every channel of a (1, C, h, w) output")
+        logits = out[0].astype(np.float32)
+        total = logits.sum(axis=0, keepdims=True)
+        if logits.min() >= 0 and np.abs(total - 1).max() < 0.01:  # probabilities; rounded, if in half precision
+            return np.asarray(logits / total, np.float32)
+        powers = np.exp(logits - logits.max(axis=0, keepdims=True))
+        return np.asarray(powers / powers.sum(axis=0, keepdims=True), np.float32)
+
+
+def _session(path: Path, device: str) -> Any:
+    import onnxruntime
+
+    if not path.is_file():
+        raise InputError(path, "is no file", "Give an ONNX file on this disk; nothing is downloaded")
+    number = {"device_id": device.partition(":")[2] or "0"}
+    providers = [] if device == "cpu" or CUDA not in onnxruntime.get_available_providers() else [(CUDA, number)]
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 4  # its errors are raised; no need to print them as well
+    try:
+        session = onnxruntime.InferenceSession(path, options, [*providers, "CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime's errors have no kind in common
+        raise _told(error, path, "can't be loaded", "Copy or export it again, with its .data if it has one") from None
+    if device.startswith("cuda") and CUDA not in session.get_providers():
+        raise SettingError(
+            "label.device", f"onnxruntime can't use {device!r} here", "Install onnxruntime-gpu, or set cpu"
+        )
+    return session
+
+
+def _told(error: Exception, path: Path, cause: str, remedy: str) -> Exception:
+    """MemoryError where onnxruntime tells of too little memory, else an InputError."""
+    why = str(error).strip().split("\n")[0]
+    full = any(
+        words in str(error).lower() for words in ("out of memory", "allocate memory", "bad_alloc", "alloc_failed")
+    )
+    return MemoryError(why) if full else InputError(path, f"{cause} ({why})", remedy)
+
+
+def _sizes(shape: list[int | str | None]) -> tuple[int | None, ...]:
+    """None for what is known only when it runs."""
+    return tuple(size if isinstance(size, int) and size > 0 else None for size in shape)
+
+
+def _json(text: str | None, other: object) -> Any:
+    """What is told, as it stands if it is no JSON; `other` where nothing is."""
+    try:
+        return other if text is None else json.loads(text)
+    except ValueError:
+        return text
+
+
+def _labels(path: Path, meta: dict[str, str]) -> tuple[str, ...]:
+    beside = path.with_suffix(".labels.txt")
+    remedy = f'Name them in order of the channels: metadata "labels" as a JSON list, or {beside.name}, one a line'
+    try:
+        told = _json(meta.get("labels"), None) or [line.strip() for line in beside.read_text("utf-8-sig").split("\n")]
+    except FileNotFoundError:
+        raise InputError(path, "doesn't name its labels", remedy) from None
+    except (OSError, ValueError) as error:
+        raise InputError(beside, f"can't be read ({error})", remedy) from None
+    if not isinstance(told, list) or not any(told) or not all(isinstance(name, str) for name in told):
+        raise InputError(path, "has labels that are no list of names", remedy)
+    return tuple(name for name in told if name)

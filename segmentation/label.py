@@ -1,0 +1,90 @@
+"""Label: a network's classes for every pixel of every photo, and masks of what is no street."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pipeline.step import Done, Inputs, Params, Report, Step
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from pipeline.types import U8
+
+
+class LabelParams(Params):
+    """Which network looks at the photos.
+
+    Attributes:
+        network: "street", the project's own; "segformer" or "onnx", with the user's weights.
+        weights: file or folder of the weights; default: those that come with the project (of "street").
+        device: of torch, as "cuda" or "cpu"; "auto": a GPU where there is one.
+        overwrite, min_classified, photos: as of `segment`, set by the recipe: photos are not looked at where the
+            cloud keeps its own classes, or where they aren't asked.
+    """
+
+    network: str = "street"
+    weights: Path | None = None
+    device: str = "auto"
+    overwrite: bool = False
+    min_classified: float = 0.2
+    photos: bool = True
+
+
+def label(inputs: Inputs, params: LabelParams, out: Path, report: Report) -> Done:
+    """Look at every photo of `views`, unless `cloud` has classes that are kept.
+
+    Folder: `labels`, with `<view index>.npy`: (h, w, C) uint8 probabilities by class of `segmentation.labels`, and
+    `network.json`: what is known of the network.
+    """
+    import json
+
+    import numpy as np
+
+    from pipeline.io import image
+    from pipeline.io import views as views_io
+    from pipeline.types import PointCloud
+    from segmentation.backends import load
+    from segmentation.photos import Labeller
+
+    folder = out / "labels"
+    folder.mkdir()
+    views = views_io.load(inputs["views"])
+    kept = not params.overwrite and classified(PointCloud.load(inputs["cloud"]).label) >= params.min_classified
+    if kept or not views or not params.photos:
+        return Done({"labels": folder}, {"photos": 0, "why": "the cloud has classes" if kept else "none is asked"})
+    network = load(params.network, params.weights, params.device)
+    labeller = Labeller(network, str(params.weights or network.facts.name))
+    warnings = []
+    for i, view in enumerate(views):
+        report(i / len(views), view.name)
+        rgb = image.read_rgb(view.photo)
+        if rgb is None or rgb.shape[:2] != (view.camera.height, view.camera.width):
+            warnings.append(f"{view.photo} can't be read or is not of its camera's size: it tells no classes")
+            continue
+        np.save(folder / f"{i}.npy", labeller.probabilities(rgb, view.camera))
+    facts = network.facts
+    told = {"network": facts.name, "sha256": facts.sha256, "licence": facts.licence, "tells": labeller.tells}
+    (folder / "network.json").write_text(json.dumps(told, indent=1), encoding="utf-8")
+    return Done(
+        {"labels": folder},
+        {"photos": len(views) - len(warnings), **told},
+        warnings,
+    )
+
+
+def classified(label: U8 | None) -> float:
+    """Share of points that have a class of their own (other than never classified and unclassified)."""
+    import numpy as np
+
+    from pipeline.classes import UNKNOWN
+
+    if label is None or not len(label):
+        return 0.0
+    known: npt.NDArray[np.bool_] = ~np.isin(label, UNKNOWN)
+    return float(known.mean())
+
+
+LABEL = Step("label", 1, label, LabelParams)

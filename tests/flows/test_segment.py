@@ -1,0 +1,86 @@
+"""`scan2sim segment` as a user types it, with the network that comes along."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from pipeline.io import las
+from pipeline.io.tile import read_tile
+from segmentation.score import confusion
+from tests.flows.test_cli import bad, good, scan2sim
+
+pytest.importorskip("torch", reason="torch is not installed (pip install 'scan2sim[segmentation]')")
+
+
+@pytest.fixture(scope="module")
+def told(small_street: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """The small street segmented anew, and what the command printed."""
+    out = tmp_path_factory.mktemp("told")
+    return out, good(scan2sim("segment", small_street, "--out", out, "--overwrite"))
+
+
+def test_points_get_their_classes_from_the_photos(small_street: Path, told: tuple[Path, str]) -> None:
+    out, printed = told
+    tile = read_tile(small_street)
+    before = las.read(tile.clouds[0], tile.frame)
+    after = las.read(out / "classified" / "cloud.laz", tile.frame)
+    np.testing.assert_array_equal(before.xyz, after.xyz)
+    np.testing.assert_array_equal(before.time, after.time)
+    assert before.label is not None and after.label is not None
+    iou = confusion(before.label, after.label).iou
+    assert iou["road"] > 0.8 and iou["building"] > 0.85 and iou["high_vegetation"] > 0.8
+    assert "known as" in printed and "road_sign" in printed
+
+
+def test_photos_get_labels_and_masks(small_street: Path, told: tuple[Path, str]) -> None:
+    out, _ = told
+    for view in read_tile(small_street).views:
+        label = cv2.imread(str(out / "labels" / f"{view.photo.stem}.png"), cv2.IMREAD_GRAYSCALE)
+        mask = cv2.imread(str(out / "masks" / f"{view.photo.stem}.png"), cv2.IMREAD_GRAYSCALE)
+        assert label.shape == mask.shape == (view.camera.height, view.camera.width)
+        np.testing.assert_array_equal(mask == 0, np.isin(label, (0, 66, 67)))
+
+
+def test_a_run_goes_on_from_there(small_street: Path, told: tuple[Path, str]) -> None:
+    out, _ = told
+    plan = good(scan2sim("plan", small_street, "--out", out, "--set", "segment.overwrite=true"))
+    again = {line.split()[0] for line in plan.splitlines() if " yes " in line}
+    assert "split" in again and not again & {"label", "segment", "ingest"}
+
+
+def test_classes_that_are_there_are_kept(small_street: Path, tmp_path: Path) -> None:
+    good(scan2sim("segment", small_street, "--out", tmp_path))
+    tile = read_tile(small_street)
+    before = las.read(tile.clouds[0], tile.frame)
+    after = las.read(tmp_path / "classified" / "cloud.laz", tile.frame)
+    assert before.label is not None and after.label is not None
+    np.testing.assert_array_equal(before.label, after.label)
+    assert not list((tmp_path / "labels").glob("*.png"))
+
+
+def test_bad_weights_leave_earlier_results(small_street: Path, told: tuple[Path, str], tmp_path: Path) -> None:
+    out, _ = told
+    before = (out / "classified" / "cloud.laz").read_bytes()
+    (tmp_path / "w.pt").write_bytes(pickle.dumps({"x": 1}))
+    command = ("segment", small_street, "--out", out, "--overwrite", "--set")
+    bad(scan2sim(*command, f"label.weights={tmp_path / 'w.pt'}"), 3, "w.pt", "safetensors")
+    bad(scan2sim(*command, f"label.weights={tmp_path / 'no.safetensors'}"), 3, "no.safetensors")
+    bad(scan2sim(*command, "label.network=deeplab"), 2, "deeplab", "segformer")
+    assert (out / "classified" / "cloud.laz").read_bytes() == before
+
+
+def test_pixels_are_scored_against_labels(small_street: Path, tmp_path: Path) -> None:
+    from data_samples.street import generate
+
+    generate(tmp_path / "tile", length=10, points=20_000, photos=4, seed=8, photo_width=320, photo_labels=True)
+    (tmp_path / "set").mkdir()
+    (tmp_path / "set" / "images").symlink_to(tmp_path / "tile" / "photos")
+    (tmp_path / "set" / "labels").symlink_to(tmp_path / "tile" / "truth" / "labels")
+    printed = good(scan2sim("segment", "evaluate", tmp_path / "set"))
+    values = {line.split()[0]: float(line.split()[1]) for line in printed.splitlines() if len(line.split()) == 2}
+    assert values["road"] > 0.6 and values["building"] > 0.6 and 0 < values["mean"] < 1

@@ -1,0 +1,290 @@
+"""SegFormer from files, against transformers itself, and what is no such file."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.errors import InputError, SettingError
+from segmentation.backends import load
+from segmentation.labels import CLASSES, mapped
+
+torch = pytest.importorskip("torch", reason="SegFormer runs on torch")
+transformers = pytest.importorskip("transformers", reason="SegFormer is transformers'")
+
+CITYSCAPES = (
+    "road", "sidewalk", "building", "wall", "fence", "pole", "traffic light", "traffic sign", "vegetation", "terrain",
+    "sky", "person", "rider", "car", "truck", "bus", "train", "motorcycle", "bicycle",
+)  # fmt: skip
+NVIDIA = "NVIDIA's SegFormer weights are for non-commercial use"
+
+
+def tiny() -> Any:
+    """A random SegFormer with statistics of its own, so that forgotten weights would show."""
+    torch.manual_seed(3)
+    config = transformers.SegformerConfig(
+        depths=[1, 2, 1, 1], hidden_sizes=[8, 16, 16, 32], num_attention_heads=[1, 1, 2, 2], decoder_hidden_size=24,
+        id2label=dict(enumerate(CITYSCAPES)),
+    )  # fmt: skip
+    net = transformers.SegformerForSemanticSegmentation(config).eval()
+    with torch.no_grad():
+        for value in net.state_dict().values():
+            if value.is_floating_point():
+                value.add_(torch.rand_like(value) * 0.2)
+    return net
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """As save_pretrained writes it."""
+    tiny().save_pretrained(tmp_path / "tiny-b0")
+    return tmp_path / "tiny-b0"
+
+
+def photo(height: int = 70, width: int = 101) -> np.ndarray:
+    return np.random.default_rng(0).integers(0, 256, (height, width, 3)).astype(np.uint8)
+
+
+def reference(rgb: np.ndarray, mean: Any = (0.485, 0.456, 0.406), std: Any = (0.229, 0.224, 0.225)) -> np.ndarray:
+    x = ((rgb / 255 - np.array(mean)) / np.array(std)).astype(np.float32)
+    with torch.no_grad():
+        logits = tiny()(torch.from_numpy(x.transpose(2, 0, 1)[None].copy())).logits
+    return np.asarray(torch.softmax(logits, 1)[0].numpy())
+
+
+def change(file: Path, **changes: object) -> None:
+    told = json.loads(file.read_text())
+    file.write_text(json.dumps({key: value for key, value in {**told, **changes}.items() if value is not None}))
+
+
+def told_of(path: Path) -> InputError:
+    """The one error of a file that can't be used, which tells what to do."""
+    with pytest.raises(InputError) as caught:
+        load("segformer", path, "cpu")
+    assert caught.value.remedy and "\n" not in str(caught.value)
+    return caught.value
+
+
+def test_it_tells_what_transformers_tells(folder: Path) -> None:
+    network = load("segformer", folder, "cpu")
+    found = network.probabilities(photo())
+    assert found.dtype == np.float32 and found.shape == (19, 18, 26)
+    assert np.allclose(found.sum(axis=0), 1, atol=1e-5)
+    assert np.abs(found - reference(photo())).max() < 1e-4
+    assert np.ptp(found, axis=(1, 2)).max() > 0.01, "the network should look at the photo at all"
+    facts = network.facts
+    assert facts.labels == CITYSCAPES and facts.name == "segformer (tiny-b0)" and facts.pixels_a_radian is None
+    assert facts.sha256 == hashlib.sha256((folder / "model.safetensors").read_bytes()).hexdigest()
+    to = mapped(facts.labels, str(folder))
+    assert CLASSES[to[0]] == "road" and CLASSES[to[13]] == "vehicle" and CLASSES[to[10]] == "sky"
+
+
+def test_names_of_old_and_of_new_transformers_are_both_read(folder: Path, tmp_path: Path) -> None:
+    from safetensors.torch import load_file
+
+    old, new = load_file(folder / "model.safetensors"), tiny().state_dict()
+    assert (
+        "segformer.encoder.block.1.0.attention.self.query.weight" in old and "decode_head.linear_c.0.proj.bias" in old
+    )
+    assert not set(old) & {name for name in new if name.startswith("segformer.")}
+    for name, state in (("old", old), ("new", new)):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "config.json").write_bytes((folder / "config.json").read_bytes())
+        torch.save(state, tmp_path / name / "pytorch_model.bin")
+        found = load("segformer", tmp_path / name, "cpu").probabilities(photo())
+        assert np.abs(found - reference(photo())).max() < 1e-4
+
+
+@pytest.mark.parametrize("kind", ["safetensors", "zip", "old pickle", "half precision"])
+def test_a_single_file_beside_its_config_will_do(folder: Path, kind: str) -> None:
+    file = folder / "model.safetensors"
+    if kind != "safetensors":
+        file.unlink()
+        file = folder / "best.pth"
+        state = tiny().state_dict()
+        if kind == "half precision":
+            state = {name: value.half() if value.is_floating_point() else value for name, value in state.items()}
+        torch.save(state, file, _use_new_zipfile_serialization=kind != "old pickle")
+    network = load("segformer", file, "cpu")
+    bar = 0.02 if kind == "half precision" else 1e-4
+    assert np.abs(network.probabilities(photo()) - reference(photo())).max() < bar
+    assert network.facts.name == f"segformer ({file.name})"
+
+
+def test_photos_are_normalised_as_the_folder_tells(folder: Path) -> None:
+    told = {"image_mean": [0.5, 0.4, 0.3], "image_std": [0.2, 0.3, 0.4], "do_normalize": True}
+    (folder / "preprocessor_config.json").write_text(json.dumps(told))
+    found = load("segformer", folder, "cpu").probabilities(photo())
+    assert np.abs(found - reference(photo(), told["image_mean"], told["image_std"])).max() < 1e-4
+    change(folder / "preprocessor_config.json", do_normalize=False)
+    found = load("segformer", folder, "cpu").probabilities(photo())
+    assert np.abs(found - reference(photo(), (0, 0, 0), (1, 1, 1))).max() < 1e-4
+    for wrong in ([0.5, 0.4], "grey", [1, 1, 0], None):
+        (folder / "preprocessor_config.json").write_text(json.dumps({"image_std": wrong}))
+        assert told_of(folder).where.endswith("preprocessor_config.json")
+
+
+def test_narrow_photos_are_looked_at_too(folder: Path) -> None:
+    assert load("segformer", folder, "cpu").probabilities(photo(9, 64)).shape == (19, 8, 16)
+
+
+@pytest.mark.parametrize(
+    ("readme", "licence"),
+    [
+        (None, f"not told; {NVIDIA}"),
+        ("---\nlicense: other\ntags: [vision]\n---\n# B0\n", f"other; {NVIDIA}"),
+        ("---\ntags:\n- vision\nlicense: 'apache-2.0'\n---\n", "apache-2.0"),
+        ("---\nlicense: other\nlicense_name: our-own\n---\n", "other, our-own"),
+        ("# B0\nlicense: mit\n", f"not told; {NVIDIA}"),
+    ],
+)
+def test_the_licence_is_told_on(folder: Path, readme: str | None, licence: str) -> None:
+    if readme:
+        (folder / "README.md").write_text(readme)
+    assert load("segformer", folder, "cpu").facts.licence == licence
+
+
+def test_weights_must_be_given_and_be_there(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(SettingError, match=r"label\.weights"):
+        load("segformer", None, "cpu")
+    assert "nothing is downloaded" in told_of(Path("nvidia/segformer-b0-finetuned-cityscapes-1024-1024")).remedy
+    (tmp_path / "empty").mkdir()
+    assert "has no model.safetensors" in told_of(tmp_path / "empty").cause
+    (folder / "config.json").unlink()
+    assert told_of(folder).where == str(folder / "config.json")
+
+
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.5, 0.999])
+@pytest.mark.parametrize("name", ["model.safetensors", "pytorch_model.bin", "old.bin"])
+def test_half_a_file_is_refused(folder: Path, name: str, share: float) -> None:
+    if name != "model.safetensors":
+        (folder / "model.safetensors").unlink()
+        torch.save(tiny().state_dict(), folder / name, _use_new_zipfile_serialization=name != "old.bin")
+    whole = (folder / name).read_bytes()
+    (folder / name).write_bytes(whole[: int(len(whole) * share)])
+    error = told_of(folder / name)
+    assert error.where == str(folder / name) and "tensors" in error.cause
+
+
+class Trap:
+    """Makes a file when it is unpickled."""
+
+    def __init__(self, made: Path) -> None:
+        self.made = made
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.mkdir, (str(self.made),)
+
+
+@pytest.mark.filterwarnings("ignore:Detected pickle protocol")
+@pytest.mark.parametrize("way", ["torch", "old torch", "pickle", "new pickle"])
+def test_code_in_a_pickle_is_not_run(folder: Path, tmp_path: Path, way: str) -> None:
+    file, made = folder / "pytorch_model.bin", tmp_path / "made"
+    (folder / "model.safetensors").unlink()
+    held = {**tiny().state_dict(), "trap": Trap(made)}
+    if way.endswith("pickle"):
+        file.write_bytes(pickle.dumps({"trap": Trap(made)}, 2 if way == "pickle" else 4))
+    else:
+        torch.save(held, file, _use_new_zipfile_serialization=way == "torch")
+    error = told_of(folder)
+    assert not made.exists()
+    assert error.where == str(file) and "safetensors" in error.remedy
+    said = "tensors alone" if way == "new pickle" else "holds code or objects besides tensors; not run (posix.mkdir)"
+    assert said in error.cause
+    if way == "torch":  # the trap is one
+        torch.load(file, weights_only=False)
+        assert made.exists()
+
+
+@pytest.mark.parametrize("held", [{"epoch": 3}, [1, 2], {"state_dict": {"a": 1}}])
+def test_a_pickle_of_something_else_is_refused(folder: Path, held: object) -> None:
+    torch.save(held, folder / "other.bin")
+    assert "holds no tensors by name" in told_of(folder / "other.bin").cause
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"architectures": ["BeitForSemanticSegmentation"], "model_type": "beit"}, "BeitForSemanticSegmentation"),
+        ({"architectures": ["SegformerForImageClassification"]}, "SegformerForImageClassification"),
+        ({"architectures": None, "model_type": "beit"}, "beit"),
+        ({"architectures": None, "model_type": None}, "another network"),
+    ],
+)
+def test_another_architecture_is_named(folder: Path, changes: dict[str, object], said: str) -> None:
+    change(folder / "config.json", **changes)
+    error = told_of(folder)
+    assert error.where == str(folder / "config.json")
+    assert said in error.cause and "SegformerForSemanticSegmentation" in error.cause
+
+
+@pytest.mark.parametrize("text", ["", "{", "[1]", '"segformer"'])
+def test_a_config_that_is_none_is_refused(folder: Path, text: str) -> None:
+    (folder / "config.json").write_text(text)
+    assert told_of(folder).where == str(folder / "config.json")
+
+
+@pytest.mark.parametrize("labels", [None, {}, ["road"], {"0": "road", "2": "sky"}, {"a": "road"}])
+def test_every_channel_needs_a_label(folder: Path, labels: object) -> None:
+    change(folder / "config.json", id2label=labels)
+    error = told_of(folder)
+    assert error.where == str(folder / "config.json") and "id2label" in error.cause
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"hidden_sizes": [8, 16, 16, 64]},
+        {"depths": [1, 1, 1, 1]},
+        {"depths": [2, 2, 2, 2]},
+        {"depths": [1]},
+        {"depths": "many"},
+        {"num_attention_heads": [3, 3, 3, 3]},
+        {"hidden_act": "none such"},
+        {"num_channels": 4},
+        {"id2label": {"0": "road", "1": "sky"}},
+    ],
+)
+def test_weights_of_another_shape_are_refused(folder: Path, changes: dict[str, object]) -> None:
+    change(folder / "config.json", **changes)
+    error = told_of(folder)
+    assert error.where == str(folder / "model.safetensors") and "doesn't fit" in error.cause
+
+
+def test_a_config_cannot_ask_for_code_from_elsewhere(folder: Path) -> None:
+    change(
+        folder / "config.json", attn_implementation="someone/kernel", _attn_implementation="someone/kernel",
+        auto_map={"AutoModel": "someone/code--net.Net"}, quantization_config={"quant_method": "someone"},
+        reshape_last_stage=False, dtype="float16",
+    )  # fmt: skip
+    found = load("segformer", folder, "cpu").probabilities(photo())
+    assert np.abs(found - reference(photo())).max() < 1e-4
+
+
+def test_nothing_is_asked_of_the_net(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import socket
+
+    def connect(*_: object) -> None:
+        raise AssertionError("a connection was tried")
+
+    monkeypatch.setattr(socket.socket, "connect", connect)
+    monkeypatch.setattr(socket, "getaddrinfo", connect)
+    load("segformer", folder, "cpu")
+    told_of(Path("nvidia/segformer-b0-finetuned-cityscapes-1024-1024"))
+
+
+def test_too_little_memory_on_the_device_is_told(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise torch.cuda.OutOfMemoryError("CUDA out of memory")
+
+    network = load("segformer", folder, "cpu")
+    monkeypatch.setattr(transformers.SegformerForSemanticSegmentation, "forward", full)
+    with pytest.raises(MemoryError, match="out of memory"):
+        network.probabilities(photo())

@@ -1,0 +1,107 @@
+"""The project's own network: the weights that come with it, others, and bad ones; training."""
+
+import json
+import pickle
+
+import numpy as np
+import pytest
+
+from pipeline.errors import DataError, InputError, SettingError
+
+torch = pytest.importorskip("torch", reason="torch is not installed (pip install 'scan2sim[segmentation]')")
+safetensors = pytest.importorskip("safetensors.torch", reason="safetensors is not installed")
+
+from segmentation.backends import load  # noqa: E402
+from segmentation.backends.street import OWN, save  # noqa: E402
+from segmentation.labels import CLASSES  # noqa: E402
+from segmentation.network import StreetNet  # noqa: E402
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    torch.manual_seed(0)
+    path = tmp_path_factory.mktemp("weights") / "w.safetensors"
+    save(StreetNet(len(CLASSES)), path, {"iou": {}})
+    return path
+
+
+def test_the_weights_that_come_along_are_small_and_tell_every_class():
+    network = load("street", None, "cpu")
+    assert OWN.stat().st_size < 8e6
+    assert network.facts.labels == CLASSES and len(network.facts.sha256) == 64
+    found = network.probabilities(np.random.default_rng(0).integers(0, 255, (96, 128, 3), np.uint8))
+    assert found.shape == (len(CLASSES), 24, 32) and found.sum(axis=0) == pytest.approx(1, abs=1e-4)
+
+
+def test_the_same_weights_and_photo_give_the_same_classes(weights):
+    photo = np.random.default_rng(0).integers(0, 255, (100, 130, 3), np.uint8)
+    a, b = (load("street", weights, "cpu").probabilities(photo) for _ in range(2))
+    np.testing.assert_array_equal(a, b)
+
+
+def test_truncated_weights(weights, tmp_path):
+    (tmp_path / "cut.safetensors").write_bytes(weights.read_bytes()[:-1000])
+    with pytest.raises(InputError, match=r"cut\.safetensors"):
+        load("street", tmp_path / "cut.safetensors", "cpu")
+
+
+def test_weights_of_another_network_are_named(tmp_path):
+    safetensors.save_file({"x": torch.zeros(3)}, tmp_path / "a.safetensors", {"network": "UNet", "labels": "[]"})
+    with pytest.raises(InputError, match=r"UNet, not StreetNet"):
+        load("street", tmp_path / "a.safetensors", "cpu")
+    told = {"network": "StreetNet", "labels": json.dumps(CLASSES)}
+    safetensors.save_file({"x": torch.zeros(3)}, tmp_path / "b.safetensors", told)
+    with pytest.raises(InputError, match="lacks weights"):
+        load("street", tmp_path / "b.safetensors", "cpu")
+
+
+def test_a_pickle_is_refused_and_not_run(tmp_path):
+    class Bad:
+        def __reduce__(self):
+            return (open, (str(tmp_path / "harm"), "w"))
+
+    (tmp_path / "w.pt").write_bytes(pickle.dumps(Bad()))
+    with pytest.raises(InputError, match="safetensors"):
+        load("street", tmp_path / "w.pt", "cpu")
+    assert not (tmp_path / "harm").exists()
+
+
+def test_a_backend_that_is_not_there():
+    with pytest.raises(SettingError, match="street, segformer, onnx"):
+        load("deeplab", None)
+
+
+def colourful(folder, n=6):
+    """Labelled photos: the class is the colour."""
+    import cv2
+
+    rng = np.random.default_rng(0)
+    for name in ("images", "labels"):
+        (folder / name).mkdir(parents=True)
+    for i in range(n):
+        label = np.zeros((128, 160), np.uint8)
+        split = int(rng.integers(40, 120))
+        label[:, :split], label[:, split:] = 11, 6
+        rgb = np.where(label[..., None] == 11, (90, 90, 90), (200, 120, 60)).astype(np.uint8)
+        cv2.imwrite(str(folder / "images" / f"{i:03d}_0.png"), rgb[..., ::-1])
+        cv2.imwrite(str(folder / "labels" / f"{i:03d}_0.png"), label)
+    return folder
+
+
+def test_training_learns_and_repeats(tmp_path):
+    from segmentation.train import Recipe, train
+
+    folder = colourful(tmp_path / "set")
+    recipe = Recipe(steps=60, batch=4, crop=(64, 96), held_out=0.2, rate=5e-3)
+    first = train(folder, recipe)
+    assert first.iou["road"] > 0.6 and first.iou["building"] > 0.6
+    again = train(folder, recipe)
+    for a, b in zip(first.network.state_dict().values(), again.network.state_dict().values(), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_a_folder_without_labels_is_named(tmp_path):
+    from segmentation.train import Recipe, train
+
+    with pytest.raises(DataError, match="images"):
+        train(tmp_path, Recipe(steps=1))

@@ -1,0 +1,104 @@
+"""A network over photos of any size and lens, by a network that is known: it tells a pixel's class by its colour."""
+
+import numpy as np
+import pytest
+
+from pipeline.errors import InputError
+from pipeline.types import Camera
+from segmentation.backends import Facts
+from segmentation.labels import CLASSES, IGNORED, LABEL_SETS, code_of_index, index_of_code, mapped
+from segmentation.photos import OVERLAP, Labeller, labels_of
+
+PINHOLE = Camera("pinhole", 640, 480, 500.0, 500.0, 319.5, 239.5)
+PANORAMA = Camera("equirectangular", 1024, 512)
+
+
+class ByColour:
+    """Tells class k where red is 20 k; looks at `seen` sizes, and has memory for `memory` pixels."""
+
+    def __init__(self, labels=CLASSES, resolution=500.0, memory=10**9):
+        self.facts = Facts("by colour", tuple(labels), "", "", resolution)
+        self.memory, self.seen = memory, []
+
+    def probabilities(self, rgb):
+        if rgb.shape[0] * rgb.shape[1] > self.memory:
+            raise MemoryError("too large")
+        self.seen.append(rgb.shape[:2])
+        small = rgb[2::4, 2::4, 0]
+        index = np.clip(np.round(small / 20.0), 0, len(self.facts.labels) - 1).astype(int)
+        return np.eye(len(self.facts.labels), dtype=np.float32)[index].transpose(2, 0, 1)
+
+
+def painted(camera, classes=12):
+    """A photo of upright stripes of all classes, and each pixel's class."""
+    index = np.tile(np.arange(camera.width) * classes // camera.width, (camera.height, 1))
+    return np.repeat((index * 20).astype(np.uint8)[..., None], 3, axis=2), index
+
+
+def test_classes_come_back_where_they_are():
+    rgb, truth = painted(PINHOLE)
+    best, sure = labels_of(Labeller(ByColour(), "").probabilities(rgb, PINHOLE), rgb.shape[:2])
+    assert (best == truth).mean() > 0.95
+    assert sure[best == truth].mean() > 230
+
+
+@pytest.mark.parametrize("camera", [Camera("pinhole", 3000, 2000, 500.0, 500.0, 1499.5, 999.5)])
+def test_large_photos_are_looked_at_in_tiles_without_seams(camera):
+    rgb, truth = painted(camera)
+    network = ByColour()
+    labeller = Labeller(network, "")
+    best, _ = labels_of(labeller.probabilities(rgb, camera), rgb.shape[:2])
+    assert (best == truth).mean() > 0.97
+    assert len(network.seen) > 1 and max(max(size) for size in network.seen) <= labeller.tile
+
+
+def test_a_device_short_of_memory_gets_smaller_tiles():
+    rgb, truth = painted(PINHOLE)
+    network = ByColour(memory=400 * 400)
+    labeller = Labeller(network, "")
+    best, _ = labels_of(labeller.probabilities(rgb, PINHOLE), rgb.shape[:2])
+    assert (best == truth).mean() > 0.93 and labeller.tile < 500
+    with pytest.raises(MemoryError):
+        Labeller(ByColour(memory=100), "").probabilities(rgb, PINHOLE)
+
+
+def test_photos_are_looked_at_at_one_angular_resolution():
+    network = ByColour(resolution=250.0)
+    rgb, _ = painted(PINHOLE)
+    Labeller(network, "").probabilities(rgb, PINHOLE)
+    assert network.seen == [(240, 320)]
+
+
+def test_a_panoramas_seam_is_no_special_place():
+    network = ByColour(resolution=PANORAMA.width / (2 * np.pi))
+    rgb, truth = painted(PANORAMA)
+    best, _ = labels_of(Labeller(network, "").probabilities(rgb, PANORAMA), rgb.shape[:2])
+    assert (best == truth).mean() > 0.95
+    assert {size[1] for size in network.seen} == {1024 + 2 * OVERLAP}, "each side is continued by the other"
+
+
+def test_label_sets_of_others_map_by_name():
+    cityscapes = [
+        "road",
+        "sidewalk",
+        "building",
+        "wall",
+        "fence",
+        "pole",
+        "traffic light",
+        "traffic sign",
+        "vegetation",
+    ]
+    assert [CLASSES[i] for i in mapped(cityscapes, "")] == [
+        "road", "sidewalk", "building", "wall_or_fence", "wall_or_fence", "pole", "road_sign", "road_sign",
+        "high_vegetation",
+    ]  # fmt: skip
+    ade = ["wall", "building, edifice", "sky", "floor, flooring", "tree", "ceiling", "road, route", "bed", "grass"]
+    assert mapped(ade, "")[5] == IGNORED and CLASSES[mapped(ade, "")[4]] == "high_vegetation"
+    with pytest.raises(InputError, match="no known set"):
+        mapped(["cat", "dog"], "pets.onnx")
+
+
+def test_every_foreign_label_maps_onto_a_class_and_codes_go_round():
+    assert all(ours in CLASSES for table in LABEL_SETS.values() for ours in table.values())
+    assert index_of_code()[code_of_index()].tolist() == list(range(len(CLASSES)))

@@ -1,0 +1,138 @@
+"""From pixels to points on the synthetic street, with photos labelled by its own truth."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from pipeline.classes import CODE
+from pipeline.errors import InputError
+from pipeline.io import las
+from pipeline.io import views as views_io
+from pipeline.io.tile import read_tile
+from pipeline.step import silent
+from segmentation.label import LABEL
+from segmentation.labels import CLASSES, index_of_code
+from segmentation.score import confusion
+from segmentation.segment import SEGMENT
+
+
+@pytest.fixture(scope="module")
+def labelled(tmp_path_factory):
+    """A street, its cloud without classes, its photos' true labels as probabilities; and the true classes."""
+    from data_samples.street import generate
+    from pipeline.types import PointCloud
+
+    folder = tmp_path_factory.mktemp("labelled")
+    tile = read_tile(
+        generate(folder / "tile", length=20, points=250_000, photos=12, seed=3, photo_width=640, photo_labels=True)
+    )
+    cloud = las.read(tile.clouds[0], tile.frame)
+    PointCloud(cloud.frame, cloud.xyz, cloud.rgb, time=cloud.time).save(folder / "cloud.npz")
+    tile.trajectory.save(folder / "path.npz")
+    views_io.save(folder / "views.json", tile.views)
+    (folder / "labels").mkdir()
+    for i, view in enumerate(tile.views):
+        codes = cv2.imread(str(folder / "tile/truth/labels" / f"{view.photo.stem}.png"), cv2.IMREAD_GRAYSCALE)
+        index = index_of_code()[codes[::2, ::2]]
+        np.save(folder / "labels" / f"{i}.npy", np.uint8(255) * (index[..., None] == np.arange(len(CLASSES))))
+    (folder / "labels" / "network.json").write_text(json.dumps({"tells": CLASSES}))
+    return folder, cloud.label
+
+
+def segment(folder, out, names=("views", "labels", "path"), **params):
+    files = {"views": "views.json", "labels": "labels", "path": "path.npz"}
+    inputs = {"cloud": folder / "cloud.npz"} | {name: folder / files[name] for name in names}
+    done = SEGMENT.run(inputs, SEGMENT.params(**params), out, silent)
+    from pipeline.types import PointCloud
+
+    with np.load(done.files["confidence"]) as beside:
+        return PointCloud.load(done.files["cloud"]).label, dict(beside), done
+
+
+def test_photos_that_are_right_make_points_right(labelled, tmp_path):
+    folder, truth = labelled
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "shape").mkdir()
+    told, beside, done = segment(folder, tmp_path / "photos")
+    found = confusion(truth, told)
+    print(found.table())
+    assert found.mean() > 0.85 and found.iou["road_sign"] > 0.6 and found.iou["road"] > 0.93
+    shape, *_ = segment(folder, tmp_path / "shape", photos=False)
+    assert found.mean() > confusion(truth, shape).mean() + 0.15
+    assert done.facts["sky_share"] < 0.08 and done.facts["seen_share"] > 0.5
+    sure, source = beside["confidence"], beside["source"]
+    right = told == truth
+    assert sure[right].mean() > sure[~right].mean() + 20, "confidence tells right from wrong"
+    assert set(np.unique(source)) <= {1, 2} and (right[source == 1].mean()) > right[source == 2].mean()
+
+
+def test_a_wrong_pose_shows_in_the_skys_share(labelled, tmp_path):
+    folder, _ = labelled
+    views = list(views_io.load(folder / "views.json"))
+    for view in views:
+        view.T_world_cam[:3, :3] = view.T_world_cam[:3, :3] @ np.array([[1, 0, 0], [0, 0.9, 0.43], [0, -0.43, 0.9]])
+    views_io.save(tmp_path / "views.json", views)
+    done = SEGMENT.run(
+        {"cloud": folder / "cloud.npz", "views": tmp_path / "views.json", "labels": folder / "labels"},
+        SEGMENT.params(), tmp_path, silent,
+    )  # fmt: skip
+    assert done.facts["sky_share"] > 0.15 and any("poses" in w for w in done.warnings)
+
+
+def test_a_network_that_knows_only_vegetation_has_it_parted_by_height(labelled, tmp_path):
+    folder, truth = labelled
+    labels = tmp_path / "labels"
+    labels.mkdir()
+    low, high = CLASSES.index("low_vegetation"), CLASSES.index("high_vegetation")
+    for file in (folder / "labels").glob("*.npy"):
+        p = np.load(file)
+        p[..., high], p[..., low] = p[..., high] | p[..., low], 0
+        np.save(labels / file.name, p)
+    (labels / "network.json").write_text(json.dumps({"tells": [c for c in CLASSES if c != "low_vegetation"]}))
+    inputs = {"cloud": folder / "cloud.npz", "views": folder / "views.json", "labels": labels}
+    done = SEGMENT.run(inputs, SEGMENT.params(), tmp_path, silent)
+    from pipeline.types import PointCloud
+
+    iou = confusion(truth, PointCloud.load(done.files["cloud"]).label).iou
+    assert iou["low_vegetation"] > 0.5 and iou["high_vegetation"] > 0.85
+
+
+def test_photos_without_overlap_leave_it_to_shape(labelled, tmp_path):
+    folder, _ = labelled
+    (tmp_path / "labels").mkdir()
+    done = SEGMENT.run(
+        {"cloud": folder / "cloud.npz", "views": folder / "views.json", "labels": tmp_path / "labels"},
+        SEGMENT.params(), tmp_path, silent,
+    )  # fmt: skip
+    assert done.facts["source"] == "shape" and any("shape alone" in w for w in done.warnings)
+
+
+def test_classes_that_are_there_are_kept_and_photos_not_looked_at(labelled, tmp_path):
+    from pipeline.types import PointCloud
+
+    folder, truth = labelled
+    cloud = PointCloud.load(folder / "cloud.npz")
+    PointCloud(cloud.frame, cloud.xyz, label=truth).save(tmp_path / "own.npz")
+    for name in ("label", "kept"):
+        (tmp_path / name).mkdir()
+    inputs = {"cloud": tmp_path / "own.npz", "views": folder / "views.json"}
+    done = LABEL.run(inputs, LABEL.params(network="nonsense"), tmp_path / "label", silent)
+    assert done.facts["photos"] == 0 and "classes" in done.facts["why"]
+    kept = SEGMENT.run(inputs | {"labels": done.files["labels"]}, SEGMENT.params(), tmp_path / "kept", silent)
+    np.testing.assert_array_equal(PointCloud.load(kept.files["cloud"]).label, truth)
+
+
+def test_ground_codes_and_vehicles_have_their_own_classes(labelled, tmp_path):
+    folder, _ = labelled
+    told, *_ = segment(folder, tmp_path)
+    assert {CODE[n] for n in ("road", "sidewalk", "terrain", "building", "high_vegetation")} <= set(told.tolist())
+
+
+def test_weights_that_are_no_weights_are_named(tmp_path):
+    pytest.importorskip("torch")
+    from segmentation.backends import load
+
+    with pytest.raises(InputError, match=r"no\.safetensors"):
+        load("street", tmp_path / "no.safetensors")
