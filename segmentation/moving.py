@@ -16,12 +16,14 @@ from pipeline.visibility import times_of_moving
 
 HEIGHTS = (0.15, 2.6)
 """Metres above ground between which things that move are looked for."""
+LASTING = 10.0
+"""Seconds that a survey must last: in a shorter one what stands is passed in a moment, too."""
 AROUND, SHARE, NEIGHBOURS = 0.6, 0.7, 24
 """Of a point's neighbours within so many metres, this share must have moved, too."""
 
 
 def moving(cloud: PointCloud, height: F32, ground: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-    """(N,) which points are of moving things; none where points have no time.
+    """(N,) which points are of moving things; none where points have no time, or the survey is short.
 
     Args:
         cloud: thinned, with time.
@@ -32,7 +34,7 @@ def moving(cloud: PointCloud, height: F32, ground: npt.NDArray[np.bool_]) -> npt
 
     out = np.zeros(len(cloud), bool)
     some = np.flatnonzero(~ground & (height > HEIGHTS[0]) & (height < HEIGHTS[1]))
-    if cloud.time is None or len(some) < NEIGHBOURS or np.ptp(cloud.time) == 0:
+    if cloud.time is None or len(some) < NEIGHBOURS or np.ptp(cloud.time) < LASTING:
         return out
     part = replace(cloud.take(some), label=np.full(len(some), CODE["vehicle"], np.uint8))
     moved = ~np.isnan(times_of_moving(part))

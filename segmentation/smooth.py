@@ -20,15 +20,19 @@ from segmentation.votes import Votes
 
 Bools = npt.NDArray[np.bool_]
 
-NEIGHBOURS = 10
-ROUNDS = 6
-PULL = 2.5
+NEIGHBOURS = 24
+ROUNDS = 10
+PULL = 16.0
 """Weight of all neighbours together against a point's own evidence."""
-TRUST = 0.35
+TRUST = 0.25
 """Power of the shape's likelihood beside photos: features of one place aren't independent."""
 ENOUGH = 0.6
 """Votes' weight at which a point's photos say all that they can."""
 UNSURE = 0.02
+UNSEEN = 0.05
+"""Votes' weight up to which a point counts as unseen."""
+REACH_GROUND, REACH, LENT, LENDERS = 4.0, 2.0, 1.0, 8
+"""Metres over which the unseen takes after the seen, the share at no distance, and of how many."""
 HIGH, LOW = 2.6, 1.2
 """Metres above ground: vegetation higher is high; where nothing around is higher than the second, it is low."""
 
@@ -74,10 +78,11 @@ def decide(
     assert cloud.normal is not None
     rgb = np.zeros((0, 3), np.uint8) if cloud.rgb is None else cloud.rgb
     alike = _alike(near, cloud.normal, rgb, normal_pull)
-    probability = mean_field(unary, near, alike)
-    probability[:, SKY] = 0
-    best = probability.argmax(axis=1).astype(np.uint8)
-    sure = probability[np.arange(len(best)), best] / np.maximum(probability.sum(axis=1), 1e-9)
+    settled = mean_field(unary, near, alike)
+    best = settled.argmax(axis=1).astype(np.uint8)
+    probability = np.empty_like(settled)  # agreeing neighbours make sure of anything: count them as one witness
+    _settle(unary, settled, near, alike, probability, np.float32(1))
+    sure = probability[np.arange(len(best)), best]
     return by_height(best, height, cloud.xyz), sure.astype(np.float32)
 
 
@@ -119,16 +124,19 @@ def evidence(votes: Votes, shape: U8, height: F32, moved: Bools, *, low_told: bo
 
 
 def _borrow(unary: F32, weight: F32, shape: U8, xyz: F32) -> None:
-    """Ground that no photo sees takes, a little, after the nearest ground that one sees."""
+    """What no photo sees takes after the nearest that one sees: ground after ground, the rest after the rest."""
     from scipy.spatial import cKDTree
 
     ground = shape == CODE["terrain"]
-    want, have = np.flatnonzero(ground & (weight <= 0.05)), np.flatnonzero(ground & (weight > 0.05))
-    if not len(want) or not len(have):
-        return
-    distance, at = cKDTree(xyz[have]).query(xyz[want], workers=-1)
-    near = np.exp(-distance / 4.0)[:, None].astype(np.float32)
-    unary[want] += near * 0.7 * (unary[have[at]] - unary[have[at]].max(axis=1, keepdims=True))
+    for kind, reach in ((ground, REACH_GROUND), (~ground, REACH)):
+        want, have = np.flatnonzero(kind & (weight <= UNSEEN)), np.flatnonzero(kind & (weight > UNSEEN))
+        if not len(want) or not len(have):
+            continue
+        k = min(LENDERS, len(have))
+        distance, at = cKDTree(xyz[have]).query(xyz[want], k=[*range(1, k + 1)], workers=-1)
+        near = (LENT * np.exp(-distance[:, 0] / reach))[:, None].astype(np.float32)
+        lent = sum(unary[have[at[:, j]]] for j in range(k)) / np.float32(k)
+        unary[want] += near * (lent - lent.max(axis=1, keepdims=True))
 
 
 @njit(cache=True, parallel=True)
