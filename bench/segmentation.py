@@ -108,6 +108,7 @@ def mesh(out: Path) -> dict[str, float]:
     tile, figures = street(out, STREETS[0]), {}
     for kind, settings in (("true", []), ("told", ["--set", "segment.overwrite=true"])):
         folder = out / f"world_{kind}"
+        shutil.rmtree(folder, ignore_errors=True)
         scan2sim("run", tile, "--out", folder, "--set", "unwrap.texel=0.05", *settings)
         for group, value in json.loads((folder / "report.json").read_text())["geometry"]["truth_mean_m"].items():
             figures[f"{kind}_{group}"] = value
