@@ -103,17 +103,29 @@ def time_of_nine_million(out: Path) -> float:
     return seconds / 60
 
 
-def mesh(out: Path) -> dict[str, float]:
-    """Metres from the truth to the meshes, by true classes and by those told."""
-    tile, figures = street(out, STREETS[0]), {}
+def mesh(out: Path) -> None:
+    """Print metres from the meshes to the truth, by true classes and by those told: of their class, and of any."""
+    from pipeline.steps.geometry import truth_error
+    from pipeline.types import Mesh
+
+    tile = street(out, STREETS[0])
+    truth = Mesh.load(tile / "truth" / "mesh.npz")
+    whole: dict[str, float] = {}
     for kind, settings in (("true", []), ("told", ["--set", "segment.overwrite=true"])):
         folder = out / f"world_{kind}"
         shutil.rmtree(folder, ignore_errors=True)
         scan2sim("run", tile, "--out", folder, "--set", "unwrap.texel=0.05", *settings)
-        for group, value in json.loads((folder / "report.json").read_text())["geometry"]["truth_mean_m"].items():
-            figures[f"{kind}_{group}"] = value
-    print(f"\nmesh to truth (m): {figures}", flush=True)
-    return figures
+        total = area = 0.0
+        for group in ("terrain", "building", "vegetation"):
+            made = Mesh.load(next((folder / "steps" / f"decimate.{group}").rglob("*.npz")))
+            own, any_class = (truth_error(made, truth, group, 200_000, whatever=w) for w in (False, True))
+            assert own is not None and any_class is not None
+            square = float(made.face_area.sum())
+            total, area = total + any_class * square, area + square
+            print(f"mesh to truth, {kind} classes, {group}: {own:.4f} m of its class, {any_class:.4f} m of any")
+        whole[kind] = total / area
+    ratio = whole["told"] / whole["true"]
+    print(f"whole world to truth: {whole['true']:.4f} m, {whole['told']:.4f} m told: {ratio - 1:+.1%}", flush=True)
 
 
 def semkitti() -> Confusion:

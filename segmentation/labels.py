@@ -14,6 +14,7 @@ CLASSES = (
     "road", "sidewalk", "terrain", "building", "road_sign", "pole", "low_vegetation", "high_vegetation", "vehicle",
     "person", "wall_or_fence", "sky",
 )  # fmt: skip
+GROUND = ("road", "sidewalk", "terrain")
 SKY = CLASSES.index("sky")
 IGNORED = 255
 """Index of what is not to be learnt, or says nothing."""

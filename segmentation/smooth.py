@@ -15,7 +15,8 @@ from numba import njit, prange
 
 from pipeline.classes import CODE
 from pipeline.types import F32, I32, U8, PointCloud
-from segmentation.labels import CLASSES, SKY
+from segmentation.labels import CLASSES, GROUND, SKY
+from segmentation.tidy import by_height, with_feet, without_specks
 from segmentation.votes import Votes
 
 Bools = npt.NDArray[np.bool_]
@@ -33,14 +34,8 @@ UNSEEN = 0.05
 """Votes' weight up to which a point counts as unseen."""
 REACH_GROUND, REACH, LENT, LENDERS = 4.0, 2.0, 1.0, 8
 """Metres over which the unseen takes after the seen, the share at no distance, and of how many."""
-SPECK, FLOATING, LINK = 400, 1.0, 0.35
-"""Vegetation of fewer voxels whose lowest is so many metres above ground is none; linked within metres."""
-HIGH, LOW = 2.6, 1.2
-"""Metres above ground: vegetation higher is high; where nothing around is higher than the second, it is low."""
-
 ABOVE = 0.4
 """Metres above ground: what no built thing or plant is and photos take for ground there was seen through: it moved."""
-GROUND = ("road", "sidewalk", "terrain")
 LIKELY: dict[str, dict[str, float]] = {
     # what the shape says: how often a class looks so, against the others; what isn't named: 0.05
     "terrain": dict.fromkeys(GROUND, 1.0) | {"low_vegetation": 0.15, "vehicle": 0.08, "wall_or_fence": 0.08},
@@ -86,6 +81,7 @@ def decide(
     _settle(unary, settled, near, alike, probability, np.float32(1))
     sure = probability[np.arange(len(best)), best]
     best = without_specks(best, height, cloud.xyz, near[:, :8])
+    best = with_feet(best, cloud.normal, near)
     return by_height(best, height, cloud.xyz), sure.astype(np.float32)
 
 
@@ -193,46 +189,3 @@ def _settle(unary, q, near, alike, out, pull):  # type: ignore[no-untyped-def]
             total += out[i, c]
         for c in range(classes):
             out[i, c] /= total
-
-
-def without_specks(best: U8, height: F32, xyz: F32, near: I32) -> U8:
-    """Small vegetation that touches no ground is what stands around it, bay windows and balconies: (N,) indices."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import cKDTree
-
-    plants = np.isin(best, [CLASSES.index("low_vegetation"), CLASSES.index("high_vegetation")])
-    rows = np.flatnonzero(plants)
-    if not len(rows):
-        return best
-    close = plants[near[rows]] & (np.linalg.norm(xyz[near[rows]] - xyz[rows, None], axis=2) < LINK)
-    a, b = np.repeat(rows, near.shape[1])[close.ravel()], near[rows][close]
-    _, part = connected_components(coo_matrix((np.ones(len(a), np.int8), (a, b)), shape=(len(best),) * 2), False)
-    size, lowest = np.bincount(part[rows], minlength=len(best)), np.full(len(best), np.inf)
-    np.minimum.at(lowest, part[rows], height[rows])
-    speck = plants & (size[part] < SPECK) & (lowest[part] > FLOATING)
-    want, have = np.flatnonzero(speck), np.flatnonzero(~speck)
-    if not len(want) or not len(have):
-        return best
-    k = min(15, len(have))
-    around = best[have][cKDTree(xyz[have]).query(xyz[want], k=[*range(1, k + 1)], workers=-1)[1]]
-    out = best.copy()
-    out[want] = np.stack([(around == c).sum(axis=1) for c in range(len(CLASSES))], axis=1).argmax(axis=1)
-    return out
-
-
-def by_height(best: U8, height: F32, xyz: F32) -> U8:
-    """Vegetation told low or high against all reason is told anew: (N,) indices."""
-    low, high = CLASSES.index("low_vegetation"), CLASSES.index("high_vegetation")
-    plants = np.flatnonzero((best == low) | (best == high))
-    if not len(plants):
-        return best
-    cells = np.floor((xyz[plants, :2] - xyz[:, :2].min(axis=0)) / 0.5).astype(np.int64)
-    of = cells[:, 0] * (cells[:, 1].max() + 1) + cells[:, 1]
-    _, of = np.unique(of, return_inverse=True)
-    top = np.full(of.max() + 1, -np.inf, np.float32)
-    np.maximum.at(top, of, height[plants])
-    out = best.copy()
-    out[plants[height[plants] > HIGH]] = high
-    out[plants[top[of] < LOW]] = low
-    return out

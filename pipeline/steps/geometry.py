@@ -58,10 +58,17 @@ def geometry(inputs: Inputs, params: GeometryParams, out: Path, report: Report) 
     return Done({}, facts)
 
 
-def truth_error(mesh: Mesh, truth: Mesh, group: str, samples: int) -> float | None:
+def truth_error(mesh: Mesh, truth: Mesh, group: str, samples: int, *, whatever: bool = False) -> float | None:
     """Mean distance in metres from points spread evenly on the mesh to the true surface of its class.
 
-    Samples outside the bounds of the true surface (a cloud reaches further than its street) don't count.
+    Samples outside the bounds of that surface (a cloud reaches further than its street) don't count.
+
+    Args:
+        mesh: of `group`.
+        truth: the true surface, labelled.
+        group: of classes.
+        samples: how many.
+        whatever: the true surface of any class counts, not just of the mesh's.
     """
     import numpy as np
 
@@ -72,7 +79,7 @@ def truth_error(mesh: Mesh, truth: Mesh, group: str, samples: int) -> float | No
     points = spread(mesh, samples)
     low, high = same.vertices.min(axis=0)[:2], same.vertices.max(axis=0)[:2]
     points = points[((points[:, :2] >= low) & (points[:, :2] <= high)).all(axis=1)]
-    return float(np.mean(distances(points, same)))
+    return float(np.mean(distances(points, truth.moved_to(mesh.frame) if whatever else same)))
 
 
 def distances(points: F32, mesh: Mesh) -> F32:

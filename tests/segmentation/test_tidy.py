@@ -1,0 +1,62 @@
+"""What no neighbourhood mends."""
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from segmentation.labels import CLASSES
+from segmentation.tidy import by_height, with_feet, without_specks
+
+BUILDING, HIGH, LOW, ROAD = (CLASSES.index(n) for n in ("building", "high_vegetation", "low_vegetation", "road"))
+
+
+def sheet(width: float, low: float, high: float, y: float = 0.0) -> np.ndarray:
+    """Points 10 cm apart on an upright plane."""
+    x, z = np.meshgrid(np.arange(0, width, 0.1), np.arange(low, high, 0.1))
+    return np.stack([x.ravel(), np.full(x.size, y), z.ravel()], axis=1).astype(np.float32)
+
+
+def neighbours(xyz: np.ndarray) -> np.ndarray:
+    return cKDTree(xyz).query(xyz, 9)[1][:, 1:].astype(np.int32)
+
+
+@pytest.mark.parametrize("away", [0.3, 2.0])
+def test_a_large_floating_piece_on_a_wall_is_the_walls_and_a_crown_in_the_air_is_not(away):
+    wall, piece = sheet(6, 0, 6), sheet(3, 2, 5, away)
+    xyz = np.concatenate([wall, piece])
+    best = np.repeat([BUILDING, HIGH], [len(wall), len(piece)]).astype(np.uint8)
+    found = without_specks(best, xyz[:, 2], xyz, neighbours(xyz))
+    assert (found[len(wall) :] == (BUILDING if away < 0.5 else HIGH)).all()
+    assert (found[: len(wall)] == BUILDING).all()
+
+
+def test_vegetation_that_stands_on_the_ground_stays_even_on_a_wall():
+    wall, climber = sheet(6, 0, 6), sheet(3, 0, 5, 0.3)
+    xyz = np.concatenate([wall, climber])
+    best = np.repeat([BUILDING, HIGH], [len(wall), len(climber)]).astype(np.uint8)
+    assert (without_specks(best, xyz[:, 2], xyz, neighbours(xyz)) == best).all()
+
+
+def test_nothing_but_vegetation_stays():
+    xyz = sheet(2, 1, 2)
+    best = np.full(len(xyz), HIGH, np.uint8)
+    assert (without_specks(best, xyz[:, 2], xyz, neighbours(xyz)) == best).all()
+
+
+def test_the_foot_of_a_wall_is_the_walls_and_a_kerb_is_not():
+    wall, road = sheet(4, 0, 3), sheet(4, 0, 3, 5.0)[:, [0, 2, 1]]
+    kerb = sheet(4, 0, 0.2, 9.0)
+    xyz = np.concatenate([wall, road, kerb])
+    normal = np.zeros_like(xyz)
+    normal[: len(wall), 1] = normal[-len(kerb) :, 1] = normal[len(wall) : -len(kerb), 2] = 1
+    best = np.full(len(xyz), ROAD, np.uint8)
+    best[: len(wall)][wall[:, 2] > 0.15] = BUILDING
+    found = with_feet(best, normal, neighbours(xyz))
+    assert (found[: len(wall)] == BUILDING).all() and (found[len(wall) :] == ROAD).all()
+
+
+def test_vegetation_is_told_by_height_where_it_can_be_nothing_else():
+    xyz = np.concatenate([sheet(1, 0, 0.6), sheet(1, 0, 4, 3.0)])
+    found = by_height(np.full(len(xyz), LOW, np.uint8), xyz[:, 2], xyz)
+    assert (found[xyz[:, 2] > 2.7] == HIGH).all() and (found[xyz[:, 1] < 1] == LOW).all()
+    assert (by_height(np.full(len(xyz), HIGH, np.uint8), xyz[:, 2], xyz)[xyz[:, 1] < 1] == LOW).all()
