@@ -20,19 +20,26 @@ imports = typer.Typer(no_args_is_help=True, help="Make a tile from your files.")
 app.add_typer(imports, name="import")
 
 
-class _TileIsDefault(TyperGroup):
-    """`segment TILE` is `segment tile TILE`."""
+class _FirstIsDefault(TyperGroup):
+    """`segment TILE` is `segment tile TILE`, `slam VIDEO` is `slam video VIDEO`."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         if args and args[0] not in self.commands:
-            args = ["tile", *args]
+            args = [next(iter(self.commands)), *args]
         return super().resolve_command(ctx, args)
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        return list(self.commands)
 
 
 segments = typer.Typer(
-    cls=_TileIsDefault, no_args_is_help=True, help="Classes of a tile's points and photos: `segment TILE --out DIR`."
+    cls=_FirstIsDefault, no_args_is_help=True, help="Classes of a tile's points and photos: `segment TILE --out DIR`."
 )
 app.add_typer(segments, name="segment")
+slams = typer.Typer(
+    cls=_FirstIsDefault, no_args_is_help=True, help="Where the camera of a video went: `slam VIDEO --out DIR`."
+)
+app.add_typer(slams, name="slam")
 
 INTERRUPTED = 130  # as typer turns Ctrl-C into
 
@@ -168,6 +175,56 @@ def segment_evaluate(
     evaluate(path, out, _settings([*(set_ or []), "segment.overwrite=true"], config, None))
 
 
+@slams.command("video")
+def slam_a_video(
+    video: Annotated[Path, typer.Argument(metavar="VIDEO", help="A video file, or a folder of pictures.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the trajectory.")],
+    gps: Annotated[
+        Path | None, typer.Option(help="GPX, NMEA, CSV, or a GoPro video: ties the scale, and places it.")
+    ] = None,
+    gps_offset: Annotated[float | None, typer.Option(help="Seconds to add to its times; first frame at 0.")] = None,
+    local: Annotated[bool, typer.Option("--local", help="Don't place it where GPS says: scale alone.")] = False,
+    mask: Annotated[Path | None, typer.Option(help="Picture: 0 where the car itself is seen.")] = None,
+    camera: Annotated[str, typer.Option(help="auto, equirectangular or pinhole.")] = "auto",
+    focal: Annotated[float | None, typer.Option(help="Pixels, of a pinhole camera.")] = None,
+    centre: Annotated[tuple[float, float] | None, typer.Option(help="Pixels; default: the middle.")] = None,
+    tile: Annotated[Path | None, typer.Option(help="Take the camera of this tile that has the video's size.")] = None,
+    fps: Annotated[float, typer.Option(help="Of a folder of pictures.")] = 10.0,
+    times: Annotated[Path | None, typer.Option(help="Of a folder's pictures: seconds, one a line.")] = None,
+    every: Annotated[int, typer.Option(min=1, help="Take every Nth frame.")] = 1,
+    backend: Annotated[str, typer.Option(help="lm, or adam: the mission's.")] = "lm",
+    colmap: Annotated[bool, typer.Option("--colmap", help="Write the map as a COLMAP model, too.")] = False,
+    loops: Annotated[bool, typer.Option("--loops", help="Recognise places that were passed before.")] = False,
+    adjust: Annotated[bool, typer.Option("--adjust", help="Adjust all keyframes at once in the end.")] = False,
+    view: Annotated[bool, typer.Option("--view", help="Record what is tracked, and where: view.mp4.")] = False,
+    set_: Sets = None,
+    config: Config = None,
+) -> None:
+    """Poses of a video's frames: TUM, KITTI, CSV, GeoJSON."""
+    from flows.slam import Options, slam_video
+
+    options = Options(
+        gps=gps, gps_offset=gps_offset, georeference=not local, mask=mask, camera=camera, focal=focal, centre=centre,
+        tile=tile, fps=fps, times=times, every=every, backend=backend, colmap=colmap, loops=loops, adjust=adjust,
+        view=view,
+    )  # fmt: skip
+    slam_video(video, out, options, _settings(set_, config, None))
+
+
+@slams.command("evaluate")
+def slam_evaluate(
+    trajectory: Annotated[Path, typer.Argument(help="CSV, TUM or KITTI file.")],
+    truth: Annotated[Path, typer.Argument(help="Another, or a GPS track.")],
+    segment: Annotated[float, typer.Option(help="Metres of the local error's segments.")] = 400.0,
+    alignment: Annotated[str, typer.Option(help="similarity2d, rigid2d or similarity3d.")] = "similarity2d",
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="PNG of path and errors.")] = None,
+) -> None:
+    """Print how far a trajectory is from the truth: D3.2's errors, ATE, RPE, drift."""
+    from flows.slam import evaluate_trajectory
+
+    evaluate_trajectory(trajectory, truth, segment=segment, alignment=alignment, out=out)
+
+
 @imports.command("kitti-raw")
 def import_kitti(
     drive: Annotated[Path, typer.Argument(help="A drive's folder (..._sync), or one that holds it.")],
@@ -241,6 +298,68 @@ def import_las_files(
             clouds, out, photos=photos, cameras=cameras, images=images, crs=crs, units=units, trajectory=trajectory,
             name=name, link=link, overwrite=overwrite, report=report,
         )  # fmt: skip
+    typer.echo(f"Tile: {path}")
+
+
+@imports.command("sweeps")
+def import_sweeps_and_poses(
+    sweeps: Annotated[Path, typer.Argument(help="Folder of sweeps in scanner axes: .bin, .pcd, .ply, .las, .laz.")],
+    poses: Annotated[Path, typer.Argument(help="Trajectory, of `slam` for example: .csv, .tum, .kitti; z-up.")],
+    out: TileOut,
+    extrinsics: Annotated[
+        Path | None, typer.Option(help="T_camera_scanner, 3 or 4 rows, or KITTI's calibration: poses are the camera's.")
+    ] = None,
+    scanner_poses: Annotated[
+        bool, typer.Option("--scanner-poses", help="Poses are the scanner's all the same.")
+    ] = False,
+    times: Annotated[
+        Path | None, typer.Option(help="Of sweeps, seconds, one a line; default: names, or order.")
+    ] = None,
+    time_offset: Annotated[float, typer.Option(help="Seconds to add to times of sweeps and photos.")] = 0.0,
+    photos: Annotated[Path | None, typer.Option(help="Folder of photos: they colour the points.")] = None,
+    photo_times: Annotated[Path | None, typer.Option(help="Of photos, likewise.")] = None,
+    camera: Annotated[str, typer.Option(help="auto, pinhole, equirectangular, or a TOML with [[cameras]].")] = "auto",
+    focal: Annotated[float | None, typer.Option(help="Pixels, of a pinhole camera.")] = None,
+    centre: Annotated[tuple[float, float] | None, typer.Option(help="Pixels; default: the middle.")] = None,
+    mask: Annotated[Path | None, typer.Option(help="Of all photos: 0 where the car itself is seen.")] = None,
+    max_range: Annotated[float, typer.Option(help="Metres; returns from further away are left out.")] = 50.0,
+    min_range: Annotated[float, typer.Option(help="Metres; nearer returns, the car's own, are left out.")] = 1.0,
+    deskew: Annotated[str, typer.Option(help="kitti: points by the pose of their own moment; or none.")] = "none",
+    period: Annotated[
+        float | None, typer.Option(help="Seconds of the scanner's turn; default: between sweeps.")
+    ] = None,
+    voxel: Annotated[float | None, typer.Option(help="Keep one point in so many metres.")] = None,
+    keep_unsure: Annotated[bool, typer.Option("--keep-unsure", help="Take unsure stretches of the path, too.")] = False,
+    crs: Crs = "local",
+    name: Name = None,
+    link: Link = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """A scanner's sweeps placed by a trajectory, with photos if there are any."""
+    from flows.display import progress
+    from pipeline.errors import SettingError
+    from pipeline.io import sweeps as sweeps_io
+
+    if deskew not in ("none", "kitti"):
+        raise SettingError("deskew", f"there is no {deskew!r}", "Use kitti, or none")
+    known = None if extrinsics is None else sweeps_io.read_extrinsics(extrinsics)
+    pictures = None
+    if photos is not None:
+        file = Path(camera) if camera.endswith(".toml") or Path(camera).exists() else None
+        shape = sweeps_io.camera_of_photos(
+            photos, model="auto" if file else camera, focal=focal, centre=centre, file=file
+        )
+        pictures = sweeps_io.Pictures(photos, shape, photo_times, mask)
+    told: list[str] = []
+    with progress("import") as report:
+        path = sweeps_io.import_sweeps(
+            sweeps, poses, out, extrinsics=known, of="scanner" if scanner_poses else None, times=times,
+            offset=time_offset, photos=pictures, max_range=max_range, min_range=min_range,
+            deskew="kitti" if deskew == "kitti" else "none", period=period, voxel=voxel, keep_unsure=keep_unsure,
+            crs=crs or "local", name=name, link=link, overwrite=overwrite, warn=told.append, report=report,
+        )  # fmt: skip
+    for warning in told:
+        typer.secho(f"warning: {warning}", fg="yellow", err=True)
     typer.echo(f"Tile: {path}")
 
 

@@ -106,14 +106,56 @@ class View:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """The scanner's path: `times` (T,) seconds, ascending; `positions` (T, 3) local, float64."""
+    """The path of a scanner or a camera.
+
+    Attributes:
+        times: (T,) seconds, ascending.
+        positions: (T, 3) local metres, float64.
+        rotations: (T, 3, 3) of the sensor's axes to local coordinates, or None where only positions are known.
+        unsure: (T,) bool, where the pose was bridged, not seen, or None.
+        covariance: (T, 6, 6) of position (m) and rotation (rad, about the local axes), or None.
+    """
 
     times: F64
     positions: F64
+    rotations: F64 | None = None
+    unsure: npt.NDArray[np.bool_] | None = None
+    covariance: F64 | None = None
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    @property
+    def poses(self) -> F64:
+        """(T, 4, 4) sensor to local coordinates; only where rotations are known."""
+        assert self.rotations is not None
+        poses = np.tile(np.eye(4), (len(self), 1, 1))
+        poses[:, :3, :3], poses[:, :3, 3] = self.rotations, self.positions
+        return poses
 
     def at(self, times: F64) -> F64:
         """(N, 3) positions at `times`, linearly interpolated, held at both ends."""
         return np.stack([np.interp(times, self.times, self.positions[:, k]) for k in range(3)], axis=-1)
+
+    def pose_at(self, times: npt.ArrayLike) -> F64:
+        """(N, 4, 4) sensor to local coordinates at `times` (N,), held at both ends; only where rotations are known.
+
+        Positions move straight from pose to pose, rotations turn evenly about one axis (slerp).
+        """
+        from scipy.spatial.transform import Rotation
+
+        assert self.rotations is not None
+        moments = np.clip(np.asarray(times, np.float64), self.times[0], self.times[-1])
+        after = np.minimum(np.maximum(np.searchsorted(self.times, moments), 1), len(self) - 1)
+        before = np.maximum(after - 1, 0)
+        span = self.times[after] - self.times[before]
+        share = np.where(span > 0, (moments - self.times[before]) / np.where(span > 0, span, 1), 0.0)[:, None]
+        start = Rotation.from_matrix(self.rotations[before])
+        turn = (start.inv() * Rotation.from_matrix(self.rotations[after])).as_rotvec()
+        poses = np.tile(np.eye(4), (len(moments), 1, 1))
+        poses[:, :3, :3] = (start * Rotation.from_rotvec(share * turn)).as_matrix()
+        poses[:, :3, 3] = (1 - share) * self.positions[before] + share * self.positions[after]
+        return poses
 
     def save(self, path: Path) -> None:
         """Write as .npz."""

@@ -24,16 +24,16 @@ import numpy as np
 from pipeline.errors import InputError, SettingError
 from pipeline.io import las
 from pipeline.io.importing import place, tile_folder
+from pipeline.io.merging import GREY as GREY
+from pipeline.io.merging import borrow_colours, colour, interpolate, phase_of, read_bin
 from pipeline.io.tile import tile_name, write_tile
 from pipeline.step import Report, silent
-from pipeline.types import F32, F64, U8, Camera, Frame, PointCloud
+from pipeline.types import F32, F64, Camera, Frame, PointCloud
 
 GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
 # the recording car's own returns, scanner axes: (low, high) corner in metres
 OWN_CAR: tuple[tuple[float, float, float], tuple[float, float, float]] = ((-3.2, -1.3, -2.0), (2.8, 1.3, 0.3))
-COLOUR_REACH = 0.5  # metres over which a point that its own photo doesn't show borrows a colour
-COLOUR_VOXEL = 0.1
-GREY = 128
+SAME_DAY = "Use the synced and rectified photos with the calibration of the same day"
 
 
 @dataclass(frozen=True)
@@ -101,15 +101,16 @@ def import_kitti_raw(
     for i, number in enumerate(numbers):
         report(0.7 * i / len(numbers), f"sweep {number}")
         xyz, reflectance = _read_sweep(sweeps[number], max_range)
-        phase = 0.5 - np.arctan2(xyz[:, 1], xyz[:, 0]) / (2 * np.pi) if deskew else np.full(len(xyz), 0.5)
+        phase = phase_of(xyz) if deskew else np.full(len(xyz), 0.5)
         times = spans[i, 0] + phase * (spans[i, 2] - spans[i, 0])
-        at = _interpolate(T_velo, spans[:, 1], times)
+        at = interpolate(T_velo, spans[:, 1], times)
         world = np.einsum("nij,nj->ni", at[:, :3, :3], xyz) + at[:, :3, 3]
         rgb = np.zeros((len(xyz), 3), np.uint8)
         seen = np.zeros(len(xyz), bool)
         for folder, rig in rigs.items():
             if number in photos[folder]:
-                _colour(world, T_velo[i] @ rig.T_velo_cam, rig.camera, photos[folder][number], rgb, seen)
+                pose = T_velo[i] @ rig.T_velo_cam
+                colour(world, pose, rig.camera, photos[folder][number], rgb, seen, remedy=SAME_DAY)
         parts.append(
             {
                 "xyz": world.astype(np.float32),
@@ -157,32 +158,6 @@ def import_kitti_raw(
         )
     report(1.0, "done")
     return Path(out) / "tile.toml"
-
-
-def borrow_colours(xyz: F32, rgb: U8, seen: Any, distance: F32) -> U8:
-    """Colours (N, 3) where points that are not `seen` take that of the nearest seen one within reach, or grey.
-
-    Of the seen points in a 10 cm voxel only the one at the smallest `distance` from its camera counts.
-    """
-    from scipy.spatial import cKDTree
-
-    out = rgb.copy()
-    out[~seen] = GREY
-    index = np.flatnonzero(seen)
-    if len(index) in (0, len(xyz)):
-        return out
-    index = index[np.argsort(distance[index], kind="stable")]
-    cells = np.floor(xyz[index] / COLOUR_VOXEL).astype(np.int64)
-    cells -= cells.min(axis=0)
-    _, first = np.unique(np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1)), return_index=True)
-    index = index[first]
-    tree = cKDTree(xyz[index])
-    rest = np.flatnonzero(~seen)
-    for some in np.array_split(rest, max(1, len(rest) // 2_000_000)):
-        gap, nearest = tree.query(xyz[some], distance_upper_bound=COLOUR_REACH, workers=-1)
-        close = np.isfinite(gap)
-        out[some[close]] = rgb[index[nearest[close]]]
-    return out
 
 
 def _find_drive(folder: Path) -> Path:
@@ -287,29 +262,13 @@ def _poses(drive: Path, poses: Path | None, numbers: list[int], times: F64) -> t
         some = slice(None) if poses is None else slice(2)  # the first sweep's, interpolated, is all that is needed
         T_imu, crs = _read_oxts(drive, numbers[some])
         stamps = _times(drive / "oxts" / "timestamps.txt", numbers[some])
-        T_world = _interpolate(T_imu, stamps, times[some]) @ np.linalg.inv(_rigid(drive, "calib_imu_to_velo.txt"))
+        T_world = interpolate(T_imu, stamps, times[some]) @ np.linalg.inv(_rigid(drive, "calib_imu_to_velo.txt"))
         if poses is None:
             return T_world, crs
         first = T_world[0]
     assert poses is not None
     relative = _read_poses(poses, numbers)
     return first @ np.linalg.inv(relative[0]) @ relative, crs
-
-
-def _interpolate(T: F64, at: F64, times: F64) -> F64:
-    """(N, 4, 4) poses at `times`, by the motion between neighbours of (F, 4, 4) `T` at `at`, beyond its ends too."""
-    from scipy.spatial.transform import Rotation
-
-    if len(T) == 1:
-        return np.repeat(T, len(times), axis=0)
-    b = np.clip(np.searchsorted(at, times), 1, len(at) - 1)
-    a = b - 1
-    share = ((times - at[a]) / (at[b] - at[a]))[:, None]
-    turn = Rotation.from_matrix(np.swapaxes(T[a, :3, :3], 1, 2) @ T[b, :3, :3]).as_rotvec()
-    out = np.tile(np.eye(4), (len(times), 1, 1))
-    out[:, :3, :3] = T[a, :3, :3] @ Rotation.from_rotvec(share * turn).as_matrix()
-    out[:, :3, 3] = T[a, :3, 3] + share * (T[b, :3, 3] - T[a, :3, 3])
-    return out
 
 
 def _read_poses(path: Path, numbers: list[int]) -> F64:
@@ -359,34 +318,7 @@ def _read_oxts(drive: Path, numbers: list[int]) -> tuple[F64, str]:
 
 def _read_sweep(path: Path, max_range: float) -> tuple[F32, F32]:
     """(N, 3) points in scanner axes and (N,) reflectance, without the car itself and what is too far."""
-    data = np.fromfile(path, np.float32)
-    if data.size == 0 or data.size % 4:
-        raise InputError(path, f"is no Velodyne sweep ({data.size * 4} bytes)", "Copy it again")
-    data = data.reshape(-1, 4)
-    data = data[np.isfinite(data).all(axis=1)]
-    xyz = data[:, :3]
+    xyz, reflectance = read_bin(path)
     low, high = np.array(OWN_CAR, np.float32)
     keep = ~((xyz > low) & (xyz < high)).all(axis=1) & (np.linalg.norm(xyz, axis=1) <= max_range)
-    return xyz[keep], np.clip(data[keep, 3], 0, 1)
-
-
-def _colour(world: F64, T_world_cam: F64, camera: Camera, photo: Path, rgb: U8, seen: Any) -> None:
-    """Fill `rgb` and `seen` of points that fall into the photo and no earlier one has shown."""
-    import cv2
-
-    image = cv2.imread(str(photo), cv2.IMREAD_COLOR_RGB)
-    if image is None:
-        raise InputError(photo, "is no readable image", "Copy it again")
-    if image.shape[:2] != (camera.height, camera.width):
-        raise InputError(
-            photo,
-            f"is {image.shape[1]}x{image.shape[0]}, but its calibration says {camera.width}x{camera.height}",
-            "Use the synced and rectified photos with the calibration of the same day",
-        )
-    local = (world - T_world_cam[:3, 3]) @ T_world_cam[:3, :3]
-    depth = np.maximum(local[:, 2], 1e-6)
-    u = np.round(camera.fx * local[:, 0] / depth + camera.cx)
-    v = np.round(camera.fy * local[:, 1] / depth + camera.cy)
-    inside = (local[:, 2] > 0.5) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height) & ~seen
-    rgb[inside] = image[v[inside].astype(int), u[inside].astype(int)]
-    seen |= inside
+    return xyz[keep], reflectance[keep]

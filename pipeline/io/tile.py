@@ -5,7 +5,7 @@ name = "my_street"
 crs = "EPSG:32633"          # code or WKT; "local" without georeference; default: the clouds' own
 units = "m"                 # "ft", "us-ft"; default: as the CRS says, else metres
 clouds = ["cloud.laz"]      # LAS, LAZ, COPC, PLY; coordinates in that CRS and unit
-trajectory = "path.csv"     # optional: time,x,y,z of the scanner
+trajectory = "path.csv"     # optional: the scanner's path, time,x,y,z or with rotations (.csv, .tum)
 
 [[cameras]]
 id = "front"
@@ -40,6 +40,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pipeline.errors import InputError
 from pipeline.io import clouds as cloud_io
 from pipeline.io import crs as crs_io
+from pipeline.io import trajectory as trajectory_io
 from pipeline.types import Camera, CameraModel, Frame, Tile, Trajectory, View
 
 Vector = tuple[float, float, float]
@@ -117,7 +118,7 @@ def read_tile(path: Path) -> Tile:
         frame=frame,
         clouds=clouds,
         views=tuple(_view(path, i, entry, cameras, frame) for i, entry in enumerate(spec.photos)),
-        trajectory=_trajectory(_existing(path, spec.trajectory, "trajectory"), frame) if spec.trajectory else None,
+        trajectory=_trajectory(path, spec, frame),
         truth_mesh=_existing(path, spec.truth.mesh, "truth.mesh") if spec.truth else None,
         truth_points=_existing(path, spec.truth.points, "truth.points") if spec.truth else None,
     )
@@ -243,14 +244,7 @@ def _view(tile: Path, index: int, entry: PhotoEntry, cameras: dict[str, Camera],
     )
 
 
-def _trajectory(path: Path, frame: Frame) -> Trajectory:
-    try:
-        rows = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2)
-        if rows.shape[1] != 4 or len(rows) == 0 or not np.isfinite(rows).all():
-            raise ValueError(f"shape {rows.shape}")
-    except ValueError as error:
-        raise InputError(
-            path, f"is no trajectory ({error})", "Write a CSV: a heading, then time,x,y,z a line, CRS coordinates"
-        ) from None
-    rows = rows[np.argsort(rows[:, 0], kind="stable")]
-    return Trajectory(rows[:, 0], frame.to_local(rows[:, 1:]))
+def _trajectory(tile: Path, spec: TileFile, frame: Frame) -> Trajectory | None:
+    if spec.trajectory is None:
+        return None
+    return trajectory_io.read(_existing(tile, spec.trajectory, "trajectory"), frame, ordered=False, timed=True)

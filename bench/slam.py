@@ -1,0 +1,267 @@
+"""Visual SLAM against a rendered drive's truth, KITTI's, pycolmap, and the mission's own method.
+
+`python -m bench.slam [--parts drive kitti pano memory] [--length 1500] [--out bench-out/slam]`
+
+- drive: 360-degree video (1024 px high, 10 Mbit/s, 15 fps) along a real path (KITTI 00; without the data a made-up one)
+  through a synthetic town with traffic, odometry alone, a consumer receiver's GPS for the scale: D3.2's two errors;
+  the same by the mission's method (`--backend adam`, adjacent distances); frames a second of the default.
+- kitti: 51 frames of KITTI odometry 06 (perspective, real): ATE after a similarity, odometry alone and with the
+  global adjustment; pycolmap's incremental mapping of the same frames, and the ratio of the times.
+- pano: rotation and direction of motion between two real 360 frames, against their reference.
+- memory: peak of the process over ever more frames.
+
+Ends with `RESULT {json}`; null where a part was left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bench.measure import measure
+from pipeline.io import trajectory as trajectory_io
+from pipeline.types import Camera
+from slam.evaluate import Evaluation, evaluate, plot, umeyama
+from slam.odometry import Odometry, OdometryParams
+from slam.video import open_video
+
+ROOT = Path(__file__).resolve().parent.parent
+DATA = ROOT.parent / "shared" / "data"
+KITTI_PARAMS = OdometryParams.model_validate({"parallax": 1.0})  # a narrow view of what lies ahead moves little
+PARTS = ("drive", "kitti", "pano", "memory")
+
+
+def drive_of(out: Path, path: str, length: float) -> Path:
+    """The rendered drive along a KITTI path, or a made-up one; made if absent."""
+    from data_samples import paths
+    from data_samples.drive import generate_drive
+
+    folder, file = out / f"drive_{path}", DATA / "kitti_gt_poses" / f"{path}.txt"
+    if not (folder / "video.mp4").is_file():
+        print(f"rendering {length:.0f} m of {path}: about a second a frame", flush=True)
+        way = paths.kitti_path(file, length) if file.is_file() else paths.town_path(0, length)
+        shutil.rmtree(folder, ignore_errors=True)
+        generate_drive(folder, way, length=length, fps=15, height=1024, bitrate=10e6)
+    return folder
+
+
+def slam(drive: Path, out: Path, *options: object) -> tuple[Evaluation, dict[str, Any]]:
+    """Run `scan2sim slam` on a drive; how far it is from the truth, and its facts."""
+    shutil.rmtree(out, ignore_errors=True)
+    command = [str(Path(sys.executable).parent / "scan2sim"), "slam", str(drive / "video.mp4"), "--out", str(out)]
+    command += ["--gps", str(drive / "gps.csv"), "--gps-offset", "0", "--mask", str(drive / "mask.png")]
+    measured = measure([*command, *map(str, options)])
+    if measured.status:
+        sys.exit(f"scan2sim slam failed with exit status {measured.status}")
+    found = evaluate(trajectory_io.read(out / "trajectory.csv"), trajectory_io.read(drive / "truth.csv"))
+    plot(found, out / "plot.png")
+    return found, json.loads((out / "slam.json").read_text()) | {"peak_gb": measured.peak_gb}
+
+
+def drive(out: Path, path: str, length: float, adam: bool) -> dict[str, float | None]:
+    """The two errors on the rendered drive, by both backends."""
+    made = drive_of(out, path, length)
+    result: dict[str, float | None] = {}
+    kinds: list[tuple[str, tuple[str, ...]]] = [("lm", ())]
+    if adam:
+        kinds.append(("adam", ("--backend", "adam", "--set", "slam.gps_chords=adjacent")))
+    for kind, options in kinds:
+        found, facts = slam(made, out / f"slam_{path}_{kind}", *options)
+        local = "-" if found.local_median is None else f"{found.local_median:.2f}"
+        mean = f"global mean {found.global_mean:.2f} m ({found.drift_percent:.3f} %), local median 400 {local} m"
+        cost = f"{facts['fps']:.1f} frames/s, {facts['unsure_share']:.1%} unsure, {facts['peak_gb']:.2f} GB"
+        print(f"{path}, {found.length:.0f} m, {kind}: {mean}, {cost}", flush=True)
+        if kind == "lm":
+            result |= {"drift_percent": found.drift_percent, "local400_m": found.local_median, "fps": facts["fps"]}
+        else:
+            result["adam_drift_percent"] = found.drift_percent
+    return result
+
+
+def kitti_camera(folder: Path) -> Camera:
+    """Of KITTI odometry's left grey camera."""
+    P = [float(v) for v in (folder / "calib.txt").read_text().split()[:12]]
+    video = open_video(folder / "image_l")
+    return Camera("pinhole", video.width, video.height, P[0], P[5], P[2], P[6])
+
+
+def kitti(out: Path) -> dict[str, float | None]:
+    """ATE on 51 real frames, and the time against pycolmap's incremental mapping."""
+    from slam.adjust import adjust
+
+    folder = DATA / "kitti_odo06_vo51"
+    truth = np.loadtxt(folder / "poses.txt").reshape(-1, 3, 4)[:, :, 3]
+    camera = kitti_camera(folder)
+    warm = Odometry(camera, KITTI_PARAMS)  # compiled code and file caches are no part of either's time
+    for frame in list(open_video(folder / "image_l").frames())[:5]:
+        warm.add(frame.time, frame.grey)
+    began = time.perf_counter()
+    odometry = Odometry(camera, KITTI_PARAMS, keep=True)
+    for frame in open_video(folder / "image_l").frames():
+        odometry.add(frame.time, frame.grey)
+    seconds = time.perf_counter() - began
+    alone = _ate(odometry, truth)
+    began = time.perf_counter()
+    adjust(odometry)
+    adjusting = time.perf_counter() - began
+    adjusted = _ate(odometry, truth)
+    theirs, their_seconds, registered = pycolmap_reference(folder, camera, out / "pycolmap", truth)
+    print(f"KITTI 06, 51 frames: odometry {100 * alone:.2f} cm in {seconds:.1f} s")
+    print(f"  with global adjustment {100 * adjusted:.2f} cm, {adjusting:.1f} s more")
+    print(f"  pycolmap {100 * theirs:.2f} cm in {their_seconds:.1f} s, {registered} frames", flush=True)
+    return {"kitti06_ate_m": alone, "pycolmap_time_ratio": their_seconds / seconds}
+
+
+def _ate(odometry: Odometry, truth: np.ndarray) -> float:
+    found = np.stack([odometry.pose_of(p)[:3, 3] for p in odometry.placed])
+    return _rms(found, truth)
+
+
+def _rms(found: np.ndarray, truth: np.ndarray) -> float:
+    off = umeyama(found, truth, scaled=True).apply(found) - truth
+    return float(np.sqrt((off**2).sum(axis=1).mean()))
+
+
+def pycolmap_reference(folder: Path, camera: Camera, out: Path, truth: np.ndarray) -> tuple[float, float, int]:
+    """ATE, seconds and frames of pycolmap's incremental mapping with known intrinsics, in a process of its own."""
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir(parents=True)
+    code = f"""
+import pycolmap, json, numpy as np
+from pathlib import Path
+out, images = Path({str(out)!r}), Path({str(folder / "image_l")!r})
+reader = pycolmap.ImageReaderOptions()
+reader.camera_model = "PINHOLE"
+reader.camera_params = "{camera.fx},{camera.fy},{camera.cx + 0.5},{camera.cy + 0.5}"
+pycolmap.extract_features(out / "db.db", images, camera_mode=pycolmap.CameraMode.SINGLE, reader_options=reader)
+pycolmap.match_sequential(out / "db.db")
+options = pycolmap.IncrementalPipelineOptions()
+options.ba_refine_focal_length = options.ba_refine_principal_point = options.ba_refine_extra_params = False
+options.mapper.init_max_forward_motion = 1
+options.mapper.init_min_tri_angle = 2
+models = pycolmap.incremental_mapping(out / "db.db", images, out, options)
+best = max(models.values(), key=lambda m: m.num_reg_images())
+places = {{best.images[i].name: best.images[i].projection_center().tolist() for i in best.reg_image_ids()}}
+(out / "places.json").write_text(json.dumps(places))
+"""
+    began = time.perf_counter()
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    seconds = time.perf_counter() - began
+    if done.returncode:
+        sys.exit(f"pycolmap failed: {done.stderr[-500:]}")
+    places = json.loads((out / "places.json").read_text())
+    rows = sorted((int(Path(name).stem), place) for name, place in places.items())
+    return _rms(np.array([p for _, p in rows]), truth[[i for i, _ in rows]]), seconds, len(rows)
+
+
+def pano() -> None:
+    """Rotation and direction of motion between two real 360 frames, by descriptors and by tracked corners.
+
+    The reference holds world-to-camera poses in axes of its own: x back, y right, z up (told by its motion).
+    """
+    import cv2
+
+    from slam.charts import Charts
+    from slam.geometry import log_so3, relative_pose
+    from slam.relocalise import describe, matches
+    from slam.tracking import Tracker
+
+    folder = DATA / "pano360"
+    numbers = (folder / "dense_transformation.dat").read_text().splitlines()[1].split()[1:]
+    axes = np.array([[0.0, 0, -1], [1, 0, 0], [0, -1, 0]])  # ours to the reference's
+    R = np.array(numbers[3:], float).reshape(3, 3)
+    turn, way = axes.T @ R.T @ axes, axes.T @ (-R.T @ np.array(numbers[:3], float))
+    way /= np.linalg.norm(way)
+    first, second = (
+        cv2.resize(cv2.imread(str(f), cv2.IMREAD_GRAYSCALE), None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
+        for f in sorted(folder.glob("2019*.jpg"))
+    )
+    charts, rng = Charts(Camera("equirectangular", 1024, 512)), np.random.default_rng(0)
+    a, b = (describe(charts, charts.pictures(grey)) for grey in (first, second))  # type: ignore[arg-type]
+    pairs = matches(a.descriptor, b.descriptor)
+    tracker = Tracker(charts, None, 600)
+    tracker.look(first)  # type: ignore[arg-type]
+    tracker.refill()
+    before = tracker.tracks
+    tracker.look(second)  # type: ignore[arg-type]
+    followed = np.searchsorted(before.ids, tracker.tracks.ids)
+    for kind, there, now in (
+        ("ORB", a.bearing[pairs[:, 0]], b.bearing[pairs[:, 1]]),
+        ("corners", before.bearing[followed], tracker.tracks.bearing),
+    ):
+        found = relative_pose(there, now, threshold=np.radians(0.5), rng=rng)
+        if found is None:
+            print(f"pano360, {kind}: no pose found")
+            continue
+        off = np.degrees(np.linalg.norm(log_so3(found[0][:3, :3].T @ turn)))
+        aside = np.degrees(np.arccos(np.clip(found[0][:3, 3] @ way, -1, 1)))
+        print(
+            f"pano360, {kind}: {found[1].sum()} of {len(there)} agree; rotation {off:.2f} degrees from the reference, "
+            f"direction of motion {aside:.2f} (a pixel is 0.70)",
+            flush=True,
+        )
+
+
+def memory(out: Path, path: str, length: float) -> None:
+    """Peak memory over ever more frames."""
+    made = drive_of(out, path, length)
+    code = """
+import sys, resource
+from pathlib import Path
+from pipeline.types import Camera
+from slam.odometry import Odometry, OdometryParams
+from slam.video import open_video
+video = open_video(Path(sys.argv[1]))
+odometry, offset, count = Odometry(Camera("equirectangular", 512, 256), OdometryParams(features=300)), 0.0, 0
+import cv2
+while count < 10000:
+    for frame in video.frames():
+        odometry.add(offset + frame.time, cv2.resize(frame.grey, (512, 256), interpolation=cv2.INTER_AREA))
+        count += 1
+        if count in (1000, 3000, 10000):
+            peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+            print(f"{count} frames: {peak:.3f} GB", flush=True)
+    offset += frame.time + 1
+"""
+    subprocess.run([sys.executable, "-c", code, str(made / "video.mp4")], check=True, cwd=ROOT)
+
+
+def main() -> None:
+    """Run the parts, print tables and the result."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=["drive", "kitti", "pano"])
+    parser.add_argument("--path", default="00", help="of kitti_gt_poses")
+    parser.add_argument("--length", type=float, default=1500.0)
+    parser.add_argument("--no-adam", action="store_true", help="leave the mission's method out (it takes long)")
+    parser.add_argument("--out", type=Path, default=ROOT / "bench-out" / "slam")
+    arguments = parser.parse_args()
+    out: Path = arguments.out
+    out.mkdir(parents=True, exist_ok=True)
+    keys = ("drift_percent", "local400_m", "adam_drift_percent", "kitti06_ate_m", "pycolmap_time_ratio", "fps")
+    result: dict[str, float | None] = dict.fromkeys(keys)
+    if "drive" in arguments.parts:
+        result |= drive(out, arguments.path, arguments.length, not arguments.no_adam)
+    for part, needed in (("kitti", "kitti_odo06_vo51"), ("pano", "pano360")):
+        if part not in arguments.parts:
+            continue
+        if not (DATA / needed).is_dir():
+            print(f"{part}: left out, there is no {DATA / needed}")
+        elif part == "kitti":
+            result |= kitti(out)
+        else:
+            pano()
+    if "memory" in arguments.parts:
+        memory(out, arguments.path, arguments.length)
+    print("RESULT " + json.dumps({k: None if v is None else round(v, 4) for k, v in result.items()}))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,225 @@
+"""Film a drive through a synthetic town: a 360-degree video with its ground truth and a receiver's fixes.
+
+`python -m data_samples.drive OUT --path town --length 300` writes video.mp4, truth.csv, gps.csv and mask.png.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable, Iterator
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+
+from data_samples import gps, paths
+from data_samples.panorama import Panorama
+from data_samples.town import build
+from data_samples.traffic import Traffic
+from pipeline.errors import SettingError
+from pipeline.step import Report, silent
+from pipeline.types import F64, U8, Trajectory
+
+RATE = 90_000  # ticks a second of the video's clock
+
+
+def generate_drive(
+    out: Path,
+    path_xy: F64,
+    *,
+    seconds: float | None = None,
+    length: float | None = None,
+    speed: float = 12.0,
+    fps: float = 15.0,
+    height: int = 1024,
+    bitrate: float = 10e6,
+    seed: int = 0,
+    rolling_shutter: float = 0.0,
+    bus: tuple[float, float] | None = None,
+    gps_rate: float = 1.0,
+    gps_gaps: Iterable[tuple[float, float]] = (),
+    gps_jumps: Iterable[tuple[float, float]] = (),
+    traffic: bool = True,
+    samples: int = 3,
+    lossless: bool = False,
+    overwrite: bool = False,
+    report: Report = silent,
+) -> Path:
+    """Write the folder `out` and return it.
+
+    `video.mp4` (H.264, equirectangular: column 0 looks back, the centre ahead), `truth.csv` (time, x, y, z of the
+    camera in metres, z up, and its camera-to-world quaternion, camera axes x right, y down, z forward),
+    `gps.csv` (time, latitude, longitude, altitude of a consumer receiver; the world's origin is `gps.ORIGIN`,
+    x east, y north), `mask.png` (0 where the camera sees its own car).
+
+    Args:
+        path_xy: (N, 2) metres, see `paths`.
+        seconds, length: stop after so much of the path.
+        speed: m/s on straights.
+        height: rows of a frame; it has twice as many columns.
+        bitrate: of the video, bits a second.
+        seed: of the town, the traffic, the light, and the receiver.
+        rolling_shutter: seconds from reading the first row to the last; a frame's time is its middle row's.
+        bus: (from, to) seconds in which buses hem the camera in.
+        gps_rate, gps_gaps, gps_jumps: see `gps.receiver`.
+        traffic: whether there is anyone else on the road.
+        samples: rays of a pixel at edges, see `panorama.Panorama`.
+        lossless: also write `frames/000000.png` and so on.
+        overwrite: replace a video that is there already.
+
+    Raises:
+        SettingError: there is a video already, or a number makes no sense.
+    """
+    import cv2
+
+    if (out / "video.mp4").exists() and not overwrite:
+        raise SettingError("out", f"{out / 'video.mp4'} exists already", "Pass overwrite, or choose another folder")
+    for name, value, least in (
+        ("height", height, 64),
+        ("fps", fps, 0.1),
+        ("bitrate", bitrate, 1e4),
+        ("speed", speed, 0.5),
+    ):
+        if not (np.isfinite(value) and value >= least):
+            raise SettingError(name, f"{value} is less than {least:g}", f"Give {least:g} or more")
+    path = path_xy if length is None else path_xy[paths.chainage(path_xy) <= length]
+    report(0.0, "building the town")
+    trajectory = paths.drive(path, speed, fps, seconds=seconds, seed=seed)
+    others = Traffic(path, trajectory, seed, bus) if traffic else None
+    camera = Panorama(build(path, seed), others, height, seed, samples)
+    out.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(out / "mask.png"), camera.mask)
+    write_truth(out / "truth.csv", trajectory)
+    times, fixes = gps.receiver(trajectory, gps_rate, seed, gaps=tuple(gps_gaps), jumps=tuple(gps_jumps))
+    table = np.column_stack([times, gps.geographic(fixes)])
+    np.savetxt(
+        out / "gps.csv", table, ["%.3f", "%.8f", "%.8f", "%.3f"], delimiter=",",
+        header="time,latitude,longitude,altitude", comments="",
+    )  # fmt: skip
+    frames = _frames(camera, trajectory, rolling_shutter, report)
+    if lossless:
+        (out / "frames").mkdir(exist_ok=True)
+        frames = _kept(frames, out / "frames")
+    encode(frames, out / "video.mp4", fps, bitrate, (2 * height, height))
+    report(1.0, "done")
+    return out
+
+
+def _frames(camera: Panorama, trajectory: Trajectory, readout: float, report: Report) -> Iterator[U8]:
+    for i, time in enumerate(trajectory.times):
+        report(i / len(trajectory), f"frame {i + 1} of {len(trajectory)}")
+        poses = row_poses(trajectory, time, camera.height, readout) if readout else trajectory.poses[i]
+        yield camera.render(poses, float(time)).rgb
+
+
+def _kept(frames: Iterable[U8], folder: Path) -> Iterator[U8]:
+    import cv2
+
+    for i, frame in enumerate(frames):
+        cv2.imwrite(str(folder / f"{i:06d}.png"), frame[..., ::-1])
+        yield frame
+
+
+def row_poses(trajectory: Trajectory, time: float, height: int, readout: float) -> F64:
+    """(H, 4, 4) the pose of each row of a frame whose middle row is taken at `time`; held beyond the ends."""
+    from scipy.spatial.transform import Rotation, Slerp
+
+    assert trajectory.rotations is not None
+    times = time + ((np.arange(height) + 0.5) / height - 0.5) * readout
+    times = np.clip(times, *trajectory.times[[0, -1]])
+    poses = np.tile(np.eye(4), (height, 1, 1))
+    poses[:, :3, :3] = Slerp(trajectory.times, Rotation.from_matrix(trajectory.rotations))(times).as_matrix()
+    poses[:, :3, 3] = trajectory.at(times)
+    return poses
+
+
+def write_truth(file: Path, trajectory: Trajectory) -> None:
+    """Write poses as time, x, y, z, qx, qy, qz, qw (camera to world)."""
+    from scipy.spatial.transform import Rotation
+
+    turn = Rotation.from_matrix(trajectory.rotations).as_quat()
+    table = np.column_stack([trajectory.times, trajectory.positions, turn])
+    np.savetxt(file, table, fmt="%.9f", delimiter=",", header="time,x,y,z,qx,qy,qz,qw", comments="")
+
+
+def encode(frames: Iterable[U8], file: Path, fps: float, bitrate: float, size: tuple[int, int]) -> int:
+    """Encode RGB frames (H, W, 3) as H.264 of a target bit rate; frame i is shown at i / fps.
+
+    Args:
+        size: width and height of the video, both even; frames of another size are scaled.
+
+    Returns:
+        The number of frames. The file appears when it is complete.
+    """
+    import av
+
+    rate = Fraction(fps).limit_denominator(1001)
+    part = file.with_name(f".{file.name}.part")
+    count = 0
+    try:
+        with av.open(str(part), "w", format="mp4", options={"movflags": "faststart"}) as container:
+            stream = container.add_stream("libx264", rate=rate)
+            stream.width, stream.height = size
+            stream.pix_fmt = "yuv420p"
+            stream.bit_rate = int(bitrate)
+            stream.time_base = stream.codec_context.time_base = Fraction(1, RATE)
+            stream.codec_context.gop_size = max(1, round(1.5 * fps))
+            stream.codec_context.options = {
+                "preset": "superfast",
+                "maxrate": str(int(1.5 * bitrate)),
+                "bufsize": str(int(2 * bitrate)),
+            }
+            for count, image in enumerate(frames, 1):
+                frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
+                if (frame.width, frame.height) != size:
+                    frame = frame.reformat(*size, interpolation="AREA")
+                frame.pts, frame.time_base = round((count - 1) * RATE / rate), Fraction(1, RATE)
+                container.mux(stream.encode(frame))
+            container.mux(stream.encode())
+        part.replace(file)
+    finally:
+        part.unlink(missing_ok=True)
+    return count
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(prog="python -m data_samples.drive", description=__doc__)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--path", default="town", help="a KITTI pose file, or town, or loop")
+    parser.add_argument("--length", type=float, help="metres of the path (town: 600)")
+    parser.add_argument("--seconds", type=float)
+    parser.add_argument("--speed", type=float, default=12.0, help="m/s on straights")
+    parser.add_argument("--height", type=int, default=1024)
+    parser.add_argument("--fps", type=float, default=15.0)
+    parser.add_argument("--bitrate", type=float, default=10.0, help="Mbit/s")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--rolling-shutter", type=float, default=0.0, help="seconds from the first row to the last")
+    parser.add_argument("--bus", type=float, nargs=2, metavar=("FROM", "TO"), help="seconds")
+    parser.add_argument("--gps-rate", type=float, default=1.0)
+    parser.add_argument("--gps-gap", type=float, nargs=2, action="append", default=[], metavar=("FROM", "TO"))
+    parser.add_argument("--gps-jump", type=float, nargs=2, action="append", default=[], metavar=("TIME", "METRES"))
+    parser.add_argument("--samples", type=int, default=3, help="rays of a pixel at edges; 1 is fastest")
+    parser.add_argument("--no-traffic", dest="traffic", action="store_false")
+    parser.add_argument("--lossless", action="store_true", help="also write PNG frames")
+    parser.add_argument("--overwrite", action="store_true")
+    a = parser.parse_args()
+    if a.path == "town":
+        path = paths.town_path(a.seed, a.length or 600.0)
+    else:
+        path = paths.loop_path() if a.path == "loop" else paths.kitti_path(Path(a.path), a.length)
+
+    def report(fraction: float, message: str = "") -> None:
+        print(f"\r{100 * fraction:5.1f} %  {message:40}", end="", flush=True)
+
+    generate_drive(
+        a.out, path, seconds=a.seconds, length=a.length, speed=a.speed, fps=a.fps, height=a.height,
+        bitrate=a.bitrate * 1e6, seed=a.seed, rolling_shutter=a.rolling_shutter, bus=tuple(a.bus) if a.bus else None,
+        gps_rate=a.gps_rate, gps_gaps=[tuple(g) for g in a.gps_gap], gps_jumps=[tuple(j) for j in a.gps_jump],
+        traffic=a.traffic, samples=a.samples, lossless=a.lossless, overwrite=a.overwrite, report=report,
+    )  # fmt: skip
+    print()
+
+
+if __name__ == "__main__":
+    main()

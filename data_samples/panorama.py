@@ -1,0 +1,245 @@
+"""Equirectangular pictures of a town, fast: rays through Open3D, colours from a compiled shader.
+
+Textures are procedural and band-limited: what is finer than a pixel's footprint fades out (`materials`).
+The ground is no triangles: two planes and a raster of distances (`ground`) give road, kerb and pavement.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from data_samples import rays as tracing
+from data_samples import shader, signs, sky
+from data_samples.ground import CELL, KERB
+from data_samples.scene import srgb
+from data_samples.shapes import Part
+from data_samples.town import Town
+from data_samples.traffic import Traffic
+from pipeline.types import F32, F64, U8
+
+RADIUS = 220.0  # metres around the camera in which things have triangles
+STEP = 0.25  # of the radius, driven before they are gathered anew
+ROOF = -60.0  # degrees of elevation below which the camera sees its own car
+GAIN = (0.6, 1.4)
+ROUGH = 20  # of 255: pixels that differ more from a neighbour are sampled again
+LENS = 0.55  # pixels, standard deviation
+
+Index = npt.NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """What the camera sees: rgb (H, W, 3) uint8; depth (H, W) metres along the ray (infinite: sky, NaN: own car);
+    moving (H, W) bool where another vehicle is; gain: what the exposure multiplied the light by."""
+
+    rgb: U8
+    depth: F32
+    moving: Index
+    gain: float
+
+
+class Panorama:
+    """A camera in a town.
+
+    Args:
+        town, traffic: what there is; None: nobody else on the road.
+        height: rows of a picture; it has twice as many columns.
+        seed: of the light's changes.
+        samples: rays of a pixel where neighbours differ; 1 is fastest.
+        radius: metres around the camera in which things are seen.
+    """
+
+    def __init__(
+        self,
+        town: Town,
+        traffic: Traffic | None,
+        height: int = 1024,
+        seed: int = 0,
+        samples: int = 3,
+        radius: float = RADIUS,
+    ) -> None:
+        self.samples, self.radius = samples, radius
+        self.town, self.traffic, self.height, self.width = town, traffic, height, 2 * height
+        self._centre = np.full(2, np.inf)
+        self._static: tuple[Any, ...] = ()
+        self._caster: Any = None
+        self._pictures = signs.pictures()
+        self._sky = _sky(town)
+        self._table = srgb(np.linspace(0, 1, 8192) ** 2)  # by the root of the light
+        self.mask, self._own = own_car(height), _roof(height)
+        self._seen = int(np.flatnonzero(self.mask.any(axis=1))[-1]) + 1  # rows that see anything
+        rng = np.random.default_rng([seed, 41])
+        self._waves = rng.uniform(0.015, 0.22, 9), rng.uniform(0, 2 * np.pi, 9)
+
+    def gain(self, time: float) -> float:
+        """What the exposure multiplies the light by: smooth, between the bounds of `GAIN`."""
+        frequency, phase = self._waves
+        x = np.sin(2 * np.pi * frequency * time + phase).sum() / np.sqrt(len(phase) / 2)
+        low, high = GAIN
+        return float(low * (high / low) ** (0.5 + 0.5 * np.tanh(0.9 * x)))
+
+    def render(self, poses: F64, time: float = 0.0) -> Picture:
+        """The picture at a time.
+
+        Args:
+            poses: (4, 4), or (H, 4, 4) one a row (rolling shutter), camera to world.
+            time: seconds, for traffic (which stands still while the rows are read) and light.
+        """
+        h, w, seen = self.height, self.width, self._seen
+        rows = np.broadcast_to(poses, (h, 4, 4))[:seen]
+        self._gather(rows[len(rows) // 2, :2, 3])
+        look = self._looker(rows, time)
+        rgb, distance, moved = look(np.arange(seen * w), 0.0, 0.0)
+        if self.samples > 1:
+            at = np.flatnonzero(tracing.rough(rgb.reshape(seen, w, 3), ROUGH))
+            total = rgb[at].astype(np.uint16)
+            for right, down in spread(self.samples - 1):
+                total += look(at, right, down)[0]
+            rgb[at] = (total + self.samples // 2) // self.samples
+        image, depth, moving = (
+            np.zeros((h, w, 3), np.uint8),
+            np.full((h, w), np.nan, np.float32),
+            np.zeros((h, w), bool),
+        )
+        image[:seen], depth[:seen], moving[:seen] = (a.reshape(seen, w, *a.shape[1:]) for a in (rgb, distance, moved))
+        image = _through_lens(image)
+        low = slice(int(np.flatnonzero((self.mask == 0).any(axis=1))[0]), None)
+        own = self.mask[low] == 0
+        image[low][own], depth[low][own], moving[low][own] = self._own[low][own], np.nan, False
+        return Picture(image, depth, moving, self.gain(time))
+
+    def _looker(self, rows: F64, time: float) -> Callable[[Index, float, float], tuple[U8, F32, Index]]:
+        """What gives rgb (N, 3), distance (N,) and whether a vehicle is there (N,), for pixels and a place in them."""
+        origins = (rows[:, :3, 3] - [*self._centre, 0]).astype(np.float32)
+        turns = np.ascontiguousarray(rows[:, :3, :3], np.float32)
+        moving, boxes = self.traffic.near(time, self._centre) if self.traffic else (None, np.zeros((0, 6), np.float32))
+        caster = None if moving is None else _scene(moving)
+        other = self._static if moving is None else _arrays(moving)
+        there = _around(boxes, rows, self._centre, self.width, self.height)
+        g = self.town.ground
+        ground = (g.distance, g.nearest, g.line, g.origin - self._centre, CELL, KERB, g.line[:, :2] - self._centre)
+        sun, gain = self.town.sun.astype(np.float32), self.gain(time)
+
+        def look(index: Index, right: float, down: float) -> tuple[U8, F32, Index]:
+            rays = tracing.rays(turns, origins, self.width, self.height, index, right, down)
+            distance, face, uv = _cast(self._caster, rays)
+            moved = np.zeros(len(rays), bool)
+            if caster is not None:
+                at = np.flatnonzero(there[index])
+                near, near_face, near_uv = _cast(caster, rays[at])
+                closer = near < distance[at]
+                at = at[closer]
+                distance[at], face[at], uv[at], moved[at] = near[closer], near_face[closer], near_uv[closer], True
+            kind, normal, shadow = tracing.meet(rays, distance, face, uv, moved, self._static, other, ground, sun)
+            dark = self._caster.test_occlusions(_tensor(shadow)).numpy()
+            rgb = shader.paint(
+                rays, distance, face, uv, moved, kind, normal, dark, self._static, other, ground, boxes, sun, self._sky,
+                self._centre, self._pictures, np.pi / self.height, gain, self._table, self.town.seed % 1000,
+            )  # fmt: skip
+            return rgb, distance, moved
+
+        return look
+
+    def _gather(self, centre: F64) -> None:
+        """Make the triangles around a place, unless those there are will do."""
+        if np.linalg.norm(centre - self._centre) < STEP * self.radius:
+            return
+        self._centre = np.round(centre)
+        part = self.town.near(self._centre, self.radius)
+        self._static, self._caster = _arrays(part), _scene(part)
+
+
+def spread(count: int) -> list[tuple[float, float]]:
+    """Places in a pixel around its centre."""
+    angle = 0.4 + 2 * np.pi * np.arange(count) / max(count, 1)
+    return [(0.37 * float(np.cos(a)), 0.37 * float(np.sin(a))) for a in angle]
+
+
+def _through_lens(image: U8) -> U8:
+    """A little blurred, as by a lens; the left edge meets the right one."""
+    import cv2
+
+    wide = cv2.GaussianBlur(np.concatenate([image[:, -4:], image, image[:, :4]], axis=1), (5, 5), LENS)
+    return np.ascontiguousarray(wide[:, 4:-4])
+
+
+def own_car(height: int) -> U8:
+    """(H, 2H) the mask: 0 where the camera sees its own car, 255 elsewhere."""
+    lon = ((np.arange(2 * height) + 0.5) / height - 1) * np.pi
+    lat = 90 - (np.arange(height) + 0.5) / height * 180
+    edge = ROOF - 5 * np.sin(lon) ** 4 + 2 * np.cos(lon)  # the roof is longer than wide
+    return np.where(lat[:, None] < edge, 0, 255).astype(np.uint8)
+
+
+def _roof(height: int) -> U8:
+    """(H, 2H, 3) the car's roof: grey, a little lighter ahead, with two rails."""
+    lon = ((np.arange(2 * height) + 0.5) / height - 1) * np.pi
+    lat = ((np.arange(height) + 0.5) / height - 0.5) * np.pi
+    r = 1 / np.tan(np.maximum(lat, 0.1))[:, None]
+    x, z = r * np.sin(lon), r * np.cos(lon)
+    grey = 46 + 14 * np.tanh(z) + 60 * np.exp(-(((np.abs(x) - 0.33) / 0.03) ** 2))
+    return np.repeat(np.clip(grey, 0, 255)[..., None], 3, axis=2).astype(np.uint8)
+
+
+def _sky(town: Town, height: int = 1024) -> F32:
+    """(height / 2, 2 height, 3) linear light of the upper half of the world, row 0 the zenith, column 0 along -x."""
+    lon = ((np.arange(2 * height) + 0.5) / height - 1) * np.pi
+    lat = np.pi / 2 * (1 - (np.arange(height // 2) + 0.5) / (height // 2))
+    c = np.cos(lat)[:, None]
+    d = np.stack([c * np.cos(lon), c * np.sin(lon), np.broadcast_to(np.sin(lat)[:, None], (len(lat), len(lon)))], -1)
+    d = d.reshape(-1, 3).astype(np.float32)
+    light = sky.beyond(
+        np.zeros_like(d), d, town.sun, 0.45, np.array([0.0, 1e-3, 4.0]), np.zeros(2), town.seed % 1000 + 7
+    )
+    return light.reshape(height // 2, 2 * height, 3)
+
+
+def _around(boxes: F32, rows: F64, centre: F64, width: int, height: int) -> Index:
+    """(R * W,) bool: pixels in whose direction there may be one of the vehicles."""
+    seen = np.zeros((len(rows), width), bool)  # of the rows that see anything
+    pose = rows[len(rows) // 2]
+    for x, y, _, _, long, wide in boxes.tolist():
+        reach = np.hypot(long, wide) + 0.3
+        to = (np.array([*(np.array([x, y]) + centre), 1.5]) - pose[:3, 3]) @ pose[:3, :3]
+        far = np.hypot(to[0], to[2])
+        if far < reach + 0.5:
+            seen[:] = True
+            continue
+        lon, half = np.arctan2(to[0], to[2]), np.arcsin(min(reach / far, 1.0)) + 0.02
+        top, low = (np.arctan2(z, far - reach) + 0.06 for z in (to[1] - 3.2, to[1] + 2.0))
+        columns = np.arange(
+            int((lon - half + np.pi) / (2 * np.pi) * width), int((lon + half + np.pi) / (2 * np.pi) * width) + 2
+        )
+        row = [int((a / np.pi + 0.5) * height) for a in (top - 0.12, low)]
+        seen[max(row[0], 0) : row[1] + 2, columns % width] = True
+    return seen.ravel()
+
+
+def _arrays(part: Part) -> tuple[Any, ...]:
+    """What the shader needs of a part."""
+    return (part.faces, part.normals, part.uv, part.sky[:, None], part.material, part.colour, part.seed, part.size)
+
+
+def _tensor(array: Any) -> Any:
+    import open3d as o3d
+
+    return o3d.core.Tensor.from_numpy(np.ascontiguousarray(array))
+
+
+def _scene(part: Part) -> Any:
+    import open3d as o3d
+
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(_tensor(part.vertices), _tensor(part.faces.astype(np.uint32)))
+    return scene
+
+
+def _cast(scene: Any, rays: F32) -> tuple[F32, Any, F32]:
+    """Distance (N,), face (N,) uint32 and barycentric uv (N, 2) of the first hits of rays (N, 6)."""
+    answer = scene.cast_rays(_tensor(rays))
+    return answer["t_hit"].numpy(), answer["primitive_ids"].numpy(), answer["primitive_uvs"].numpy()

@@ -1,0 +1,152 @@
+"""Rays of a panorama, compiled: through which pixels, and where they meet the ground."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit, prange
+
+from data_samples.ground import HALF
+
+Array = npt.NDArray[Any]
+
+SKY, THING, ROAD, WALL, PAVEMENT = range(5)  # what a ray meets; WALL: the face of a kerb
+BLOCK, MIX = 1021, 1_000_003  # pixels of a task, and a prime by which tasks are mixed: sky is quicker than road
+
+
+@njit(cache=True, error_model="numpy", parallel=True)
+def rays(rotations: Array, origins: Array, width: int, height: int, index: Array, right: float, down: float) -> Array:
+    """(N, 6) origins and unit directions through pixels of an equirectangular picture.
+
+    Args:
+        rotations, origins: (R, 3, 3) and (R, 3) of each row.
+        index: (N,) pixels, row by row.
+        right, down: where in them, pixels from their centres.
+    """
+    out = np.empty((len(index), 6), np.float32)
+    lon = ((np.arange(width) + 0.5 + right) / width - 0.5) * 2 * math.pi
+    lat = ((np.arange(len(origins)) + 0.5 + down) / height - 0.5) * math.pi
+    c, s, around, ahead = np.cos(lat), np.sin(lat), np.sin(lon), np.cos(lon)
+    for i in prange(len(index)):
+        row = index[i] // width
+        column = index[i] - row * width
+        x, y, z = c[row] * around[column], s[row], c[row] * ahead[column]
+        m = rotations[row]
+        for j in range(3):
+            out[i, j] = origins[row, j]
+            out[i, 3 + j] = m[j, 0] * x + m[j, 1] * y + m[j, 2] * z
+    return out
+
+
+@njit(cache=True, error_model="numpy", parallel=True)
+def rough(image: Array, limit: int) -> Array:
+    """(H, W) bool: pixels of (H, W, 3) uint8 that differ from a neighbour by more than `limit` in some channel."""
+    h, w = image.shape[0], image.shape[1]
+    out = np.zeros((h, w), np.bool_)
+    for r in prange(h):
+        for c in range(w):
+            for k in range(3):
+                v = np.int64(image[r, c, k])  # Numba keeps int() of an unsigned number unsigned
+                most = max(abs(v - image[r, c - 1, k]), abs(v - image[r, (c + 1) % w, k]))
+                most = max(most, abs(v - image[max(r - 1, 0), c, k]), abs(v - image[min(r + 1, h - 1), c, k]))
+                if most > limit:
+                    out[r, c] = True
+    return out
+
+
+@njit(cache=True, error_model="numpy")
+def from_road(x: float, y: float, ground: Any) -> float:
+    """Distance to the nearest centre line, bilinear; 999 off the raster."""
+    distance, origin, cell = ground[0], ground[3], ground[4]
+    gx, gy = (x - origin[0]) / cell, (y - origin[1]) / cell
+    if not (0 <= gx < distance.shape[1] - 1 and 0 <= gy < distance.shape[0] - 1):
+        return 999.0
+    i, j = int(gx), int(gy)
+    a, b = gx - i, gy - j
+    low = distance[j, i] * (1 - a) + distance[j, i + 1] * a
+    high = distance[j + 1, i] * (1 - a) + distance[j + 1, i + 1] * a
+    return low * (1 - b) + high * b
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def task(turn: int, n: int) -> tuple[int, int]:
+    """First and last + 1 pixel of a task; neighbouring turns are far apart, so that threads have equal shares."""
+    tasks = n // BLOCK + 1
+    first = (turn * MIX) % tasks * BLOCK
+    return first, min(first + BLOCK, n)
+
+
+@njit(cache=True, error_model="numpy")
+def mixed(values: Array, part: Any, face: int, uv: Array) -> tuple[float, float, float]:
+    """The first three columns (or the first, thrice) of values at a face's corners, by barycentric uv."""
+    p, q, r = part[0][face, 0], part[0][face, 1], part[0][face, 2]
+    b, c = uv[0], uv[1]
+    a = 1 - b - c
+    one, last = min(1, values.shape[1] - 1), values.shape[1] - 1
+    return (
+        a * values[p, 0] + b * values[q, 0] + c * values[r, 0],
+        a * values[p, one] + b * values[q, one] + c * values[r, one],
+        a * values[p, last] + b * values[q, last] + c * values[r, last],
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def _ground(
+    ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, t: float, ground: Any
+) -> tuple[int, float, float, float, float]:
+    """What of the ground a ray meets before `t` (SKY: nothing), how far away, and the normal."""
+    if dz >= 0:
+        return SKY, t, 0.0, 0.0, 1.0
+    high, low = (ground[5] - oz) / dz, -oz / dz
+    if high >= t:
+        return SKY, t, 0.0, 0.0, 1.0
+    d = from_road(ox + high * dx, oy + high * dy, ground)
+    if d >= HALF:
+        return PAVEMENT, high, 0.0, 0.0, 1.0
+    e = from_road(ox + low * dx, oy + low * dy, ground)
+    if e >= HALF:
+        at = high + (low - high) * (HALF - d) / (e - d)
+        if at < t:
+            flat = math.sqrt(dx * dx + dy * dy) + 1e-9
+            return WALL, at, -dx / flat, -dy / flat, 0.0
+    elif low < t:
+        return ROAD, low, 0.0, 0.0, 1.0
+    return SKY, t, 0.0, 0.0, 1.0
+
+
+@njit(cache=True, error_model="numpy", parallel=True)
+def meet(
+    ray: Array, distance: Array, face: Array, uv: Array, moved: Array, static: Any, other: Any, ground: Any, sun: Array
+) -> tuple[Array, Array, Array]:
+    """Let rays that miss all things, or meet them underground, meet the ground; `distance` (N,) is updated.
+
+    Returns:
+        What each meets (N,) uint8, the normal there (N, 3), and the ray (N, 6) from there to the sun (one that
+        meets nothing, where the sun doesn't matter).
+    """
+    n = len(ray)
+    kind, normal, shadow = np.empty(n, np.uint8), np.empty((n, 3), np.float32), np.empty((n, 6), np.float32)
+    for turn in prange(n // BLOCK + 1):
+        first, last = task(turn, n)
+        for i in range(first, last):
+            ox, oy, oz, dx, dy, dz = ray[i, 0], ray[i, 1], ray[i, 2], ray[i, 3], ray[i, 4], ray[i, 5]
+            what, t, nx, ny, nz = _ground(ox, oy, oz, dx, dy, dz, distance[i], ground)
+            if what == SKY and t < 1e9:
+                what, part = THING, other if moved[i] else static
+                nx, ny, nz = mixed(part[1], part, face[i], uv[i])
+                length = max(math.sqrt(nx * nx + ny * ny + nz * nz), 1e-6)
+                nx, ny, nz = nx / length, ny / length, nz / length
+            distance[i], kind[i] = t, what
+            normal[i, 0], normal[i, 1], normal[i, 2] = nx, ny, nz
+            if what == SKY or nx * sun[0] + ny * sun[1] + nz * sun[2] <= 0:
+                shadow[i, 0], shadow[i, 1], shadow[i, 2] = 0, 0, 5000
+                shadow[i, 3], shadow[i, 4], shadow[i, 5] = 0, 0, 1
+            else:
+                shadow[i, 0] = ox + t * dx + 0.03 * nx + 0.02 * sun[0]
+                shadow[i, 1] = oy + t * dy + 0.03 * ny + 0.02 * sun[1]
+                shadow[i, 2] = oz + t * dz + 0.03 * nz + 0.02 * sun[2]
+                shadow[i, 3], shadow[i, 4], shadow[i, 5] = sun[0], sun[1], sun[2]
+    return kind, normal, shadow

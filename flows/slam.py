@@ -1,0 +1,200 @@
+"""`scan2sim slam`: a video to a trajectory, figures against a truth, and the study of compression."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+from pydantic import ValidationError
+
+from flows.display import console, progress
+from flows.execute import locked
+from flows.settings import Settings
+from pipeline.errors import InputError, SettingError
+from pipeline.io import trajectory as trajectory_io
+from pipeline.io.image import read_rgb
+from pipeline.io.tile import read_tile
+from pipeline.types import Camera, Trajectory
+from slam import output
+from slam.adjust import adjust
+from slam.charts import Charts
+from slam.evaluate import AlignmentKind, Evaluation, evaluate, plot
+from slam.gps import GpsTrack, read_gps, smooth
+from slam.loops import Places
+from slam.loops import close as close_loops
+from slam.odometry import Odometry, OdometryParams
+from slam.sparse import sparse_map
+from slam.track import Tracked, camera_of, track
+from slam.video import Video, open_video
+
+
+@dataclass(frozen=True)
+class Options:
+    """What the command was asked, besides parameters.
+
+    Attributes:
+        gps: file of the track.
+        gps_offset: seconds added to the track's times, first frame at 0; None: as the files' clocks say.
+        georeference: place the trajectory where GPS says.
+        mask: picture, 0 where the car is.
+        camera: "auto", "pinhole", "equirectangular".
+        focal: pixels.
+        centre: pixels.
+        tile: whose camera it is, and
+        tile_camera: the name of a photo of that camera there.
+        fps, times: of a folder of pictures.
+        every: take every so manieth frame.
+        backend: of `slam.graph`.
+        colmap: write the map as a COLMAP model, too.
+        loops: recognise places that were passed before.
+        adjust: adjust all keyframes at once in the end.
+        view: record a video of what is tracked.
+    """
+
+    gps: Path | None = None
+    gps_offset: float | None = None
+    georeference: bool = True
+    mask: Path | None = None
+    camera: str = "auto"
+    focal: float | None = None
+    centre: tuple[float, float] | None = None
+    tile: Path | None = None
+    fps: float = 10.0
+    times: Path | None = None
+    every: int = 1
+    backend: str = "lm"
+    colmap: bool = False
+    loops: bool = False
+    adjust: bool = False
+    view: bool = False
+
+
+def slam_video(path: Path, out: Path, options: Options, settings: Settings) -> Tracked:
+    """Write the trajectory of the camera that took a video, in all formats, and `slam.json`.
+
+    Raises:
+        ScanError: see `pipeline.errors`; earlier results stay.
+    """
+    params = odometry_params(settings)
+    video = open_video(path, fps=options.fps, times=options.times)
+    camera, gps, mask = _camera(video, options), _gps(video, options), _mask(video, options)
+    with locked(out), progress("slam") as report:
+        asked = json.dumps([str(path.resolve()), str(options), params.model_dump()], default=str)
+        state = out / f"state-{hashlib.sha256(asked.encode()).hexdigest()[:12]}"
+        watch = None
+        if options.view:
+            from slam.view import Recorder
+
+            watch = Recorder(out / "view.mp4", fps=video.fps / options.every)
+        places = Places(Charts(camera)) if options.loops else None
+        after: list[Callable[[Odometry], dict[str, float]]] = [adjust] if options.adjust else []
+        if places is not None:
+            after.append(partial(close_loops, places=places))
+        keep = options.colmap or options.adjust
+
+        def start(warn: Callable[[str], None]) -> Odometry:
+            return Odometry(
+                camera, params, mask=mask, gps=gps, backend=options.backend, keep=keep, remember=places, warn=warn
+            )
+
+        tracked = track(
+            video, start, gps=gps, georeference=options.georeference, every=options.every, state=state, watch=watch,
+            after=after, report=report,
+        )  # fmt: skip
+        if watch is not None:
+            watch.close()
+        sparse = sparse_map(tracked.odometry, tracked.placing, tracked.trajectory) if options.colmap else None
+        output.write(out, tracked.trajectory, tracked.frame, camera=camera, names=tracked.names, sparse=sparse)
+        if tracked.alone is not None:
+            trajectory_io.write(out / "odometry.csv", tracked.alone, tracked.frame)
+        (out / "slam.json").write_text(json.dumps(tracked.facts | {"warnings": tracked.warnings}, indent=1) + "\n")
+        state.unlink(missing_ok=True)
+    for warning in tracked.warnings[:20]:
+        console.print(f"[yellow]warning:[/] {warning}", highlight=False, soft_wrap=True)
+    console.print(json.dumps(tracked.facts, indent=1), highlight=False, markup=False)
+    console.print(f"Trajectory: {out / 'trajectory.csv'}", highlight=False, soft_wrap=True, markup=False)
+    return tracked
+
+
+def odometry_params(settings: Settings) -> OdometryParams:
+    """Of `--set slam.param=value`.
+
+    Raises:
+        SettingError: unknown, or out of range.
+    """
+    for name in settings.values:
+        if name != "slam":
+            raise SettingError(name, "there is no such step here", "Write --set slam.param=value")
+    try:
+        return OdometryParams(**settings.values.get("slam", {}))
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(["slam", *(str(part) for part in first["loc"])])
+        raise SettingError(where, f"{first['msg']} (got {first['input']!r})", "docs/slam.md lists them") from None
+
+
+def _camera(video: Video, options: Options) -> Camera:
+    if options.tile is None:
+        return camera_of(video, options.camera, options.focal, options.centre)
+    for view in read_tile(options.tile).views:
+        if (view.camera.width, view.camera.height) == (video.width, video.height):
+            return view.camera
+    raise InputError(options.tile, f"has no camera of {video.width}x{video.height}", "Give --camera and --focal")
+
+
+def _gps(video: Video, options: Options) -> GpsTrack | None:
+    """The track in the frames' times, smoothed."""
+    if options.gps is None:
+        return None
+    track_ = read_gps(options.gps)
+    absolute = track_.times[0] > 1e8
+    if options.gps_offset is not None:
+        track_ = track_.shifted(options.gps_offset)
+    elif absolute and video.start is not None and abs(video.start - track_.times[0]) < 3600:
+        track_ = track_.shifted(-video.start)
+    elif absolute:
+        console.print("[yellow]warning:[/] no clock of the video's: its first frame is taken to be at the first fix")
+        track_ = track_.shifted(-float(track_.times[0]))
+    return smooth(track_)
+
+
+def _mask(video: Video, options: Options) -> np.ndarray | None:
+    if options.mask is None:
+        return None
+    import cv2
+
+    rgb = read_rgb(options.mask) if options.mask.is_file() else None
+    if rgb is None:
+        raise InputError(options.mask, "is no readable picture", "Give a mask: 0 where the car itself is seen")
+    return cv2.resize(rgb[..., 0], (video.width, video.height), interpolation=cv2.INTER_NEAREST)
+
+
+def evaluate_trajectory(estimate: Path, truth: Path, *, segment: float, alignment: str, out: Path | None) -> Evaluation:
+    """Print how far a trajectory is from the truth: a trajectory, or a GPS track."""
+    kinds: tuple[AlignmentKind, ...] = get_args(AlignmentKind)
+    kind = next((k for k in kinds if k == alignment), None)
+    if kind is None:
+        raise SettingError("--alignment", f"there is no `{alignment}`", f"Choose one of {', '.join(kinds)}")
+    path = trajectory_io.read(estimate)
+    known = _truth(truth)
+    result = evaluate(path, known, segment=segment, alignment=kind)
+    for name, value in result.figures().items():
+        console.print(f"{name:<24}{'-' if value is None else f'{value:.4f}':>14}", highlight=False, markup=False)
+    if out is not None:
+        plot(result, out)
+        console.print(f"Plot: {out}", highlight=False, soft_wrap=True, markup=False)
+    return result
+
+
+def _truth(path: Path) -> Trajectory | GpsTrack:
+    if path.suffix.lower() in (".gpx", ".nmea", ".mp4"):
+        return read_gps(path)
+    if path.suffix.lower() == ".csv" and "lat" in path.read_text(encoding="utf-8", errors="replace")[:200]:
+        return read_gps(path)
+    return trajectory_io.read(path)

@@ -1,0 +1,129 @@
+"""What importers of a moving scanner's sweeps share: poses between poses, colours from photos, thinning."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.errors import InputError
+from pipeline.io.image import read_rgb
+from pipeline.types import F32, F64, U8, Camera
+
+Bools = npt.NDArray[np.bool_]
+
+COLOUR_REACH = 0.5  # metres over which a point that its own photo doesn't show borrows a colour
+COLOUR_VOXEL = 0.1
+NEAREST = 0.5  # metres: what is nearer to the lens gets no colour from it
+GREY = 128
+
+
+def read_bin(path: Path) -> tuple[F32, F32]:
+    """(N, 3) points in scanner axes and (N,) reflectance of a sweep as KITTI has it: float32 x, y, z, reflectance.
+
+    Raises:
+        InputError: it isn't one.
+    """
+    data = np.fromfile(path, np.float32)
+    if data.size == 0 or data.size % 4:
+        raise InputError(path, f"is no Velodyne sweep ({data.size * 4} bytes)", "Copy it again")
+    data = data.reshape(-1, 4)
+    data = data[np.isfinite(data).all(axis=1)]
+    return data[:, :3], np.clip(data[:, 3], 0, 1)
+
+
+def interpolate(T: F64, at: F64, times: F64) -> F64:
+    """(N, 4, 4) poses at `times`, by the motion between neighbours of (F, 4, 4) `T` at `at`, beyond its ends too."""
+    from scipy.spatial.transform import Rotation
+
+    if len(T) == 1:
+        return np.repeat(T, len(times), axis=0)
+    b = np.clip(np.searchsorted(at, times), 1, len(at) - 1)
+    a = b - 1
+    share = ((times - at[a]) / (at[b] - at[a]))[:, None]
+    turn = Rotation.from_matrix(np.swapaxes(T[:-1, :3, :3], 1, 2) @ T[1:, :3, :3]).as_rotvec()[a]
+    out = np.tile(np.eye(4), (len(times), 1, 1))
+    out[:, :3, :3] = T[a, :3, :3] @ Rotation.from_rotvec(share * turn).as_matrix()
+    out[:, :3, 3] = T[a, :3, 3] + share * (T[b, :3, 3] - T[a, :3, 3])
+    return out
+
+
+def phase_of(xyz: F32) -> F64:
+    """(N,) when within a sweep each point was measured, 0 to 1: by a scanner (z up, x ahead) as KITTI's.
+
+    It turns clockwise, starts and ends looking back, and faces forward in the middle.
+    """
+    return 0.5 - np.arctan2(xyz[:, 1], xyz[:, 0], dtype=np.float64) / (2 * np.pi)
+
+
+def colour(
+    world: F64,
+    T_world_cam: F64,
+    camera: Camera,
+    photo: Path,
+    rgb: U8,
+    seen: Bools,
+    *,
+    mask: U8 | None = None,
+    remedy: str = "Give the camera that took it",
+) -> None:
+    """Fill `rgb` and `seen` (N,) of points (N, 3) that fall into the photo and no earlier one has shown.
+
+    Whether something stands between is not looked at: camera and scanner must be close to each other.
+
+    Args:
+        mask: (H, W), 0 where the photo must not be used.
+        remedy: what to do about a photo of another size than its camera's.
+
+    Raises:
+        InputError: the photo can't be read, or has another size.
+    """
+    from pipeline.cameras import inside, project
+
+    image = read_rgb(photo)
+    if image is None:
+        raise InputError(photo, "is no readable image", "Copy it again")
+    if image.shape[:2] != (camera.height, camera.width):
+        size = f"{image.shape[1]}x{image.shape[0]}"
+        raise InputError(photo, f"is {size}, but its calibration says {camera.width}x{camera.height}", remedy)
+    local = (world - T_world_cam[:3, 3]) @ T_world_cam[:3, :3]
+    uv, valid = project(camera, local)
+    good = valid & inside(camera, uv) & ~seen & (np.einsum("ij,ij->i", local, local) > NEAREST**2)
+    u, v = np.clip(np.rint(uv[good]).astype(int), 0, [camera.width - 1, camera.height - 1]).T
+    if mask is not None:
+        shown = mask[v, u] > 0
+        good[good], u, v = shown, u[shown], v[shown]
+    rgb[good] = image[v, u]
+    seen |= good
+
+
+def borrow_colours(xyz: F32, rgb: U8, seen: Bools, distance: F32) -> U8:
+    """Colours (N, 3) where points that are not `seen` take that of the nearest seen one within reach, or grey.
+
+    Of the seen points in a 10 cm voxel only the one at the smallest `distance` from its camera counts.
+    """
+    from scipy.spatial import cKDTree
+
+    out = rgb.copy()
+    out[~seen] = GREY
+    index = np.flatnonzero(seen)
+    if len(index) in (0, len(xyz)):
+        return out
+    index = index[thin(xyz[index], COLOUR_VOXEL, distance[index])]
+    tree = cKDTree(xyz[index])
+    rest = np.flatnonzero(~seen)
+    for some in np.array_split(rest, max(1, len(rest) // 2_000_000)):
+        gap, nearest = tree.query(xyz[some], distance_upper_bound=COLOUR_REACH, workers=-1)
+        close = np.isfinite(gap)
+        out[some[close]] = rgb[index[nearest[close]]]
+    return out
+
+
+def thin(xyz: F32, size: float, rank: npt.NDArray[np.floating]) -> npt.NDArray[np.intp]:
+    """Indices of one point for each voxel of `size` metres: that of the smallest `rank` (N,)."""
+    order = np.argsort(rank, kind="stable")
+    cells = np.floor(xyz[order] / size).astype(np.int64)
+    cells -= cells.min(axis=0)
+    _, first = np.unique(np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1)), return_index=True)
+    return order[first]

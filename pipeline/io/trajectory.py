@@ -1,0 +1,307 @@
+"""Trajectory files, told apart by their suffix; positions in them are CRS coordinates of a `Frame`.
+
+| suffix | holds |
+| --- | --- |
+| .csv | a heading, then time,x,y,z[,qx,qy,qz,qw][,unsure][,sx,sy,sz[,srx,sry,srz]]: all but correlations |
+| .tum | time x y z qx qy qz qw a line, as the TUM benchmark and evo have it |
+| .kitti | 12 numbers a line, row-major 3x4; ten poses a second unless times are given |
+| .geojson | the path in WGS84, and a point for each unsure stretch; only written |
+
+Quaternions turn the sensor's axes to the world's, scalar last. `sx` to `sz` are standard deviations in the CRS's
+unit, `srx` to `srz` in radians. Files of other suffixes are told by their first line.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.errors import DataError, InputError, SettingError, from_os_error
+from pipeline.io import crs as crs_io
+from pipeline.types import F64, Frame, Trajectory
+
+POSITION = ("time", "x", "y", "z")
+QUATERNION = ("qx", "qy", "qz", "qw")
+DEVIATION = ("sx", "sy", "sz", "srx", "sry", "srz")
+REMEDIES = {
+    ".csv": "Write a CSV: a heading, then time,x,y,z[,qx,qy,qz,qw] a line, CRS coordinates",
+    ".tum": "Write time x y z qx qy qz qw a line",
+    ".kitti": "Write 12 numbers a line, row-major 3x4",
+}
+KITTI_RATE = 10.0  # poses a second, as KITTI's cameras
+Lines = list[tuple[int, list[str]]]  # number in the file, from 1 on, and cells
+
+
+def read(
+    path: Path, frame: Frame | None = None, *, times: F64 | None = None, ordered: bool = True, timed: bool = False
+) -> Trajectory:
+    """Read a trajectory into local coordinates of `frame` (by default those of the file itself).
+
+    Args:
+        times: (T,) seconds, for a .kitti file, which has none.
+        ordered: refuse times that don't ascend; otherwise lines are sorted by them.
+        timed: refuse a file without times, rather than count poses.
+
+    Raises:
+        InputError: naming file and line: unreadable, empty, NaN, wrong columns, times out of order, no rotation.
+    """
+    frame = frame or Frame()
+    kind, lines = _lines(path)
+    if kind == ".kitti":
+        if timed and times is None:
+            raise InputError(path, "is no trajectory with times", REMEDIES[".csv"])
+        trajectory = _from_kitti(path, lines, frame, times)
+    else:
+        heading: tuple[str, ...] = POSITION + QUATERNION
+        if kind == ".csv":
+            heading, lines = _heading(path, lines)
+        trajectory = _from_columns(path, kind, heading, lines, frame)
+    order = np.argsort(trajectory.times, kind="stable")
+    if ordered and (np.diff(trajectory.times) <= 0).any():
+        late = int(np.flatnonzero(np.diff(trajectory.times) <= 0)[0]) + 1
+        number = lines[late][0] if late < len(lines) else late + 1
+        raise _bad(path, kind, number, "its time doesn't follow that of the line before", "Sort it, each time once")
+    return trajectory if ordered else _take(trajectory, order)
+
+
+def write(path: Path, trajectory: Trajectory, frame: Frame | None = None) -> None:
+    """Write a trajectory, whose positions are local to `frame`, as its suffix says; the file appears whole or not.
+
+    Raises:
+        SettingError: unknown suffix; rotations are unknown but asked for; GeoJSON of a frame without a CRS.
+        DataError: nothing to write, or a pose with NaN.
+        SpaceError: the disk is full or may not be written to.
+    """
+    frame = frame or Frame()
+    writers = {".csv": _to_csv, ".tum": _to_tum, ".kitti": _to_kitti, ".geojson": _to_geojson}
+    kind = path.suffix.lower()
+    if kind not in writers:
+        raise SettingError(path, "is no known trajectory format", f"End its name in one of {', '.join(writers)}")
+    if kind in (".tum", ".kitti") and trajectory.rotations is None:
+        raise SettingError(path, "needs rotations, but only positions are known", "Write .csv or .geojson")
+    if not len(trajectory) or not all(np.isfinite(part).all() for part in (trajectory.times, trajectory.positions)):
+        raise DataError(path, "its trajectory is empty or holds NaN", "Leave out what has no pose")
+    text = writers[kind](path, trajectory, frame)
+    with replacing(path) as fresh:
+        fresh.write_text(text, encoding="utf-8")
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A temporary path beside `path` that takes its place when the block ends well, and is removed otherwise.
+
+    Raises:
+        SpaceError: the disk is full or may not be written to.
+    """
+    fresh = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        yield fresh
+        fresh.replace(path)
+    except OSError as error:
+        raise from_os_error(error, path) from error
+    finally:
+        fresh.unlink(missing_ok=True)
+
+
+def _bad(path: Path, kind: str, line: int, cause: str, remedy: str | None = None) -> InputError:
+    return InputError(path, f"is no trajectory (line {line}: {cause})", remedy or REMEDIES[kind])
+
+
+def _lines(path: Path) -> tuple[str, Lines]:
+    """The format of a file and its lines, without blank ones and (but for a CSV's heading) comments."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise from_os_error(error, path) from error
+    except UnicodeDecodeError:
+        raise InputError(path, "is no trajectory (it is no text)", REMEDIES[".csv"]) from None
+    filled = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
+    plain = [(i, line) for i, line in filled if not line.lstrip().startswith("#")]
+    kind = path.suffix.lower()
+    if kind == ".geojson":
+        raise InputError(path, "is GeoJSON, which is only written", "Name the .csv beside it")
+    if kind not in REMEDIES:
+        first = plain[0][1] if plain else ","
+        kind = ".csv" if "," in first else {8: ".tum", 12: ".kitti"}.get(len(first.split()), ".csv")
+    if kind == ".csv":
+        plain = filled[:1] + [line for line in plain if line not in filled[:1]]
+    lines = [(i, line.split("," if kind == ".csv" else None)) for i, line in plain]
+    if len(lines) <= (kind == ".csv"):
+        raise InputError(path, "is no trajectory (it holds no poses)", REMEDIES[kind])
+    return kind, lines
+
+
+def _heading(path: Path, lines: Lines) -> tuple[tuple[str, ...], Lines]:
+    """Names of a CSV's columns, and the lines under them; four columns of other names are time,x,y,z."""
+    number, cells = lines[0]
+    names = tuple(cell.strip(" #\t\"'").lower() for cell in cells)
+    if all(_is_number(cell) for cell in cells):
+        raise _bad(path, ".csv", number, "it has no heading")
+    if set(POSITION) <= set(names):
+        partial = {"rotation": QUATERNION, "deviation": DEVIATION[:3], "turn deviation": DEVIATION[3:]}
+        for what, columns in partial.items():
+            if 0 < len(set(columns) & set(names)) < len(columns):
+                raise _bad(path, ".csv", number, f"its {what} needs all of {','.join(columns)}")
+        return names, lines[1:]
+    if len(names) == 4:
+        return POSITION, lines[1:]
+    raise _bad(path, ".csv", number, f"columns are {','.join(names)[:80]}")
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _numbers(path: Path, kind: str, lines: Lines, width: int) -> F64:
+    """(T, width) the cells of all lines."""
+    rows = np.empty((len(lines), width))
+    for i, (number, cells) in enumerate(lines):
+        if len(cells) != width:
+            raise _bad(path, kind, number, f"{len(cells)} columns, expected {width}")
+        try:
+            rows[i] = [float(cell) for cell in cells]
+        except ValueError as error:
+            raise _bad(path, kind, number, str(error)) from None
+    odd = np.flatnonzero(~np.isfinite(rows).all(axis=1))
+    if len(odd):
+        raise _bad(path, kind, lines[odd[0]][0], "holds NaN or infinity", "Leave out the lines that have no pose")
+    return rows
+
+
+def _from_columns(path: Path, kind: str, names: tuple[str, ...], lines: Lines, frame: Frame) -> Trajectory:
+    from scipy.spatial.transform import Rotation
+
+    rows = _numbers(path, kind, lines, len(names))
+    column = {name: rows[:, k] for k, name in enumerate(names)}
+
+    def block(wanted: Sequence[str]) -> F64 | None:
+        return np.stack([column[name] for name in wanted], axis=1) if set(wanted) <= set(column) else None
+
+    quaternions = block(QUATERNION)
+    if quaternions is not None:
+        odd = np.flatnonzero(np.abs(np.linalg.norm(quaternions, axis=1) - 1) > 0.01)
+        if len(odd):
+            raise _bad(path, kind, lines[odd[0]][0], "its quaternion is not of length 1", "Give qx, qy, qz, qw")
+    covariance = None
+    if set(DEVIATION[:3]) <= set(column):
+        deviation = np.full((len(rows), 6), np.inf)  # nothing is known of turns that the file doesn't tell of
+        for k, name in enumerate(DEVIATION):
+            if name in column:
+                deviation[:, k] = column[name] * (frame.unit if k < 3 else 1)
+        covariance = np.zeros((len(rows), 6, 6))
+        covariance[:, np.arange(6), np.arange(6)] = deviation**2
+    return Trajectory(
+        column["time"],
+        frame.to_local(rows[:, [names.index(name) for name in POSITION[1:]]]),
+        None if quaternions is None else Rotation.from_quat(quaternions).as_matrix(),
+        column["unsure"] != 0 if "unsure" in column else None,
+        covariance,
+    )
+
+
+def _from_kitti(path: Path, lines: Lines, frame: Frame, times: F64 | None) -> Trajectory:
+    matrices = _numbers(path, ".kitti", lines, 12).reshape(-1, 3, 4)
+    rotations = matrices[:, :, :3]
+    skew = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    odd = np.flatnonzero((skew > 1e-3) | (np.linalg.det(rotations) < 0))
+    if len(odd):
+        raise _bad(path, ".kitti", lines[odd[0]][0], "its left 3x3 is no rotation")
+    u, _, vt = np.linalg.svd(rotations)  # rounded digits: nearest true rotation
+    if times is None:
+        times = np.arange(len(lines)) / KITTI_RATE
+    if len(times) != len(lines):
+        raise InputError(path, f"has {len(lines)} poses for {len(times)} times", "Give a time for each line")
+    return Trajectory(np.asarray(times, np.float64), frame.to_local(matrices[:, :, 3]), u @ vt)
+
+
+def _take(trajectory: Trajectory, index: Any) -> Trajectory:
+    t = trajectory
+    optional = (None if part is None else part[index] for part in (t.rotations, t.unsure, t.covariance))
+    return Trajectory(t.times[index], t.positions[index], *optional)
+
+
+def _quaternions(rotations: F64) -> F64:
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_matrix(rotations).as_quat(canonical=True)
+
+
+def _rows(columns: Sequence[tuple[F64, str]], separator: str) -> str:
+    """Lines of columns, each (T,) or (T, K) with the format of its numbers."""
+    parts = [(part.reshape(len(part), -1), form) for part, form in columns]
+    template = separator.join(separator.join([form] * part.shape[1]) for part, form in parts)
+    return "".join(template % tuple(row) + "\n" for row in np.column_stack([part for part, _ in parts]).tolist())
+
+
+def _to_csv(path: Path, t: Trajectory, frame: Frame) -> str:
+    names, columns = list(POSITION), [(t.times, "%.6f"), (frame.to_crs(t.positions), "%.6f")]
+    if t.rotations is not None:
+        names += QUATERNION
+        columns.append((_quaternions(t.rotations), "%.9f"))
+    if t.unsure is not None:
+        names.append("unsure")
+        columns.append((t.unsure.astype(np.float64), "%d"))
+    if t.covariance is not None:
+        deviation = np.sqrt(np.einsum("tkk->tk", t.covariance)) / ([frame.unit] * 3 + [1.0] * 3)
+        known = 6 if np.isfinite(deviation).all() else 3
+        names += DEVIATION[:known]
+        columns.append((deviation[:, :known], "%.6g"))
+    return ",".join(names) + "\n" + _rows(columns, ",")
+
+
+def _to_tum(path: Path, t: Trajectory, frame: Frame) -> str:
+    assert t.rotations is not None
+    columns = [(t.times, "%.6f"), (frame.to_crs(t.positions), "%.6f"), (_quaternions(t.rotations), "%.9f")]
+    return "# timestamp tx ty tz qx qy qz qw\n" + _rows(columns, " ")
+
+
+def _to_kitti(path: Path, t: Trajectory, frame: Frame) -> str:
+    assert t.rotations is not None
+    matrices = np.concatenate([t.rotations, frame.to_crs(t.positions)[:, :, None]], axis=2)
+    return _rows([(matrices.reshape(-1, 12), "%.12e")], " ")
+
+
+def _to_geojson(path: Path, t: Trajectory, frame: Frame) -> str:
+    """The path, and a point in the middle of every unsure stretch with its largest horizontal deviation (1 sigma)."""
+    if crs_io.to_wgs84(frame) is None:  # it also refuses what is no CRS
+        raise SettingError(path, "can't be placed on the globe: its frame has no CRS", "Write .csv, or align to GPS")
+    from pyproj import CRS, Transformer
+
+    x, y, _ = frame.to_crs(t.positions).T
+    horizontal = CRS.from_user_input(frame.crs).to_2d()  # heights stay as they are
+    lon, lat = Transformer.from_crs(horizontal, "EPSG:4326", always_xy=True).transform(x, y)
+    height = t.positions[:, 2] + frame.origin[2]
+    places = np.column_stack([np.round(lon, 8), np.round(lat, 8), np.round(height, 3)]).tolist()
+    whole = {"kind": "path", "start_s": float(t.times[0]), "end_s": float(t.times[-1]), "poses": len(t)}
+    line = {"type": "LineString", "coordinates": places} if len(t) > 1 else {"type": "Point", "coordinates": places[0]}
+    features = [{"type": "Feature", "properties": whole, "geometry": line}]
+    edges = np.diff(np.concatenate([[False], t.unsure if t.unsure is not None else [], [False]]).astype(int))
+    for first, end in zip(np.flatnonzero(edges > 0).tolist(), np.flatnonzero(edges < 0).tolist(), strict=True):
+        about = {
+            "kind": "unsure",
+            "start_s": float(t.times[first]),
+            "end_s": float(t.times[end - 1]),
+            "length_m": round(float(np.linalg.norm(np.diff(t.positions[first:end], axis=0), axis=1).sum()), 3),
+            "sigma_m": None if t.covariance is None else _worst(t.covariance[first:end]),
+        }
+        point = {"type": "Point", "coordinates": places[(first + end - 1) // 2]}
+        features.append({"type": "Feature", "properties": about, "geometry": point})
+    return json.dumps({"type": "FeatureCollection", "features": features}) + "\n"
+
+
+def _worst(covariance: F64) -> float | None:
+    """The largest horizontal standard deviation (m) of (N, 6, 6) covariances, along its worst direction."""
+    horizontal = covariance[:, :2, :2]
+    if not np.isfinite(horizontal).all():
+        return None
+    return round(float(np.sqrt(max(0.0, np.linalg.eigvalsh(horizontal).max()))), 3)

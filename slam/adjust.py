@@ -1,0 +1,70 @@
+"""Global adjustment: all keyframes and points at once, by pycolmap (Ceres), after odometry; reported apart from it.
+
+Schoenberger and Frahm, "Structure-from-Motion Revisited", CVPR 2016; pycolmap knows equirectangular cameras.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.errors import UnavailableError
+from pipeline.types import Trajectory
+from slam.evaluate import umeyama
+from slam.odometry import Odometry
+from slam.output import SparseMap, write_colmap
+from slam.sparse import kept
+
+LOSS = 1.0
+"""Pixels, of Cauchy's loss."""
+
+
+def adjust(odometry: Odometry) -> dict[str, float]:
+    """Move the keyframes of an odometry that was told to `keep` to where all observations fit best; figures.
+
+    The whole keeps its place, orientation and scale: those are the odometry's, or GPS's.
+
+    Raises:
+        UnavailableError: pycolmap isn't installed.
+    """
+    from pipeline.cameras import project
+
+    try:
+        import pycolmap
+    except ImportError:
+        raise UnavailableError("pycolmap", "is not installed", "pip install pycolmap") from None
+    keyframes = odometry.map.keyframes
+    poses = np.stack([k.T_world_cam for k in keyframes])
+    known = kept(odometry)
+    uv, inside = project(odometry.map.camera, known.bearing)
+    path = Trajectory(np.arange(len(poses), dtype=np.float64), poses[:, :3, 3], poses[:, :3, :3])
+    sparse = SparseMap(known.xyz, known.point[inside], known.keyframe[inside], uv[inside].astype(np.float64))
+    with tempfile.TemporaryDirectory(prefix="scan2sim-adjust-") as folder:
+        write_colmap(Path(folder), path, odometry.map.camera, [f"{i:06d}" for i in range(len(poses))], sparse)
+        model = pycolmap.Reconstruction(folder)
+    before = model.compute_mean_reprojection_error()
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_focal_length = options.refine_principal_point = options.refine_extra_params = False
+    options.print_summary = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = LOSS
+    options.ceres.solver_options.max_num_iterations = 50
+    pycolmap.bundle_adjustment(model, options)
+    model.update_point_3d_errors()
+    moved = poses.copy()
+    for i in model.reg_image_ids():
+        world_to_cam = model.images[i].cam_from_world()
+        R = world_to_cam.rotation.matrix()
+        moved[i - 1, :3, :3], moved[i - 1, :3, 3] = R.T, -R.T @ world_to_cam.translation
+    onto = umeyama(moved[:, :3, 3], poses[:, :3, 3], scaled=True)
+    for keyframe, pose in zip(keyframes, moved, strict=True):
+        keyframe.T_world_cam = np.eye(4)
+        keyframe.T_world_cam[:3, :3] = onto.rotation @ pose[:3, :3]
+        keyframe.T_world_cam[:3, 3] = onto.apply(pose[None, :3, 3])[0]
+    return {
+        "adjusted_keyframes": len(poses), "adjusted_points": len(known.xyz),
+        "reprojection_before_px": round(float(before), 4),
+        "reprojection_after_px": round(float(model.compute_mean_reprojection_error()), 4),
+    }  # fmt: skip

@@ -1,0 +1,111 @@
+"""Finish: what odometry placed becomes a trajectory: upright, in GPS's scale, where GPS says."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.types import F64, Frame, Trajectory
+from slam import scale
+from slam.geometry import exp_so3
+from slam.gps import GpsTrack
+from slam.odometry import Odometry
+
+DRIFT, TURN = 0.003, 2e-5
+"""Of the way and radians a metre: how far tracked poses are off, one standard deviation (bench/slam.py measures it)."""
+BRIDGED_DRIFT, BRIDGED_TURN = 0.2, 0.03
+"""Of the way and radians a second, where poses were carried on without seeing."""
+
+
+@dataclass(frozen=True)
+class Placing:
+    """How the camera's own world becomes that of the trajectory.
+
+    Attributes:
+        R: (3, 3) rotation, then
+        shift: (3,) metres.
+        factor: (T - 1,) what every step's length is multiplied by.
+        frame: of the result.
+    """
+
+    R: F64
+    shift: F64
+    factor: F64
+    frame: Frame
+
+    def points(self, xyz: F64, at: npt.NDArray[np.int64], before: F64, after: Trajectory) -> F64:
+        """Points (P, 3) of the camera's world, carried along with the poses `at` (P,) which they were seen from.
+
+        `before` (T, 3) are the positions in the camera's world, `after` the finished trajectory.
+        """
+        steps = np.append(self.factor, self.factor[-1:] if len(self.factor) else [1.0])
+        return (xyz - before[at]) * steps[at, None] @ self.R.T + after.positions[at]
+
+
+def finish(odometry: Odometry, gps: GpsTrack | None, *, georeference: bool = True) -> tuple[Trajectory, Placing]:
+    """The trajectory, camera to a z-up world; `gps` in the frames' times ties its scale, and places it.
+
+    Without GPS, the world begins at the first camera, its x axis along that camera's view.
+    """
+    placed = odometry.placed
+    times = np.array([p.time for p in placed])
+    unsure = np.array([p.unsure for p in placed])
+    poses = np.stack([odometry.pose_of(p) for p in placed])
+    R = upright(poses)
+    positions, rotations = poses[:, :3, 3] @ R.T, R @ poses[:, :3, :3]
+    factor, frame = np.ones(len(times) - 1), Frame()
+    if gps is not None:
+        factor = scale.factors(times, positions, unsure, gps)
+        positions = scale.apply(positions, factor)
+        if georeference:
+            turn, shift = place(positions, gps.at(times))
+            R, positions, rotations = turn @ R, positions @ turn.T + shift, turn @ rotations
+            frame = gps.frame
+    covariance = uncertainty(times, positions, unsure)
+    trajectory = Trajectory(times, positions, rotations, unsure, covariance)
+    return trajectory, Placing(R, positions[0] - poses[0, :3, 3] @ R.T, factor, frame)
+
+
+def upright(poses: F64) -> F64:
+    """(3, 3) rotation to a z-up world whose x axis is the first view's direction: cameras stand upright on average."""
+    down = poses[:, :3, 1].mean(axis=0)
+    up = -down / np.linalg.norm(down)
+    ahead = poses[0, :3, 2] - up * (poses[0, :3, 2] @ up)
+    ahead /= np.linalg.norm(ahead)
+    return np.stack([ahead, np.cross(up, ahead), up])
+
+
+def place(positions: F64, there: F64) -> tuple[F64, F64]:
+    """Turn about z (3, 3) and shift (3,) that bring positions (T, 3) to GPS's (T, 3; NaN where unknown), robustly."""
+    known = np.isfinite(there[:, 0])
+    if known.sum() < 2:
+        return np.eye(3), np.zeros(3)
+    a, b = positions[known], there[known]
+    w = np.ones(len(a))
+    for _ in range(10):
+        ma, mb = np.average(a, axis=0, weights=w), np.average(b, axis=0, weights=w)
+        p, q = a - ma, b - mb
+        angle = np.arctan2(
+            (w * (p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0])).sum(), (w * (p[:, :2] * q[:, :2]).sum(axis=1)).sum()
+        )
+        turn = exp_so3([0.0, 0.0, angle])
+        shift = mb - turn @ ma
+        off = np.linalg.norm((a @ turn.T + shift - b)[:, :2], axis=1)
+        w = 1 / (1 + (off / 3.0) ** 2)
+    return turn, shift
+
+
+def uncertainty(times: F64, positions: F64, unsure: npt.NDArray[np.bool_]) -> F64:
+    """(T, 6, 6) covariance against the start: little for what was tracked, much for what was bridged."""
+    way = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    seconds = np.diff(times)
+    blind = unsure[1:]
+    tracked = np.cumsum(np.where(blind, 0, way))
+    sigma = DRIFT * tracked + np.sqrt(np.cumsum(np.where(blind, (BRIDGED_DRIFT * way) ** 2 * 10, 0)))
+    turn = TURN * tracked + np.sqrt(np.cumsum(np.where(blind, (BRIDGED_TURN * seconds) ** 2 * 10, 0)))
+    out = np.zeros((len(times), 6, 6))
+    for k in range(3):
+        out[1:, k, k], out[1:, 3 + k, 3 + k] = sigma**2, turn**2
+    return out

@@ -1,0 +1,201 @@
+"""Geometry of viewing directions: rotations, triangulation, the relative pose of two cameras. Import late: numba.
+
+Bearings are unit vectors in camera axes, so that any camera will do, and nothing is special about seam or poles.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from pipeline.types import F64, I32
+
+Bools = npt.NDArray[np.bool_]
+
+
+def exp_so3(w: npt.ArrayLike) -> F64:
+    """(..., 3, 3) rotations of rotation vectors (..., 3), radians."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_rotvec(np.asarray(w, np.float64)).as_matrix()
+
+
+def log_so3(R: npt.ArrayLike) -> F64:
+    """(..., 3) rotation vectors, radians, of rotations (..., 3, 3)."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_matrix(np.asarray(R, np.float64)).as_rotvec()
+
+
+def rigid(R: F64, t: F64) -> F64:
+    """(4, 4) pose."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, t
+    return T
+
+
+def inverse(T: F64) -> F64:
+    """Of poses (..., 4, 4)."""
+    out = np.zeros_like(T)
+    Rt = np.swapaxes(T[..., :3, :3], -1, -2)
+    out[..., :3, :3], out[..., 3, 3] = Rt, 1
+    out[..., :3, 3] = -(Rt @ T[..., :3, 3:])[..., 0]
+    return out
+
+
+def nearest_rotation(R: F64) -> F64:
+    """The rotation nearest to a (3, 3) matrix."""
+    u, _, vt = np.linalg.svd(R)
+    return u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+
+
+@njit(cache=True, nogil=True)
+def triangulate(poses, starts, camera_of, bearing):  # type: ignore[no-untyped-def]
+    """Where rays meet, by least squares of the distances to them, and the widest angle between two.
+
+    Args:
+        poses: (C, 4, 4) camera to world.
+        starts: (P + 1,) observations of point p are starts[p] to starts[p + 1].
+        camera_of: (O,) camera of each observation.
+        bearing: (O, 3).
+
+    Returns:
+        (P, 3) points and (P,) radians; NaN where rays are parallel or meet behind a camera.
+    """
+    n = len(starts) - 1
+    points = np.full((n, 3), np.nan)
+    angle = np.zeros(n)
+    for p in range(n):
+        A = np.zeros((3, 3))
+        b = np.zeros(3)
+        first = starts[p]
+        count = starts[p + 1] - first
+        rays = np.empty((count, 3))
+        for k in range(count):
+            T = poses[camera_of[first + k]]
+            for r in range(3):
+                rays[k, r] = (
+                    T[r, 0] * bearing[first + k, 0] + T[r, 1] * bearing[first + k, 1] + T[r, 2] * bearing[first + k, 2]
+                )
+            for r in range(3):
+                for c in range(3):
+                    m = (1.0 if r == c else 0.0) - rays[k, r] * rays[k, c]
+                    A[r, c] += m
+                    b[r] += m * T[c, 3]
+        widest = 1.0
+        for k in range(count):
+            for j in range(k):
+                dot = rays[k, 0] * rays[j, 0] + rays[k, 1] * rays[j, 1] + rays[k, 2] * rays[j, 2]
+                widest = min(widest, dot)
+        angle[p] = math.acos(min(1.0, max(-1.0, widest)))
+        det = (
+            A[0, 0] * (A[1, 1] * A[2, 2] - A[1, 2] * A[2, 1])
+            - A[0, 1] * (A[1, 0] * A[2, 2] - A[1, 2] * A[2, 0])
+            + A[0, 2] * (A[1, 0] * A[2, 1] - A[1, 1] * A[2, 0])
+        )
+        if count < 2 or det < 1e-12:
+            continue
+        x = np.linalg.solve(A, b)
+        front = True
+        for k in range(count):
+            T = poses[camera_of[first + k]]
+            depth = 0.0
+            for r in range(3):
+                depth += (x[r] - T[r, 3]) * rays[k, r]
+            front = front and depth > 0.05
+        if front:
+            points[p] = x
+    return points, angle
+
+
+def angular_errors(T_cam_world: F64, points: F64, bearing: F64) -> F64:
+    """(N,) radians between bearings (N, 3) and the directions of points (N, 3) seen by one camera."""
+    seen = points @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]
+    seen /= np.maximum(np.linalg.norm(seen, axis=1, keepdims=True), 1e-12)
+    sine = np.linalg.norm(np.cross(seen, bearing), axis=1)
+    return np.arctan2(sine, np.einsum("ij,ij->i", seen, bearing))
+
+
+def epipolar_errors(E: F64, a: F64, b: F64) -> F64:
+    """(..., N) radians of bearings b off the epipolar planes of a, both ways the larger: E (..., 3, 3), b' E a = 0."""
+    la, lb = a @ np.swapaxes(E, -1, -2), b @ E
+    sine = np.abs(np.einsum("...nk,nk->...n", la, b))
+    na, nb = np.linalg.norm(la, axis=-1), np.linalg.norm(lb, axis=-1)
+    return sine / np.maximum(np.minimum(na, nb), 1e-12)
+
+
+def essential(T: F64) -> F64:
+    """(3, 3) of the pose (4, 4) of a first camera in a second's axes: bearings fulfil b' E a = 0."""
+    x, y, z = T[:3, 3] / max(float(np.linalg.norm(T[:3, 3])), 1e-9)
+    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ T[:3, :3]
+
+
+def relative_pose(
+    a: F64, b: F64, *, threshold: float, rng: np.random.Generator, rounds: int = 300
+) -> tuple[F64, Bools] | None:
+    """Pose (4, 4) of camera b in camera a's axes, baseline of length 1, from bearings (N, 3) of the same features.
+
+    RANSAC with eight rays each (Hartley's linear method, on the sphere), then refined on all inliers.
+
+    Args:
+        a, b: bearings.
+        threshold: radians, of an inlier.
+        rng: for the samples.
+        rounds: number of samples.
+
+    Returns:
+        the pose and inliers (N,); None if no pose fits half of them.
+    """
+    n = len(a)
+    if n < 12:
+        return None
+    rows = np.einsum("ni,nj->nij", b, a).reshape(n, 9)
+    pick = np.argsort(rng.random((rounds, n)), axis=1)[:, :8] if n < 400 else rng.integers(0, n, (rounds, 8))
+    _, _, vt = np.linalg.svd(rows[pick], full_matrices=True)
+    E = _nearest_essential(vt[:, 8].reshape(-1, 3, 3))
+    some = slice(None) if n <= 500 else rng.permutation(n)[:500]
+    errors = epipolar_errors(E, a[some], b[some])
+    best = E[np.minimum(errors, 3 * threshold).sum(axis=1).argmin()]
+    inlier = epipolar_errors(best, a, b) < threshold
+    for _ in range(4):
+        if inlier.sum() < 12:
+            return None
+        w = 1 / (1 + (epipolar_errors(best, a, b)[inlier] / (0.5 * threshold)) ** 2)
+        _, _, vt = np.linalg.svd(rows[inlier] * w[:, None], full_matrices=False)
+        best = _nearest_essential(vt[-1].reshape(1, 3, 3))[0]
+        inlier = epipolar_errors(best, a, b) < threshold
+    if inlier.sum() < max(12, 0.5 * n):
+        return None
+    return _decompose(best, a, b, inlier)
+
+
+def _nearest_essential(E: F64) -> F64:
+    """The nearest essential matrices of (B, 3, 3)."""
+    u, _, vt = np.linalg.svd(E)
+    return u @ np.diag([1.0, 1.0, 0.0]) @ vt
+
+
+def _decompose(E: F64, a: F64, b: F64, inlier: Bools) -> tuple[F64, Bools]:
+    """Of the four poses that E may mean, that in which most rays meet in front of both cameras."""
+    u, _, vt = np.linalg.svd(E)
+    u, vt = u * np.sign(np.linalg.det(u)), vt * np.sign(np.linalg.det(vt))
+    W = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    best: tuple[int, F64, Bools] | None = None
+    index: I32 = np.flatnonzero(inlier).astype(np.int32)
+    starts = np.arange(0, 2 * len(index) + 1, 2)
+    cameras = np.tile(np.array([0, 1], np.int32), len(index))
+    rays = np.stack([a[index], b[index]], axis=1).reshape(-1, 3)
+    for R in (u @ W @ vt, u @ W.T @ vt):
+        for t in (u[:, 2], -u[:, 2]):
+            T = inverse(rigid(R, t))  # x_b = R x_a + t
+            points, _ = triangulate(np.stack([np.eye(4), T]), starts, cameras, rays)
+            front = ~np.isnan(points[:, 0])
+            if best is None or front.sum() > best[0]:
+                keep = np.zeros(len(a), bool)
+                keep[index[front]] = True
+                best = int(front.sum()), T, keep
+    assert best is not None
+    return best[1], best[2]

@@ -1,0 +1,322 @@
+"""Odometry: frames to poses, one after the other (D3.2, section 4.1).
+
+Every frame, features are followed and the camera is placed by those whose points are known; every few metres a
+keyframe is added to the local map. When too few points agree, or speed and GPS don't, the car is lost: poses are
+carried on at the last speed, or GPS's, and marked unsure; the last keyframes are looked for; where they aren't found, a
+new map begins where the car is believed to be, never at the origin.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from pipeline.types import F64, U8, Camera
+from slam.charts import Charts
+from slam.geometry import angular_errors, exp_so3, inverse, log_so3, relative_pose, rigid
+from slam.gps import GpsTrack
+from slam.graph import backend_named
+from slam.graph.problem import Graph
+from slam.localmap import Keyframe, LocalMap, MapParams, gps_distance
+from slam.relocalise import Remembered, describe, relocalise
+from slam.tracking import Tracker, Tracks
+
+LOST = 0.4
+"""Seconds after which a new map is begun."""
+REMEMBER = 20.0
+"""Seconds for which the keyframes before a loss are looked for."""
+
+
+class OdometryParams(MapParams):
+    """How frames become poses, besides `MapParams`.
+
+    Attributes:
+        features: followed at a time.
+        parallax: degrees; a keyframe where the median feature has moved so far, turning apart.
+        survival: or where fewer than this share of the last keyframe's are still followed.
+        seed: of random samples.
+    """
+
+    features: int = Field(700, ge=50)
+    parallax: float = Field(3.0, gt=0)
+    survival: float = Field(0.65, gt=0, lt=1)
+    seed: int = 0
+
+
+@dataclass
+class Placed:
+    """Where a frame is: (4, 4) in the axes of keyframe `keyframe`, and whether it was bridged, not seen."""
+
+    time: float
+    keyframe: int
+    T_key_cam: F64
+    unsure: bool
+
+
+class Odometry:
+    """Feed `add` with frames; `placed` and `map` hold what came out."""
+
+    def __init__(
+        self,
+        camera: Camera,
+        params: OdometryParams,
+        *,
+        mask: U8 | None = None,
+        gps: GpsTrack | None = None,
+        backend: str = "lm",
+        tracker: Any = None,
+        keep: bool = False,
+        remember: Callable[[int, list[U8]], None] | None = None,
+        warn: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        """Begin.
+
+        Args:
+            camera: of the frames.
+            params: see there.
+            mask: (H, W), 0 where the car itself is seen.
+            gps: the track, in the frames' times, smoothed; its distances are used.
+            backend: name of one of `slam.graph`.
+            tracker: what follows features; default: `slam.tracking.Tracker`.
+            keep: keep all points and what keyframes see of them, for loops, adjustment and COLMAP.
+            remember: is shown every keyframe: its number and charts (`slam.loops.Places`).
+            warn: receives what went wrong, and when.
+        """
+        self.params, self.gps, self.warn, self.remember = params, gps, warn, remember
+        self.charts = Charts(camera)
+        self.tracker = tracker or Tracker(self.charts, mask, params.features)
+        self.map = LocalMap(camera, params, self.charts.pixel, gps=gps, backend=backend, keep=keep)
+        self.placed: list[Placed] = []
+        self._backend, self._rng = backend, np.random.default_rng(params.seed)
+        self._masks = None if mask is None else self.charts.pictures(mask)
+        self._pose, self._time = np.eye(4), 0.0
+        self._velocity = np.zeros(6)
+        self._started = self._blind = False
+        self._waiting = 0  # frames since the first keyframe of a map, or since the car moved
+        self._lost_at: float | None = None
+        self._memory: list[tuple[list[U8], F64]] = []  # charts and poses of the last good keyframes
+        self._known: tuple[float, list[Remembered]] | None = None
+
+    # each frame
+
+    def add(self, time: float, grey: U8) -> None:
+        """The next frame (H, W), `time` in seconds, later than the last."""
+        guess = self._predicted(time)
+        self.tracker.look(grey, self._expected(guess))
+        if not self.map.keyframes:
+            self._time = time
+            self._begin(time, np.eye(4))
+        elif self._blind:
+            self._anew(time, guess)
+        elif not self._started:
+            self._initialise(time, guess)
+        else:
+            self._continue(time, guess)
+
+    def pose_of(self, placed: Placed) -> F64:
+        """(4, 4) camera to world, as the map knows it now."""
+        return self.map.keyframes[placed.keyframe].T_world_cam @ placed.T_key_cam
+
+    def _predicted(self, time: float) -> F64:
+        """The pose at the last speed; at GPS's while lost."""
+        dt = time - self._time
+        step = self._velocity[:3] * dt
+        if self._lost_at is not None and self.gps is not None:
+            far = gps_distance(self.gps, time - 1.0, time)
+            length = float(np.linalg.norm(step))
+            if far is not None and length > 0:
+                step = step * (far * dt / length)
+        return self._pose @ rigid(exp_so3(self._velocity[3:] * dt), step)
+
+    def _expected(self, guess: F64) -> F64:
+        """(N, 3) where tracks will probably be seen: known points at their place, others as the camera turns."""
+        tracks = self.tracker.tracks
+        expected = tracks.bearing @ (guess[:3, :3].T @ self._pose[:3, :3]).T
+        rows, known = self.map.landmarks.find(tracks.ids)
+        if self._started and known.any():
+            seen = (self.map.landmarks.xyz[rows[known]] - guess[:3, 3]) @ guess[:3, :3]
+            expected[known] = seen / np.maximum(np.linalg.norm(seen, axis=1, keepdims=True), 1e-9)
+        return expected
+
+    def _place(self, time: float, pose: F64, *, unsure: bool) -> None:
+        """Keep a frame's pose, and what it says of the car's speed."""
+        dt = time - self._time
+        if dt > 0:
+            moved = inverse(self._pose) @ pose
+            self._velocity = np.concatenate([moved[:3, 3], log_so3(moved[:3, :3])]) / dt
+        self._pose, self._time = pose, time
+        last = len(self.map.keyframes) - 1
+        self.placed.append(Placed(time, last, inverse(self.map.keyframes[last].T_world_cam) @ pose, unsure))
+
+    def _continue(self, time: float, guess: F64) -> None:
+        pose, inliers, known = self._locate(guess)
+        if not self._sound(time, pose, inliers, known):
+            self._bridge(time, guess)
+            return
+        if self._lost_at is not None:
+            self.warn(f"{time:.2f} s: found again, {time - self._lost_at:.2f} s after it was lost")
+            self._lost_at = None
+        self._place(time, pose, unsure=False)
+        if self._due():
+            self._keyframe(time)
+
+    def _locate(self, guess: F64) -> tuple[F64, int, int]:
+        """Pose by the known points; how many agree with it, of how many."""
+        tracks = self.tracker.tracks
+        rows, known = self.map.landmarks.find(tracks.ids)
+        n = int(known.sum())
+        if n < 8:
+            return guess, 0, n
+        xyz, bearing, one = self.map.landmarks.xyz[rows[known]], tracks.bearing[known], np.zeros(n, np.int32)
+        graph = Graph(
+            guess[None], xyz, np.arange(n, dtype=np.int32), one, bearing, np.zeros(1, bool), self.map.sigma,
+            bend=self.map.bend(guess[None], self._velocity[None], one, bearing), shared=self.map.shared,
+            shared_sigma=np.full(len(self.map.shared), 1e-9),
+        )  # fmt: skip
+        pose = backend_named(self._backend).solve(graph, points=False).poses[0]
+        error = angular_errors(inverse(pose), xyz, bearing)
+        self.tracker.drop(tracks.ids[known][error > 3 * self.map.gate])
+        return pose, int((error < self.map.gate).sum()), n
+
+    def _sound(self, time: float, pose: F64, inliers: int, known: int) -> bool:
+        """Whether a pose can be believed: enough points agree, no leap, and no quarrel with GPS."""
+        if inliers < 20 or inliers < 0.3 * known:
+            return False
+        if self.gps is None:
+            return True
+        since = time - 2.0
+        far = gps_distance(self.gps, since, time)
+        back = next((p for p in reversed(self.placed) if p.time <= since), None)
+        if far is None or back is None or back.unsure:
+            return True
+        moved = float(np.linalg.norm(pose[:3, 3] - self.pose_of(back)[:3, 3]))
+        return abs(moved - far) < max(6.0, 0.5 * far)
+
+    def _common(self, keyframe: Keyframe) -> tuple[F64, F64]:
+        """Bearings (M, 3) of what a keyframe saw and is still followed: there, and now."""
+        tracks = self.tracker.tracks
+        _, mine, his = np.intersect1d(tracks.ids, keyframe.ids, return_indices=True)
+        return keyframe.bearing[his], tracks.bearing[mine]
+
+    def _due(self) -> bool:
+        """Whether this frame is to be a keyframe."""
+        last = self.map.keyframes[-1]
+        there, now = self._common(last)
+        if len(now) < self.params.survival * len(last.ids):
+            return True
+        turn = last.T_world_cam[:3, :3].T @ self._pose[:3, :3]
+        return _median_angle(now @ turn.T, there) > math.radians(self.params.parallax)
+
+    def _keyframe(self, time: float) -> None:
+        """Make the frame just placed a keyframe."""
+        tracks = self.tracker.tracks
+        self.tracker.drop(
+            self.map.add(Keyframe(time, self._pose, tracks.ids, tracks.bearing, self.map.part, self._velocity))
+        )
+        self.tracker.refill()
+        self.map.see(self.tracker.tracks.ids, self.tracker.tracks.bearing)
+        self._pose = self.map.keyframes[-1].T_world_cam
+        self.placed[-1].keyframe, self.placed[-1].T_key_cam = len(self.map.keyframes) - 1, np.eye(4)
+        self._memory = [*self._memory[-3:], (self.tracker.pictures, self._pose)]
+        if self.remember is not None:
+            self.remember(len(self.map.keyframes) - 1, self.tracker.pictures)
+
+    # beginning, and beginning anew
+
+    def _begin(self, time: float, pose: F64) -> None:
+        """The first keyframe of a map, unless there is nothing to see."""
+        found = self.tracker.refill()
+        tracks = self.tracker.tracks
+        self._blind, self._started, self._waiting = found < 30, False, 0
+        if not self.map.keyframes or not self._blind:
+            self.map.begin(Keyframe(time, pose, tracks.ids, tracks.bearing, self.map.part, self._velocity))
+        self._place(time, pose, unsure=self.map.part > 0 or self._blind)
+
+    def _initialise(self, time: float, guess: F64) -> None:
+        """A map's second keyframe, once features have moved enough against the first."""
+        first = self.map.keyframes[-1]
+        there, now = self._common(first)
+        if len(now) < max(30, 0.2 * len(first.ids)):
+            self._anew(time, guess)
+            return
+        still = guess if self.map.part else first.T_world_cam
+        found = None
+        if _median_angle(there, now) > math.radians(0.5):
+            found = relative_pose(there, now, threshold=self.map.gate, rng=self._rng)
+        elif not self.map.part:
+            self._waiting = 0
+        if found is None or _median_angle(now @ found[0][:3, :3].T, there) < math.radians(self.params.parallax):
+            self._waiting += 1
+            self._place(time, still, unsure=self.map.part > 0)
+            return
+        T = found[0]
+        T[:3, 3] *= self._baseline(first, time, guess)
+        self._place(time, first.T_world_cam @ T, unsure=self.map.part > 0)
+        self._between(T)
+        self._velocity = np.concatenate([T[:3, 3], log_so3(T[:3, :3])]) / (time - self.placed[-2 - self._waiting].time)
+        self._started = True
+        self._keyframe(time)
+        if self.map.landmarks.find(self.tracker.tracks.ids)[1].sum() < 30:
+            self.map.keyframes.pop()
+            self.placed[-1].keyframe, self.placed[-1].T_key_cam = len(self.map.keyframes) - 1, T
+            self._anew(time, self._pose)
+
+    def _between(self, T: F64) -> None:
+        """Frames since the car began to move lie on the way from a map's first keyframe to its second, at T (4, 4)."""
+        way = self.placed[-2 - self._waiting :]
+        turn = log_so3(T[:3, :3])
+        for p in way[1:]:
+            share = (p.time - way[0].time) / (way[-1].time - way[0].time)
+            p.T_key_cam = rigid(exp_so3(share * turn), share * T[:3, 3])
+
+    def _baseline(self, first: Keyframe, time: float, guess: F64) -> float:
+        """Metres between a map's first two keyframes: GPS's, else at the speed before, else 1."""
+        far = gps_distance(self.gps, first.time, time)
+        if far:
+            return far
+        moved = float(np.linalg.norm(guess[:3, 3] - first.T_world_cam[:3, 3]))
+        return moved if self.map.part and moved > 0 else 1.0
+
+    def _bridge(self, time: float, guess: F64) -> None:
+        """A frame that can't be placed is carried on; after a while a new map begins."""
+        if self._lost_at is None:
+            self._lost_at = time
+            self._known = None
+            self.warn(f"{time:.2f} s: lost, poses are carried on")
+        if time - self._lost_at > LOST:
+            self._anew(time, guess)
+        else:
+            self._place(time, guess, unsure=True)
+
+    def _anew(self, time: float, guess: F64) -> None:
+        """A new map where the last keyframes say that the car is, else where it is believed to be."""
+        if self._lost_at is None:
+            self._lost_at = time
+            self.warn(f"{time:.2f} s: lost, poses are carried on")
+        self.map.part += 1
+        self.tracker.tracks = Tracks()
+        found = self._recognised(time)
+        self._begin(time, guess if found is None else found)
+
+    def _recognised(self, time: float) -> F64 | None:
+        """The pose by the keyframes before the loss."""
+        if self._lost_at is None or time - self._lost_at > REMEMBER or len(self._memory) < 2:
+            return None
+        if self._known is None:
+            few = (self._memory[-1], self._memory[max(0, len(self._memory) - 3)])
+            self._known = time, [Remembered(describe(self.charts, c, self._masks), pose) for c, pose in few]
+        now = describe(self.charts, self.tracker.pictures, self._masks)
+        found = relocalise(now, *self._known[1], sigma=self.map.sigma, rng=self._rng)
+        if found is not None:
+            self.warn(f"{time:.2f} s: recognised the place")
+        return found
+
+
+def _median_angle(a: F64, b: F64) -> float:
+    """Radians between unit vectors (N, 3), the median."""
+    return float(np.median(np.arccos(np.clip(np.einsum("ij,ij->i", a, b), -1, 1)))) if len(a) else 0.0

@@ -1,0 +1,57 @@
+"""The sparse map: all points that odometry kept, and which keyframes saw them where, for COLMAP and for adjustment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.cameras import project
+from pipeline.types import F64, I32, Trajectory
+from slam.finish import Placing
+from slam.odometry import Odometry
+from slam.output import SparseMap
+
+
+@dataclass(frozen=True)
+class Kept:
+    """Points `xyz` (P, 3) in odometry's world; `point`, `keyframe` (O,), `bearing` (O, 3) of what is seen of them."""
+
+    xyz: F64
+    point: I32
+    keyframe: I32
+    bearing: F64
+
+
+def kept(odometry: Odometry) -> Kept:
+    """What odometry, told to `keep`, knows of points: those that two keyframes or more see."""
+    known = odometry.map
+    ids = np.concatenate([known.landmarks.ids, *(gone.ids for gone in known.retired)])
+    xyz = np.concatenate([known.landmarks.xyz, *(gone.xyz for gone in known.retired)])
+    ids, first = np.unique(ids, return_index=True)
+    seen = known.observations(list(range(len(known.keyframes))))
+    rows = np.minimum(np.searchsorted(ids, seen.ids), len(ids) - 1)
+    real = ids[rows] == seen.ids
+    real &= np.bincount(rows[real], minlength=len(ids))[rows] > 1
+    rows = rows[real]
+    used = np.unique(rows)
+    return Kept(
+        xyz[first][used],
+        np.searchsorted(used, rows).astype(np.int32),
+        seen.of[real].astype(np.int32),
+        seen.bearing[real],
+    )
+
+
+def sparse_map(odometry: Odometry, placing: Placing, trajectory: Trajectory) -> SparseMap:
+    """The points in the trajectory's coordinates, seen from its poses."""
+    known = kept(odometry)
+    frame_of = np.searchsorted(trajectory.times, [k.time for k in odometry.map.keyframes])
+    uv, inside = project(odometry.map.camera, known.bearing)
+    frame = frame_of[known.keyframe]
+    at: npt.NDArray[np.int64] = np.zeros(len(known.xyz), np.int64)
+    at[known.point[::-1]] = frame[::-1]
+    before = np.stack([odometry.pose_of(p)[:3, 3] for p in odometry.placed])
+    points = placing.points(known.xyz, at, before, trajectory)
+    return SparseMap(points, known.point[inside], frame[inside].astype(np.int32), uv[inside].astype(np.float64))

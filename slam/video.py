@@ -1,0 +1,181 @@
+"""Video: frames of a video file, or of a folder of pictures, one at a time, in order of their times."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.errors import InputError
+from pipeline.types import F64, U8
+
+PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A frame: its number in the source, `time` in seconds from the first, `grey` (H, W) and a name."""
+
+    number: int
+    time: float
+    grey: U8
+    name: str
+
+
+@dataclass(frozen=True)
+class Video:
+    """What frames come from.
+
+    Attributes:
+        path: video file or folder.
+        width, height: pixels of the first frame.
+        count: of frames, as the file says; None if it doesn't.
+        fps: frames a second, as the file says, or as was given for a folder.
+        start: UNIX time of the first frame where the file tells it, else None.
+    """
+
+    path: Path
+    width: int
+    height: int
+    count: int | None
+    fps: float
+    start: float | None
+    times: F64 | None = None
+
+    def frames(self, *, every: int = 1, warn: Callable[[str], None] = lambda _: None) -> Iterator[Frame]:
+        """Every so manieth frame; frames that are damaged, of another size or out of order are left out, and told."""
+        source = _of_folder(self) if self.path.is_dir() else _of_file(self, warn)
+        last, number = -np.inf, -1
+        for number, frame in enumerate(source):
+            if frame.grey.shape != (self.height, self.width):
+                size = f"{frame.grey.shape[1]}x{frame.grey.shape[0]}"
+                warn(f"frame {number} is {size} instead of {self.width}x{self.height}: the video is read up to there")
+                return
+            if frame.time <= last:
+                warn(f"frame {number} is out of order ({frame.time:.3f} s after {last:.3f} s): left out")
+                continue
+            last = frame.time
+            if number % every == 0:
+                yield frame
+        if self.count is not None and number + 1 < self.count:
+            warn(f"the video ends after {number + 1} of {self.count} frames")
+
+
+def open_video(path: Path, *, fps: float = 10.0, times: Path | None = None) -> Video:
+    """Look at a video file or a folder of pictures.
+
+    Args:
+        path: of either.
+        fps: of a folder's pictures, where `times` isn't given.
+        times: of a folder's pictures, seconds, one a line.
+
+    Raises:
+        InputError: there are no frames, or they can't be read.
+    """
+    if path.is_dir():
+        return _folder(path, fps, times)
+    if not path.is_file():
+        raise InputError(path, "is missing", "Name a video file, or a folder of pictures")
+    av = _av()
+    try:
+        with av.open(str(path)) as container:
+            if not container.streams.video:
+                raise InputError(path, "has no video stream", "Name a video file, or a folder of pictures")
+            stream = container.streams.video[0]
+            rate = float(stream.average_rate or stream.base_rate or 30)
+            count = stream.frames or (round(stream.duration * stream.time_base * rate) if stream.duration else None)
+            start = _start(container.metadata.get("creation_time") or stream.metadata.get("creation_time"))
+            return Video(path, stream.codec_context.width, stream.codec_context.height, count, rate, start)
+    except av.error.FFmpegError as error:
+        raise InputError(path, f"is no readable video ({error})", "Copy or convert it again") from None
+
+
+def _av() -> Any:
+    try:
+        import av
+    except ImportError:
+        from pipeline.errors import UnavailableError
+
+        raise UnavailableError("PyAV", "is not installed", "pip install 'scan2sim[slam]'") from None
+    return av
+
+
+def _start(written: str | None) -> float | None:
+    from datetime import datetime
+
+    try:
+        return datetime.fromisoformat(written).timestamp() if written else None
+    except ValueError:
+        return None
+
+
+def _natural(path: Path) -> list[Any]:
+    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)]
+
+
+def _files(path: Path) -> list[Path]:
+    return sorted((p for p in path.iterdir() if p.suffix.lower() in PICTURES), key=_natural)
+
+
+def _folder(path: Path, fps: float, times: Path | None) -> Video:
+    files = _files(path)
+    if not files:
+        raise InputError(path, f"holds no pictures ({' '.join(PICTURES)})", "Name a folder of pictures, or a video")
+    shown = None
+    if times is not None:
+        try:
+            shown = np.loadtxt(times, ndmin=1).astype(np.float64)
+        except (OSError, ValueError) as error:
+            raise InputError(times, f"is no list of times ({error})", "Write seconds, one a line") from None
+        if len(shown) != len(files):
+            raise InputError(
+                times, f"has {len(shown)} times for {len(files)} pictures", "Write a time for every picture"
+            )
+        shown = shown - shown[0]
+    height, width = _read(files[0]).shape
+    return Video(path, width, height, len(files), fps, None, shown)
+
+
+def _read(path: Path) -> U8:
+    import cv2
+
+    grey = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE) if path.stat().st_size else None
+    if grey is None:
+        raise InputError(path, "is no readable picture", "Copy it again, or take it out of the folder")
+    return grey  # type: ignore[return-value]
+
+
+def _of_folder(video: Video) -> Iterator[Frame]:
+    for i, path in enumerate(_files(video.path)):
+        yield Frame(i, i / video.fps if video.times is None else float(video.times[i]), _read(path), path.name)
+
+
+def _of_file(video: Video, warn: Callable[[str], None]) -> Iterator[Frame]:
+    av = _av()
+    with av.open(str(video.path)) as container:
+        stream = container.streams.video[0]
+        stream.thread_type = "AUTO"
+        first: float | None = None
+        number = 0
+        try:
+            for frame in container.decode(stream):
+                time = float(frame.pts * frame.time_base) if frame.pts is not None else number / video.fps
+                first = time if first is None else first
+                grey = _grey(frame)
+                yield Frame(number, time - first, grey, f"{number:06d}")
+                number += 1
+        except av.error.FFmpegError as error:
+            warn(f"the video can't be read beyond frame {number} ({error})")
+
+
+def _grey(frame: Any) -> U8:
+    """(H, W): the luma plane, where the frame has one."""
+    if frame.format.name in ("yuv420p", "yuvj420p", "nv12", "yuv422p", "yuvj422p", "yuv444p"):
+        plane = frame.planes[0]
+        rows = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)
+        return np.ascontiguousarray(rows[: frame.height, : frame.width])
+    return np.ascontiguousarray(frame.to_ndarray(format="gray"))

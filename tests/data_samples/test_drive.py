@@ -1,0 +1,252 @@
+"""The synthetic drive: what the video shows agrees with the poses that come with it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from data_samples import gps, paths
+from data_samples.drive import generate_drive, row_poses
+from data_samples.ground import HALF
+from data_samples.panorama import GAIN, Panorama, Picture
+from data_samples.photos import directions
+from data_samples.planner import PLOT
+from data_samples.scene import srgb
+from data_samples.town import Town, build
+from data_samples.traffic import Traffic
+from pipeline.errors import SettingError
+from pipeline.types import F64, Camera, Trajectory
+
+H = 128
+CAMERA = Camera("equirectangular", 2 * H, H)
+PATH = paths.loop_path(width=70.0, depth=60.0, laps=1.2)
+
+
+@pytest.fixture(scope="module")
+def town() -> Town:
+    return build(PATH, seed=3)
+
+
+@pytest.fixture(scope="module")
+def trajectory() -> Trajectory:
+    return paths.drive(PATH, 10.0, 15.0, seed=3)
+
+
+@pytest.fixture(scope="module")
+def camera(town: Town, trajectory: Trajectory) -> Panorama:
+    return Panorama(town, Traffic(PATH, trajectory, 3), H, seed=3, radius=90.0)
+
+
+def light(image: np.ndarray, gain: float) -> np.ndarray:
+    """Linear light of 8-bit sRGB, without the exposure; NaN where it is clipped."""
+    shown = srgb(np.linspace(0, 1, 4096) ** 2)
+    linear = np.interp(image, shown, np.linspace(0, 1, 4096) ** 2) / gain
+    return np.where(image > 250, np.nan, linear)
+
+
+def project(points: F64, pose: F64) -> tuple[np.ndarray, F64]:
+    """Pixels (N, 2) as whole numbers, and distances (N,), of world points."""
+    d = (points - pose[:3, 3]) @ pose[:3, :3]
+    far = np.linalg.norm(d, axis=1)
+    u = (np.arctan2(d[:, 0], d[:, 2]) / (2 * np.pi) + 0.5) * 2 * H - 0.5
+    v = (np.arcsin(d[:, 1] / far) / np.pi + 0.5) * H - 0.5
+    return np.stack([np.round(u).astype(int) % (2 * H), np.clip(np.round(v).astype(int), 0, H - 1)], axis=1), far
+
+
+def points_of(picture: Picture, poses: F64) -> tuple[np.ndarray, F64]:
+    """(N, 2) pixels that see something that stands still, and where it is (N, 3)."""
+    seen = np.isfinite(picture.depth) & ~picture.moving & (picture.depth < 40)
+    v, u = np.nonzero(seen)
+    rays = directions(CAMERA, np.stack([u, v], axis=1)) * picture.depth[seen][:, None]
+    rows = np.broadcast_to(poses, (H, 4, 4))[v]
+    return np.stack([u, v], axis=1), np.einsum("nij,nj->ni", rows[:, :3, :3], rays) + rows[:, :3, 3]
+
+
+def agreement(a: Picture, poses_a: F64, b: Picture, poses_b: F64) -> tuple[float, float]:
+    """Share of a's still points that b sees too, and their median relative difference of light."""
+    pixels, points = points_of(a, poses_a)
+    if poses_b.ndim == 2:
+        there, far = project(points, poses_b)
+    else:  # each row has its own pose: the row a point is seen in, by iteration
+        there, far = project(points, poses_b[H // 2])
+        for _ in range(3):
+            found = [project(points[i : i + 1], poses_b[there[i, 1]]) for i in range(len(points))]
+            there, far = np.concatenate([f[0] for f in found]), np.concatenate([f[1] for f in found])
+    u, v = there.T
+    seen = np.abs(b.depth[v, u] - far) < 0.05 * far
+    la, lb = light(a.rgb, a.gain)[pixels[seen, 1], pixels[seen, 0]], light(b.rgb, b.gain)[v[seen], u[seen]]
+    return float(seen.mean()), float(np.nanmedian(np.abs(la - lb) / (la + lb + 0.02)))
+
+
+@pytest.mark.parametrize("file", ["town", "kitti"])
+def test_a_drive_is_smooth_and_starts_from_standing(tmp_path: Path, file: str) -> None:
+    if file == "kitti":
+        angle = np.linspace(0, 3, 400)
+        rows = np.tile(np.eye(4)[:3].ravel(), (400, 1))
+        rows[:, 3], rows[:, 11] = 50 * (1 - np.cos(angle)), 50 * np.sin(angle)
+        np.savetxt(tmp_path / "00.txt", rows)
+        path = paths.kitti_path(tmp_path / "00.txt", 120.0)
+        assert abs(paths.chainage(path)[-1] - 120) < 1
+    else:
+        path = paths.town_path(5, 400.0)
+    drive = paths.drive(path, 12.0, 15.0)
+    assert drive.rotations is not None
+    v = np.diff(drive.positions, axis=0) * 15
+    assert np.allclose(drive.positions[:15], drive.positions[0])  # the first second
+    assert np.linalg.norm(v, axis=1).max() < 12.2
+    assert np.linalg.norm(np.diff(v[:, :2], axis=0) * 15, axis=1).max() < 4.5
+    assert np.allclose(drive.rotations @ drive.rotations.transpose(0, 2, 1), np.eye(3), atol=1e-9)
+    going = np.linalg.norm(v, axis=1) > 1
+    ahead = np.einsum("ij,ij->i", v, drive.rotations[:-1, :, 2])[going] / np.linalg.norm(v, axis=1)[going]
+    assert ahead.min() > 0.97
+    assert drive.rotations[:, 2, 1].max() < -0.99  # y is down
+    assert 0.002 < drive.positions[:, 2].std() < 0.06
+
+
+def test_nothing_stands_on_the_road(town: Town) -> None:
+    houses = [t for t in town.things if getattr(t.make, "func", t.make).__name__ == "house"]
+    assert len(houses) > 10
+    for t in houses:
+        corners = t.make().moved(t.heading, (0, 0, 0)).vertices[:, :2] + t.at
+        assert town.ground.at(corners).min() > PLOT - 0.6
+    assert min(float(town.ground.at(t.at)) for t in town.things) > HALF - 1.5
+    from scipy.spatial import cKDTree
+
+    assert cKDTree(town.ground.driven).query(np.array([t.at for t in town.things]))[0].min() > 2.0
+
+
+def test_pixels_agree_with_the_poses(camera: Panorama, trajectory: Trajectory) -> None:
+    for i, j in ((60, 63), (150, 147)):
+        a, b = (camera.render(trajectory.poses[k], float(trajectory.times[k])) for k in (i, j))
+        share, difference = agreement(a, trajectory.poses[i], b, trajectory.poses[j])
+        assert share > 0.8
+        assert difference < 0.06
+        _, wrong = agreement(a, trajectory.poses[i], b, trajectory.poses[j + 3])
+        assert wrong > 1.5 * difference  # the measure notices a wrong pose
+
+
+def test_rows_of_a_rolling_shutter_have_their_own_poses(camera: Panorama, trajectory: Trajectory) -> None:
+    time = float(trajectory.times[70])
+    poses = row_poses(trajectory, time, H, 0.06)
+    rolling = camera.render(poses, time)
+    for row in (30, 64, 100):
+        whole = camera.render(poses[row], time)
+        assert np.array_equal(rolling.depth[row], whole.depth[row])
+    still = camera.render(trajectory.poses[70], time)
+    assert np.nanmedian(np.abs(still.depth[100] - rolling.depth[100])) > 0.001
+    assert np.allclose(row_poses(trajectory, time, H, 0.0)[5], trajectory.poses[70], atol=1e-9)
+    share, difference = agreement(still, trajectory.poses[70], rolling, poses)
+    assert share > 0.8
+    assert difference < 0.06
+
+
+def test_the_picture_closes_at_the_seam_and_hides_its_own_car(camera: Panorama, trajectory: Trajectory) -> None:
+    picture = camera.render(trajectory.poses[90], 6.0)
+    rgb = picture.rgb.astype(int)
+    seam = np.abs(rgb[:, 0] - rgb[:, -1]).mean()
+    assert seam < 1.5 * np.abs(np.diff(rgb, axis=1)).mean() + 2
+    own = camera.mask == 0
+    assert 0.12 < own.mean() < 0.2
+    assert not own[: H * 8 // 10].any()
+    assert np.isnan(picture.depth[own]).all()
+    assert not np.isnan(picture.depth[~own]).any()
+    other = camera.render(trajectory.poses[140], 9.0)
+    assert np.array_equal(picture.rgb[own], other.rgb[own])
+
+
+def test_exposure_changes_smoothly(camera: Panorama) -> None:
+    gains = np.array([camera.gain(t) for t in np.arange(0, 120, 1 / 15)])
+    assert GAIN[0] <= gains.min() < 0.85
+    assert 1.05 < gains.max() <= GAIN[1]
+    assert np.abs(np.diff(gains)).max() < 0.06
+
+
+def test_the_same_seed_gives_the_same_picture(town: Town, trajectory: Trajectory) -> None:
+    def picture(seed: int) -> np.ndarray:
+        camera = Panorama(build(PATH, seed), Traffic(PATH, trajectory, seed), 64, seed, radius=45.0)
+        return camera.render(trajectory.poses[100], float(trajectory.times[100])).rgb
+
+    first = picture(3)
+    assert np.array_equal(first, picture(3))
+    assert np.abs(first.astype(int) - picture(4)).mean() > 5
+
+
+def test_other_cars_move(camera: Panorama, trajectory: Trajectory) -> None:
+    assert camera.traffic is not None
+    for time in (3.0, 7.0):
+        now, later = camera.traffic.at(time), camera.traffic.at(time + 0.5)
+        assert now
+        before = {id(v): xy for v, xy, _ in now}
+        moves = [np.linalg.norm(xy - before[id(v)]) for v, xy, _ in later if id(v) in before]
+        assert max(moves) > 1.0
+        pose = trajectory.poses[round(time * 15)]
+        for v, xy, _ in now:
+            near = pose[:2, 3] - xy
+            assert np.linalg.norm(near) > 2.5, v
+    assert any(camera.render(trajectory.poses[k], k / 15).moving.any() for k in range(30, 180, 30))
+
+
+def test_buses_can_block_the_view(town: Town, trajectory: Trajectory) -> None:
+    camera = Panorama(town, Traffic(PATH, trajectory, 3, bus=(6.0, 8.0)), H, seed=3, radius=60.0)
+    rows = slice(H * 2 // 5, H // 2)  # from the horizon to 18 degrees above it
+    shares = [camera.render(trajectory.poses[k], k / 15).moving[rows].mean() for k in (60, 105)]
+    assert shares[0] < 0.3
+    assert shares[1] > 0.95
+
+
+def test_the_receiver_wanders_as_it_should() -> None:
+    n = 40_000
+    still = Trajectory(np.arange(n, dtype=float), np.zeros((n, 3)))
+    times, xyz = gps.receiver(still, 1.0, seed=1)
+    assert len(times) == n
+    assert np.allclose(xyz.std(axis=0), [1.5, 1.5, 2.5], rtol=0.15)
+    x = xyz[:, 0] - xyz[:, 0].mean()
+    assert 0.25 < (x[60:] * x[:-60]).mean() / x.var() < 0.5  # 1/e after a minute
+    assert np.diff(xyz[:, 0]).std() < 0.6
+    gapped, moved = gps.receiver(still, 1.0, 1, gaps=[(100.0, 200.0)], jumps=[(500.0, 20.0), (600.0, 0.0)])
+    assert len(gapped) == n - 100
+    jump = moved - xyz[np.isin(times, gapped)]
+    inside = (gapped >= 500) & (gapped < 600)
+    assert np.allclose(np.linalg.norm(jump[inside], axis=1), 20)
+    assert np.allclose(jump[~inside], 0)
+    assert len(gps.receiver(still, 5.0)[0]) == 5 * (n - 1) + 1
+
+
+def test_geographic_coordinates_are_metres_apart() -> None:
+    lat, lon, up = gps.geographic(np.array([[0, 0, 0], [0, 100, 0], [100, 0, 5.0]])).T
+    assert np.allclose([lat[0], lon[0], up[0]], gps.ORIGIN)
+    assert abs((lat[1] - lat[0]) * 111_220 - 100) < 0.5
+    assert abs((lon[2] - lon[0]) * 111_320 * np.cos(np.radians(49.2)) - 100) < 1.0
+    assert abs(up[2] - up[0] - 5) < 0.01
+
+
+def test_a_drive_is_written(tmp_path: Path) -> None:
+    import av
+    import cv2
+
+    out = generate_drive(
+        tmp_path / "drive", PATH, seconds=1.2, height=64, fps=12.5, bitrate=5e5, seed=3, gps_rate=5.0, lossless=True
+    )
+    with av.open(str(out / "video.mp4")) as video:
+        frames = [(f.time, f.to_ndarray(format="rgb24")) for f in video.decode(video=0)]
+    assert len(frames) == 15
+    assert np.allclose([t for t, _ in frames], np.arange(15) / 12.5, atol=1e-6)
+    kept = sorted((out / "frames").glob("*.png"))
+    assert len(kept) == 15
+    assert np.abs(cv2.imread(str(kept[7]))[..., ::-1].astype(int) - frames[7][1]).mean() < 8
+    truth = np.loadtxt(out / "truth.csv", delimiter=",", skiprows=1)
+    assert (out / "truth.csv").read_text().startswith("time,x,y,z,qx,qy,qz,qw\n")
+    assert truth.shape == (15, 8)
+    assert np.allclose(truth[:, 0], [t for t, _ in frames], atol=1e-6)
+    assert np.allclose(np.linalg.norm(truth[:, 4:], axis=1), 1)
+    fixes = np.loadtxt(out / "gps.csv", delimiter=",", skiprows=1)
+    assert fixes.shape == (6, 4)
+    assert np.abs(fixes[:, 1] - 49.2).max() < 0.01
+    mask = cv2.imread(str(out / "mask.png"), cv2.IMREAD_UNCHANGED)
+    assert mask.shape == (64, 128)
+    assert set(np.unique(mask)) == {0, 255}
+    assert sorted(p.name for p in out.iterdir()) == ["frames", "gps.csv", "mask.png", "truth.csv", "video.mp4"]
+    with pytest.raises(SettingError):
+        generate_drive(out, PATH, seconds=1.0, height=64)

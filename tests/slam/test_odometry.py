@@ -1,0 +1,155 @@
+"""Frames to poses: on drives whose truth is known, and what goes wrong on the road."""
+
+import numpy as np
+import pytest
+
+from slam.evaluate import umeyama
+from slam.finish import finish
+from tests.slam.made_up import Follower, drive, gps_of, run, scatter
+
+
+def positions(odometry):
+    return np.stack([odometry.pose_of(p)[:3, 3] for p in odometry.placed])
+
+
+def error(found, poses, which=slice(None)):
+    """Root mean square metres after a similarity."""
+    truth = poses[which, :3, 3]
+    return np.sqrt(((umeyama(found[which], truth, scaled=True).apply(found[which]) - truth) ** 2).sum(axis=1).mean())
+
+
+def test_a_drive_is_found_up_to_scale_and_a_standing_car_stands():
+    times, poses = drive(20)
+    odometry = run(times, Follower(poses, scatter(poses)))
+    found = positions(odometry)
+    assert len(found) == len(times)
+    assert error(found, poses) < 0.15  # of 180 m
+    assert np.linalg.norm(found[5] - found[0]) < 1e-6
+    assert not any(p.unsure for p in odometry.placed)
+
+
+def test_a_perspective_cameras_narrow_view_is_enough():
+    times, poses = drive(10)
+
+    class Narrow(Follower):
+        def _seen(self, points):
+            bearing, seen = super()._seen(points)
+            return bearing, seen & (bearing[:, 2] > 0.7)
+
+    odometry = run(times, Narrow(poses, scatter(poses, 20000)), parallax=1.0)
+    assert error(positions(odometry), poses) < 0.6
+
+
+def test_gps_ties_the_scale_and_places_the_path():
+    times, poses = drive(30)
+    gps = gps_of(times, poses, sigma=0.5)
+    trajectory, _ = finish(run(times, Follower(poses, scatter(poses)), gps=gps), gps)
+    off = np.linalg.norm((trajectory.positions - poses[:, :3, 3])[:, :2], axis=1)
+    assert off.mean() < 1.0
+    length = np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1).sum()
+    assert length == pytest.approx(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum(), rel=0.02)
+    up = trajectory.rotations[:, 2, 1]
+    assert (up < -0.99).all()
+
+
+def test_adjacent_gps_distances_work_too():
+    times, poses = drive(15)
+    gps = gps_of(times, poses, sigma=0.3)
+    odometry = run(times, Follower(poses, scatter(poses)), gps=gps, gps_chords="adjacent")
+    assert error(positions(odometry), poses) < 1.0
+
+
+@pytest.mark.parametrize("seconds", [0.3, 2.0])
+def test_a_black_stretch_is_bridged_marked_and_never_restarts_at_the_origin(seconds):
+    times, poses = drive(20)
+    gps, said = gps_of(times, poses, sigma=0.2), []
+
+    def black(frame, points):
+        return np.full(len(points), 10 <= times[frame] < 10 + seconds)
+
+    odometry = run(times, Follower(poses, scatter(poses), hide=black), gps=gps, warn=said.append)
+    trajectory, _ = finish(odometry, gps)
+    off = np.linalg.norm(trajectory.positions - poses[:, :3, 3], axis=1)
+    dark = (times >= 10) & (times < 10 + seconds)
+    assert trajectory.unsure[dark].all() and not trajectory.unsure[times < 9.9].any()
+    assert not trajectory.unsure[-1] and any("lost" in text for text in said)
+    assert off.max() < 8
+    step = np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1)
+    assert step.max() < 4
+    sigma = np.sqrt(trajectory.covariance[:, 0, 0])
+    assert sigma[-1] > 3 * sigma[np.searchsorted(times, 9.5)]
+
+
+def test_a_bus_that_covers_all_is_noticed_by_gps():
+    times, poses = drive(20)
+    gps, said = gps_of(times, poses, sigma=0.2), []
+    bus = np.random.default_rng(1).uniform(-4, 4, (400, 3)) + [0, 0, 1.0]
+    bus = bus[np.linalg.norm(bus, axis=1) > 2]
+
+    class Behind(Follower):
+        """From second 10 to 12, nothing is seen but a bus that drives along."""
+
+        def _seen(self, points):
+            bearing, seen = super()._seen(points)
+            with_us = np.arange(len(points)) >= 0
+            if 10 <= times[self._frame] < 12:
+                near = np.linalg.norm(points[:, None, 0] - 1e6, axis=1) < 1e5
+                seen = near
+                local = (points - [1e6, 0, 0]) @ np.eye(3)
+                bearing = np.where(near[:, None], local / np.linalg.norm(local, axis=1, keepdims=True), bearing)
+            return bearing, seen & with_us
+
+    points = np.concatenate([scatter(poses), bus + [1e6, 0, 0]])
+    odometry = run(times, Behind(poses, points), gps=gps, warn=said.append)
+    trajectory, _ = finish(odometry, gps)
+    off = np.linalg.norm(trajectory.positions - poses[:, :3, 3], axis=1)
+    assert any("lost" in text for text in said)
+    assert trajectory.unsure[(times >= 10.5) & (times < 12)].all()
+    assert off.max() < 10
+
+
+def test_moving_cars_are_left_out():
+    times, poses = drive(15)
+    rng = np.random.default_rng(3)
+    moving = rng.random(6000) < 0.35
+    speed = rng.uniform(3, 12, (6000, 1)) * np.array([1.0, 0.2, 0.0])
+
+    class Traffic(Follower):
+        def _seen(self, points):
+            at = points
+            if len(points):
+                kind = np.array([self._which[tuple(p)] for p in points])
+                at = points + np.where(moving[kind][:, None], speed[kind] * times[self._frame], 0)
+            return super()._seen(at)
+
+    still = scatter(poses)
+    follower = Traffic(poses, still)
+    follower._which = {tuple(p): i for i, p in enumerate(still)}
+    assert error(positions(run(times, follower)), poses) < 0.6
+
+
+def test_rolling_shutter_is_estimated():
+    times, poses = drive(12, speed=15)
+    readout = 0.03
+
+    class Rolling(Follower):
+        def _seen(self, points):
+            pose = self.poses[self._frame]
+            ahead = self.poses[min(self._frame + 1, len(self.poses) - 1)]
+            rate = (ahead[:3, 3] - pose[:3, 3]) / 0.1
+            bearing, seen = super()._seen(points)
+            for _ in range(2):
+                late = (np.arcsin(bearing[:, 1]) / np.pi) * readout
+                local = (points - pose[:3, 3] - late[:, None] * rate) @ pose[:3, :3]
+                bearing = local / np.linalg.norm(local, axis=1, keepdims=True)
+            return bearing, seen
+
+    odometry = run(times, Rolling(poses, scatter(poses)), gps=gps_of(times, poses), rolling_shutter=True)
+    assert odometry.map.shared[0] == pytest.approx(readout, rel=0.25)
+
+
+def test_what_left_the_window_is_forgotten_unless_it_is_to_be_kept():
+    times, poses = drive(25)
+    odometry = run(times, Follower(poses, scatter(poses)), window=5, anchors=2)
+    held = [len(k.ids) > 0 for k in odometry.map.keyframes]
+    assert len(held) > 12 and sum(held) <= 8 and not odometry.map.retired
