@@ -225,6 +225,30 @@ def slam_evaluate(
     evaluate_trajectory(trajectory, truth, segment=segment, alignment=alignment, out=out)
 
 
+@slams.command("study")
+def slam_study(
+    source: Annotated[Path, typer.Argument(metavar="DRIVE", help="A drive's folder, a video, or its frames.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of cells, tables and plots.")],
+    truth: Annotated[Path | None, typer.Option(help="Trajectory or GPS track; default: the drive's.")] = None,
+    gps: Annotated[Path | None, typer.Option(help="Track for the scale; default: the drive's.")] = None,
+    mask: Annotated[Path | None, typer.Option(help="Picture: 0 where the car is; default: the drive's.")] = None,
+    heights: Annotated[str, typer.Option(help="Pixels.")] = "512,768,1024,1536",
+    bitrates: Annotated[str, typer.Option(help="Mbit/s.")] = "1,2,5,10,20,40",
+    rates: Annotated[str, typer.Option(help="Frames a second.")] = "30,15",
+    jobs: Annotated[int, typer.Option(min=1, help="Cells at a time.")] = 1,
+    backend: Annotated[str, typer.Option(help="lm, or adam: the mission's.")] = "lm",
+    set_: Sets = None,
+    config: Config = None,
+) -> None:
+    """What resolution, bit rate and frame rate of the video cost: D3.2's tables 4 and 5."""
+    from flows.slam import study_compression
+
+    study_compression(
+        source, out, truth=truth, gps=gps, mask=mask, heights=heights, bitrates=bitrates, rates=rates, jobs=jobs,
+        backend=backend, settings=_settings(set_, config, None),
+    )  # fmt: skip
+
+
 @imports.command("kitti-raw")
 def import_kitti(
     drive: Annotated[Path, typer.Argument(help="A drive's folder (..._sync), or one that holds it.")],

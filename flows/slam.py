@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import get_args
+from typing import TypeVar, get_args
 
 import numpy as np
 from pydantic import ValidationError
@@ -32,6 +32,8 @@ from slam.odometry import Odometry, OdometryParams
 from slam.sparse import sparse_map
 from slam.track import Tracked, camera_of, track
 from slam.video import Video, open_video
+
+T = TypeVar("T", int, float)
 
 
 @dataclass(frozen=True)
@@ -198,3 +200,41 @@ def _truth(path: Path) -> Trajectory | GpsTrack:
     if path.suffix.lower() == ".csv" and "lat" in path.read_text(encoding="utf-8", errors="replace")[:200]:
         return read_gps(path)
     return trajectory_io.read(path)
+
+
+def study_compression(
+    source: Path, out: Path, *, truth: Path | None, gps: Path | None, mask: Path | None, heights: str, bitrates: str,
+    rates: str, jobs: int, backend: str, settings: Settings,
+) -> Path:  # fmt: skip
+    """Print the table of what compression costs; in a drive's folder, what isn't named is found by its name.
+
+    Raises:
+        ScanError: see `pipeline.errors`.
+    """
+    from slam.study import study
+
+    def found(given: Path | None, name: str) -> Path | None:
+        beside = source / name
+        return given or (beside if source.is_dir() and beside.is_file() else None)
+
+    known = found(truth, "truth.csv")
+    if known is None:
+        raise SettingError("--truth", "is missing", "Give a trajectory, or a GPS track, to compare with")
+    video = open_video(source / "video.mp4" if (source / "video.mp4").is_file() else source)
+    options = Options(gps=found(gps, "gps.csv"), gps_offset=0.0, mask=found(mask, "mask.png"))
+    with progress("study") as report:
+        table = study(
+            source, _truth(known), out, params=odometry_params(settings), gps=_gps(video, options),
+            mask=_mask(video, options), heights=_numbers("--heights", heights, int), jobs=jobs, backend=backend,
+            bitrates=_numbers("--bitrates", bitrates, float), rates=_numbers("--rates", rates, float), report=report,
+        )  # fmt: skip
+    console.print(table.read_text(encoding="utf-8"), highlight=False, markup=False, soft_wrap=True)
+    console.print(f"Table: {table}", highlight=False, soft_wrap=True, markup=False)
+    return table
+
+
+def _numbers(option: str, text: str, kind: type[T]) -> list[T]:
+    try:
+        return [kind(part) for part in text.split(",")]  # type: ignore[call-arg]
+    except ValueError:
+        raise SettingError(option, f"`{text}` isn't a list of numbers", "Write 512,1024") from None

@@ -130,6 +130,7 @@ class LocalMap:
         self.keyframes: list[Keyframe] = []
         self.landmarks = Landmarks()
         self.retired: list[Landmarks] = []
+        self._others = 0  # of those retired, how many are of earlier maps
         self.part = 0
         wanted = zip(shared.NAMES, shared.SIGMA, (params.rolling_shutter, params.lens_offset), strict=True)
         chosen = [(name, sigma) for name, sigma, on in wanted if on]
@@ -139,7 +140,7 @@ class LocalMap:
     def begin(self, keyframe: Keyframe) -> None:
         """A new map, of one keyframe."""
         self._retire(self.landmarks)
-        self.landmarks = Landmarks()
+        self.landmarks, self._others = Landmarks(), len(self.retired)
         self.keyframes.append(keyframe)
         self._forget()
 
@@ -157,6 +158,17 @@ class LocalMap:
         fresh = ~np.isin(ids, newest.ids)
         newest.ids = np.concatenate([newest.ids, ids[fresh]])
         newest.bearing = np.concatenate([newest.bearing, bearing[fresh]])
+
+    def rescale(self, factor: float) -> None:
+        """Enlarge this map about its first keyframe."""
+        mine = [k for k in self.keyframes if k.part == self.part]
+        centre = mine[0].T_world_cam[:3, 3].copy()
+        for keyframe in mine:
+            keyframe.T_world_cam = keyframe.T_world_cam.copy()
+            keyframe.T_world_cam[:3, 3] = centre + factor * (keyframe.T_world_cam[:3, 3] - centre)
+            keyframe.velocity = keyframe.velocity * np.repeat([factor, 1.0], 3)
+        for points in (self.landmarks, *self.retired[self._others :]):
+            points.xyz = centre + factor * (points.xyz - centre)
 
     def _retire(self, gone: Landmarks) -> None:
         if self.keep and len(gone):
@@ -287,6 +299,11 @@ class LocalMap:
 
 
 def gps_distance(gps: GpsTrack | None, start: float, end: float) -> float | None:
-    """Metres between two times, None where GPS doesn't say."""
-    far = float(gps.distance(start, end)) if gps is not None else math.nan
+    """Metres between two times, None where GPS doesn't say; a second before and after its fixes it is believed to."""
+    if gps is None:
+        return None
+    first, last = np.clip((start, end), gps.times[0], gps.times[-1])
+    if last <= first or max(first - start, end - last) > 1.0:
+        return None
+    far = float(gps.distance(first, last)) * (end - start) / (last - first)
     return None if math.isnan(far) else far

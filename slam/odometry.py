@@ -28,6 +28,10 @@ from slam.tracking import Tracker, Tracks
 
 LOST = 0.4
 """Seconds after which a new map is begun."""
+QUARREL = 0.4, 2.5
+"""Vision that says less, or more, of GPS's distance over two seconds is mistaken: it followed a bus, say."""
+SETTLED = 15.0, 60.0
+"""Metres after which a map's scale, first taken from two keyframes, is set by GPS anew."""
 REMEMBER = 20.0
 """Seconds for which the keyframes before a loss are looked for."""
 
@@ -37,13 +41,14 @@ class OdometryParams(MapParams):
 
     Attributes:
         features: followed at a time.
-        parallax: degrees; a keyframe where the median feature has moved so far, turning apart.
+        parallax: degrees; a keyframe where the median feature has moved so far, turning apart; None: 3 for a 360
+            camera, 1 for others, in whose view little moves.
         survival: or where fewer than this share of the last keyframe's are still followed.
         seed: of random samples.
     """
 
     features: int = Field(700, ge=50)
-    parallax: float = Field(3.0, gt=0)
+    parallax: float | None = Field(None, gt=0)
     survival: float = Field(0.65, gt=0, lt=1)
     seed: int = 0
 
@@ -97,7 +102,9 @@ class Odometry:
         self._pose, self._time = np.eye(4), 0.0
         self._velocity = np.zeros(6)
         self._started = self._blind = False
+        self._parallax = math.radians(params.parallax or (1.0 if self.charts.whole else 3.0))
         self._waiting = 0  # frames since the first keyframe of a map, or since the car moved
+        self._settled = 0
         self._lost_at: float | None = None
         self._memory: list[tuple[list[U8], F64]] = []  # charts and poses of the last good keyframes
         self._known: tuple[float, list[Remembered]] | None = None
@@ -195,7 +202,7 @@ class Odometry:
         if far is None or back is None or back.unsure:
             return True
         moved = float(np.linalg.norm(pose[:3, 3] - self.pose_of(back)[:3, 3]))
-        return abs(moved - far) < max(6.0, 0.5 * far)
+        return QUARREL[0] * far - 3 < moved < QUARREL[1] * far + 5
 
     def _common(self, keyframe: Keyframe) -> tuple[F64, F64]:
         """Bearings (M, 3) of what a keyframe saw and is still followed: there, and now."""
@@ -210,7 +217,7 @@ class Odometry:
         if len(now) < self.params.survival * len(last.ids):
             return True
         turn = last.T_world_cam[:3, :3].T @ self._pose[:3, :3]
-        return _median_angle(now @ turn.T, there) > math.radians(self.params.parallax)
+        return _median_angle(now @ turn.T, there) > self._parallax
 
     def _keyframe(self, time: float) -> None:
         """Make the frame just placed a keyframe."""
@@ -220,11 +227,30 @@ class Odometry:
         )
         self.tracker.refill()
         self.map.see(self.tracker.tracks.ids, self.tracker.tracks.bearing)
+        self._settle()
         self._pose = self.map.keyframes[-1].T_world_cam
         self.placed[-1].keyframe, self.placed[-1].T_key_cam = len(self.map.keyframes) - 1, np.eye(4)
         self._memory = [*self._memory[-3:], (self.tracker.pictures, self._pose)]
         if self.remember is not None:
             self.remember(len(self.map.keyframes) - 1, self.tracker.pictures)
+
+    def _settle(self) -> None:
+        """Set the scale of a map that has just become so long that GPS knows it well."""
+        mine = [k for k in self.map.keyframes if k.part == self.map.part]
+        if self.gps is None or self._settled >= len(SETTLED):
+            return
+        far = gps_distance(self.gps, mine[0].time, mine[-1].time)
+        length = float(np.linalg.norm(mine[-1].T_world_cam[:3, 3] - mine[0].T_world_cam[:3, 3]))
+        if far is None or far < SETTLED[self._settled] or length < 1e-6:
+            return
+        self._settled += 1
+        self.map.rescale(far / length)
+        first = len(self.map.keyframes) - len(mine)
+        for placed in reversed(self.placed):
+            if placed.keyframe < first:
+                break
+            placed.T_key_cam[:3, 3] *= far / length
+        self._velocity = self._velocity * np.repeat([far / length, 1.0], 3)
 
     # beginning, and beginning anew
 
@@ -232,7 +258,7 @@ class Odometry:
         """The first keyframe of a map, unless there is nothing to see."""
         found = self.tracker.refill()
         tracks = self.tracker.tracks
-        self._blind, self._started, self._waiting = found < 30, False, 0
+        self._blind, self._started, self._waiting, self._settled = found < 30, False, 0, 0
         if not self.map.keyframes or not self._blind:
             self.map.begin(Keyframe(time, pose, tracks.ids, tracks.bearing, self.map.part, self._velocity))
         self._place(time, pose, unsure=self.map.part > 0 or self._blind)
@@ -250,7 +276,7 @@ class Odometry:
             found = relative_pose(there, now, threshold=self.map.gate, rng=self._rng)
         elif not self.map.part:
             self._waiting = 0
-        if found is None or _median_angle(now @ found[0][:3, :3].T, there) < math.radians(self.params.parallax):
+        if found is None or _median_angle(now @ found[0][:3, :3].T, there) < self._parallax:
             self._waiting += 1
             self._place(time, still, unsure=self.map.part > 0)
             return
@@ -263,7 +289,8 @@ class Odometry:
         self._keyframe(time)
         if self.map.landmarks.find(self.tracker.tracks.ids)[1].sum() < 30:
             self.map.keyframes.pop()
-            self.placed[-1].keyframe, self.placed[-1].T_key_cam = len(self.map.keyframes) - 1, T
+            self.placed.pop()
+            self._time = self.placed[-1].time
             self._anew(time, self._pose)
 
     def _between(self, T: F64) -> None:

@@ -389,7 +389,7 @@ class _Way:
         Raises:
             InputError: none has a pose. DataError: all are unsure.
         """
-        reach = self.usual + 1e-6
+        reach = self.usual / 2 + 1e-6  # half a turn of the scanner, say
         within = (times >= self.times[0] - reach) & (times <= self.times[-1] + reach)
         if not within.any():
             raise InputError(
