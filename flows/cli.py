@@ -192,7 +192,12 @@ def slam_a_video(
     fps: Annotated[float, typer.Option(help="Of a folder of pictures.")] = 10.0,
     times: Annotated[Path | None, typer.Option(help="Of a folder's pictures: seconds, one a line.")] = None,
     every: Annotated[int, typer.Option(min=1, help="Take every Nth frame.")] = 1,
+    until: Annotated[float, typer.Option(help="Seconds of the video; 0: all.")] = 0.0,
     backend: Annotated[str, typer.Option(help="lm, or adam: the mission's.")] = "lm",
+    features: Annotated[str, typer.Option(help="corners (tracked), orb, rootsift, superpoint, aliked.")] = "corners",
+    matcher: Annotated[str, typer.Option(help="nearest, superglue, lightglue.")] = "nearest",
+    weights: Annotated[Path | None, typer.Option(help="Your file of the features' weights.")] = None,
+    matcher_weights: Annotated[Path | None, typer.Option(help="Your file of the matcher's.")] = None,
     colmap: Annotated[bool, typer.Option("--colmap", help="Write the map as a COLMAP model, too.")] = False,
     loops: Annotated[bool, typer.Option("--loops", help="Recognise places that were passed before.")] = False,
     adjust: Annotated[bool, typer.Option("--adjust", help="Adjust all keyframes at once in the end.")] = False,
@@ -205,8 +210,9 @@ def slam_a_video(
 
     options = Options(
         gps=gps, gps_offset=gps_offset, georeference=not local, mask=mask, camera=camera, focal=focal, centre=centre,
-        tile=tile, fps=fps, times=times, every=every, backend=backend, colmap=colmap, loops=loops, adjust=adjust,
-        view=view,
+        tile=tile, fps=fps, times=times, every=every, until=until or None, backend=backend,
+        features=features, matcher=matcher, weights=weights, matcher_weights=matcher_weights,
+        colmap=colmap, loops=loops, adjust=adjust, view=view,
     )  # fmt: skip
     slam_video(video, out, options, _settings(set_, config, None))
 

@@ -31,6 +31,7 @@ from slam.loops import close as close_loops
 from slam.odometry import Odometry, OdometryParams
 from slam.sparse import sparse_map
 from slam.track import Tracked, camera_of, track
+from slam.tracking import Tracker
 from slam.video import Video, open_video
 
 T = TypeVar("T", int, float)
@@ -52,7 +53,11 @@ class Options:
         tile_camera: the name of a photo of that camera there.
         fps, times: of a folder of pictures.
         every: take every so manieth frame.
+        until: seconds of the video to take; None: all.
         backend: of `slam.graph`.
+        features: "corners", or a backend of `slam.features`, with
+        matcher: one of `slam.matchers`, and
+        weights, matcher_weights: files of theirs, where they need any.
         colmap: write the map as a COLMAP model, too.
         loops: recognise places that were passed before.
         adjust: adjust all keyframes at once in the end.
@@ -70,7 +75,12 @@ class Options:
     fps: float = 10.0
     times: Path | None = None
     every: int = 1
+    until: float | None = None
     backend: str = "lm"
+    features: str = "corners"
+    matcher: str = "nearest"
+    weights: Path | None = None
+    matcher_weights: Path | None = None
     colmap: bool = False
     loops: bool = False
     adjust: bool = False
@@ -102,12 +112,13 @@ def slam_video(path: Path, out: Path, options: Options, settings: Settings) -> T
 
         def start(warn: Callable[[str], None]) -> Odometry:
             return Odometry(
-                camera, params, mask=mask, gps=gps, backend=options.backend, keep=keep, remember=places, warn=warn
-            )
+                camera, params, mask=mask, gps=gps, backend=options.backend, keep=keep, remember=places, warn=warn,
+                tracker=_tracker(camera, mask, params.features, options),
+            )  # fmt: skip
 
         tracked = track(
-            video, start, gps=gps, georeference=options.georeference, every=options.every, state=state, watch=watch,
-            after=after, report=report,
+            video, start, gps=gps, georeference=options.georeference, every=options.every, until=options.until,
+            state=state, watch=watch, after=after, report=report,
         )  # fmt: skip
         if watch is not None:
             watch.close()
@@ -139,6 +150,21 @@ def odometry_params(settings: Settings) -> OdometryParams:
         first = error.errors()[0]
         where = ".".join(["slam", *(str(part) for part in first["loc"])])
         raise SettingError(where, f"{first['msg']} (got {first['input']!r})", "docs/slam.md lists them") from None
+
+
+def _tracker(camera: Camera, mask: np.ndarray | None, count: int, options: Options) -> Tracker:
+    """What follows features: corners by Lucas-Kanade, or descriptors from frame to frame (D3.2)."""
+    if options.features == "corners":
+        return Tracker(Charts(camera), mask, count)
+    from slam import features, matchers
+    from slam.matching import MatchingTracker
+
+    detector = features.named(options.features, options.weights)
+    matcher = matchers.named(options.matcher, options.matcher_weights)
+    matchers.check(detector, matcher)
+    for part in (detector, matcher):
+        console.print(part.describe(), highlight=False, markup=False, soft_wrap=True)
+    return MatchingTracker(Charts(camera), mask, count, detector, matcher)
 
 
 def _camera(video: Video, options: Options) -> Camera:

@@ -15,7 +15,7 @@ from pipeline.types import Trajectory
 from slam.evaluate import umeyama
 from slam.odometry import Odometry
 from slam.output import SparseMap, write_colmap
-from slam.sparse import kept
+from slam.sparse import kept, move
 
 LOSS = 1.0
 """Pixels, of Cauchy's loss."""
@@ -59,10 +59,12 @@ def adjust(odometry: Odometry) -> dict[str, float]:
         R = world_to_cam.rotation.matrix()
         moved[i - 1, :3, :3], moved[i - 1, :3, 3] = R.T, -R.T @ world_to_cam.translation
     onto = umeyama(moved[:, :3, 3], poses[:, :3, 3], scaled=True)
-    for keyframe, pose in zip(keyframes, moved, strict=True):
-        keyframe.T_world_cam = np.eye(4)
-        keyframe.T_world_cam[:3, :3] = onto.rotation @ pose[:3, :3]
-        keyframe.T_world_cam[:3, 3] = onto.apply(pose[None, :3, 3])[0]
+    placed = np.tile(np.eye(4), (len(poses), 1, 1))
+    placed[:, :3, :3], placed[:, :3, 3] = onto.rotation @ moved[:, :3, :3], onto.apply(moved[:, :3, 3])
+    xyz = known.xyz.copy()
+    for i, point in model.points3D.items():
+        xyz[i - 1] = point.xyz
+    move(odometry, known, placed, onto.apply(xyz))
     return {
         "adjusted_keyframes": len(poses), "adjusted_points": len(known.xyz),
         "reprojection_before_px": round(float(before), 4),

@@ -55,7 +55,7 @@ class Charts:
         for axes in _CAPS:
             uv, _ = project(camera, (rays @ axes.T).reshape(-1, 3))
             x, y = uv.reshape(size, size, 2).transpose(2, 0, 1)
-            self._maps.append((np.ascontiguousarray(x), np.ascontiguousarray(y)))
+            self._maps.append((np.ascontiguousarray(x), np.clip(y, 0, h - 1)))  # beyond a pole isn't the other one
 
     def pictures(self, grey: U8) -> list[U8]:
         """The charts of a frame (H, W); of masks, too."""

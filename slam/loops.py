@@ -14,6 +14,7 @@ from slam.charts import Charts
 from slam.geometry import exp_so3, inverse, log_so3
 from slam.odometry import Odometry
 from slam.relocalise import Remembered, Seen, describe, relocalise
+from slam.sparse import kept, move
 
 THUMBNAIL = 64, 12
 APART = 60.0
@@ -69,9 +70,12 @@ def close(odometry: Odometry, places: Places) -> dict[str, float]:
     way = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))])
     loops = _find(odometry, places, poses, way)
     if loops:
-        moved = pose_graph(poses, way, loops)
-        for keyframe, pose in zip(keyframes, moved, strict=True):
-            keyframe.T_world_cam = pose
+        moved, known = pose_graph(poses, way, loops), kept(odometry)
+        first = np.zeros(len(known.xyz), np.int64)  # points go where the keyframe goes that saw them first
+        first[known.point[::-1]] = known.keyframe[::-1]
+        change = (moved @ inverse(poses))[first]
+        xyz = np.einsum("pij,pj->pi", change[:, :3, :3], known.xyz) + change[:, :3, 3]
+        move(odometry, known, moved, xyz)
     return {"loops": len(loops)}
 
 

@@ -10,14 +10,23 @@ import numpy.typing as npt
 from pipeline.cameras import project
 from pipeline.types import F64, I32, Trajectory
 from slam.finish import Placing
+from slam.localmap import Landmarks
 from slam.odometry import Odometry
 from slam.output import SparseMap
 
 
 @dataclass(frozen=True)
 class Kept:
-    """Points `xyz` (P, 3) in odometry's world; `point`, `keyframe` (O,), `bearing` (O, 3) of what is seen of them."""
+    """What odometry knows of points.
 
+    Attributes:
+        ids: (P,) ascending.
+        xyz: (P, 3) in odometry's world.
+        point, keyframe: (O,) what is seen, and from where, by point.
+        bearing: (O, 3) in which direction.
+    """
+
+    ids: npt.NDArray[np.int64]
     xyz: F64
     point: I32
     keyframe: I32
@@ -37,11 +46,21 @@ def kept(odometry: Odometry) -> Kept:
     rows = rows[real]
     used = np.unique(rows)
     return Kept(
+        ids[used],
         xyz[first][used],
         np.searchsorted(used, rows).astype(np.int32),
         seen.of[real].astype(np.int32),
         seen.bearing[real],
     )
+
+
+def move(odometry: Odometry, known: Kept, poses: F64, xyz: F64) -> None:
+    """Put keyframes and the points of `known` elsewhere: (C, 4, 4), (P, 3)."""
+    for keyframe, pose in zip(odometry.map.keyframes, poses, strict=True):
+        keyframe.T_world_cam = pose
+    alive = np.isin(known.ids, odometry.map.landmarks.ids)
+    odometry.map.landmarks = Landmarks(known.ids[alive], xyz[alive])
+    odometry.map.retired = [Landmarks(known.ids[~alive], xyz[~alive])]
 
 
 def sparse_map(odometry: Odometry, placing: Placing, trajectory: Trajectory) -> SparseMap:

@@ -63,6 +63,7 @@ def track(
     gps: GpsTrack | None = None,
     georeference: bool = True,
     every: int = 1,
+    until: float | None = None,
     state: Path | None = None,
     watch: Callable[[Odometry, U8], None] | None = None,
     after: Sequence[Callable[[Odometry], dict[str, float]]] = (),
@@ -76,6 +77,7 @@ def track(
         gps: the track, in the frames' times.
         georeference: put the trajectory where GPS says; otherwise GPS ties its scale alone.
         every: take every so manieth frame.
+        until: stop after so many seconds of the video.
         state: file in which the state is kept every minute, and from which an interrupted run goes on.
         after: what moves the keyframes once all are there (loops, adjustment), and its figures.
         watch: is shown odometry and frame after each.
@@ -93,6 +95,8 @@ def track(
     for frame in video.frames(every=every, warn=kept.warnings.append):
         if frame.time <= last:
             continue
+        if until is not None and frame.time > until:
+            break
         kept.odometry.add(frame.time, frame.grey)
         kept.names.append(frame.name)
         if watch is not None:

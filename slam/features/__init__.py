@@ -1,0 +1,128 @@
+"""Features: places in a picture that are found again in another, each with a descriptor. A file a backend, found by
+its name.
+
+A backend's module has `available() -> str | None` (what to install, if it can't run here) and
+`load(weights, count, upsample, device) -> Features`. Backends see pictures, never the sphere: `slam.matching` shows
+them the charts and makes bearings of what they find.
+"""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.errors import SettingError, UnavailableError
+from pipeline.types import F32, U8
+
+
+class Found(NamedTuple):
+    """Features of a picture.
+
+    Attributes:
+        uv: (N, 2) float32 pixels.
+        descriptors: (N, D) uint8 bits, or float32 of length 1.
+        scores: (N,) float32, larger is better.
+    """
+
+    uv: F32
+    descriptors: npt.NDArray[Any]
+    scores: F32
+
+
+class Features(Protocol):
+    """A backend that is loaded.
+
+    Attributes:
+        name: of the backend.
+        binary: whether descriptors are bits.
+        dimension: D, of descriptors: bytes of bits, or numbers.
+    """
+
+    name: str
+    binary: bool
+    dimension: int
+
+    def detect(self, picture: U8, mask: U8 | None = None) -> Found:
+        """Features of a picture (H, W), none where `mask` (H, W) is 0; the strongest `count`."""
+
+    def describe(self) -> str:
+        """What this is, for logs: with the hash and licence of weights."""
+
+
+def names() -> list[str]:
+    """Of the backends that there are."""
+    return sorted(module.name for module in pkgutil.iter_modules(__path__))
+
+
+def missing(name: str) -> str | None:
+    """What to install so that a backend can run here, or None."""
+    found: str | None = _module(name).available()
+    return found
+
+
+def named(
+    name: str, weights: Path | None = None, *, count: int = 3000, upsample: int = 1, device: str = "auto"
+) -> Features:
+    """A backend.
+
+    Args:
+        name: one of `names()`.
+        weights: the user's file, for networks.
+        count: features a picture at most.
+        upsample: how many times pictures are enlarged before; 2 lets RootSIFT match a tenth more, in twice the time.
+        device: of torch, for networks.
+
+    Raises:
+        SettingError: there is no such backend, or it wants weights, or none.
+        UnavailableError: it can't run here.
+        InputError: the weights are damaged, of another network, or unsafe to read.
+    """
+    module = _module(name)
+    lacking = module.available()
+    if lacking:
+        raise UnavailableError(f"slam.features {name}", f"needs {lacking}", f"pip install {lacking.replace(',', '')}")
+    backend: Features = module.load(weights, count, upsample, device)
+    return backend
+
+
+def _module(name: str) -> Any:
+    if name not in names():
+        raise SettingError("slam.features", f"there is no {name!r}", f"Choose one of: {', '.join(names())}")
+    return importlib.import_module(f"slam.features.{name}")
+
+
+def no_weights(name: str, weights: Path | None) -> None:
+    """Raise SettingError if weights are given to a backend that has none."""
+    if weights is not None:
+        raise SettingError("slam.weights", f"{name!r} takes no weights", "Leave them out, or choose a network")
+
+
+def enlarged(picture: U8, mask: U8 | None, times: int) -> tuple[U8, U8 | None]:
+    """Picture and mask, so many times as wide and high."""
+    import cv2
+
+    if times == 1:
+        return picture, mask
+    size = (picture.shape[1] * times, picture.shape[0] * times)
+    large = cv2.resize(picture, size, interpolation=cv2.INTER_LINEAR)
+    return large, None if mask is None else cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST)  # type: ignore[return-value]
+
+
+def unmasked(found: Found, mask: U8 | None) -> Found:
+    """Those whose nearest pixel isn't masked: detectors look at masks before they know places exactly."""
+    if mask is None or not len(found.uv):
+        return found
+    u, v = np.rint(found.uv).astype(int).T
+    height, width = mask.shape
+    keep = mask[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)] > 0
+    return Found(*(values[keep] for values in found))
+
+
+def reduced(uv: npt.ArrayLike, times: int) -> F32:
+    """Pixels (N, 2) of a picture before it was enlarged."""
+    return np.asarray((np.asarray(uv, np.float64).reshape(-1, 2) + 0.5) / times - 0.5, np.float32)

@@ -1,0 +1,73 @@
+"""Nearest descriptors, each other's, and clearly so (Lowe's ratio). Needs no weights; takes any features."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from slam.features import Found, no_weights
+from slam.matchers import I64, Sizes
+
+RATIO = 0.9
+"""Of the distance to the nearest to that of the second nearest. Looser than Lowe's 0.8: what stands in neighbouring
+frames differs little, and Lucas-Kanade tries every match."""
+ROWS = 2048
+"""Descriptors that are compared at a time."""
+
+
+def available() -> str | None:
+    """What to install, or None."""
+    return None
+
+
+def load(weights: Path | None, device: str) -> Nearest:
+    """See `slam.matchers.named`."""
+    no_weights("nearest", weights)
+    return Nearest()
+
+
+class Nearest:
+    """See `slam.matchers.Matcher`."""
+
+    name, takes, dimension = "nearest", None, None
+
+    def __init__(self, ratio: float = RATIO) -> None:
+        self.ratio = ratio
+
+    def match(self, a: Found, b: Found, sizes: Sizes) -> I64:
+        """See `slam.matchers.Matcher`."""
+        if len(a.uv) < 2 or len(b.uv) < 2:
+            return np.zeros((0, 2), np.int64)
+        there, clear = _nearest(a.descriptors, b.descriptors, self.ratio)
+        back, clear_back = _nearest(b.descriptors, a.descriptors, self.ratio)
+        rows = np.arange(len(there))
+        good = (back[there] == rows) & clear & clear_back[there]
+        return np.stack([rows[good], there[good]], axis=1).astype(np.int64)
+
+    def describe(self) -> str:
+        """See `slam.matchers.Matcher`."""
+        return f"nearest descriptors, ratio {self.ratio}"
+
+
+def _nearest(a: npt.NDArray, b: npt.NDArray, ratio: float) -> tuple[I64, npt.NDArray[np.bool_]]:
+    """(N,) the row of b nearest to each of a, and whether the second nearest is clearly farther."""
+    if a.dtype == np.uint8:
+        import cv2
+
+        pairs = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(a, b, k=2)
+        index = np.array([p[0].trainIdx for p in pairs], np.int64)
+        distance = np.array([(p[0].distance, p[1].distance) for p in pairs])
+        return index, distance[:, 0] < ratio * distance[:, 1]
+    index, clear = np.empty(len(a), np.int64), np.empty(len(a), bool)
+    length = np.einsum("nd,nd->n", b, b)
+    for first in range(0, len(a), ROWS):
+        part = a[first : first + ROWS]
+        squares = np.einsum("nd,nd->n", part, part)[:, None] + length - 2 * part @ b.T
+        two = np.argpartition(squares, 1, axis=1)[:, :2]
+        near = np.take_along_axis(squares, two, axis=1)
+        rows, swap = slice(first, first + len(part)), near[:, 1] < near[:, 0]
+        index[rows] = np.where(swap, two[:, 1], two[:, 0])
+        clear[rows] = near.min(axis=1) < ratio**2 * near.max(axis=1)
+    return index, clear

@@ -1,0 +1,134 @@
+"""`scan2sim slam` as a user types it: what it writes, what it says, and bad input."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import slam.track
+from flows.cli import app
+from pipeline.errors import InputError, ScanError
+from pipeline.io import trajectory as trajectory_io
+from slam.odometry import Odometry, OdometryParams
+from slam.track import track
+from slam.video import open_video
+
+
+def command(*arguments):
+    """Run it; errors are raised."""
+    result = CliRunner().invoke(app, [str(a) for a in arguments], catch_exceptions=True)
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result
+
+
+@pytest.fixture(scope="session")
+def done(corridor, tmp_path_factory):
+    out = tmp_path_factory.mktemp("slam") / "out"
+    result = command(
+        "slam", corridor.folder / "video.mp4", "--out", out, "--colmap", "--adjust", "--set", "slam.features=300"
+    )
+    return out, result.output
+
+
+def test_it_writes_the_trajectory_in_all_formats_and_says_that_there_is_no_gps(done, corridor):
+    out, said = done
+    found = trajectory_io.read(out / "trajectory.csv")
+    assert len(found) == len(corridor.truth)
+    for name in ("trajectory.tum", "trajectory.kitti", "odometry.csv", "slam.json", "colmap/images.txt"):
+        assert (out / name).is_file()
+    assert "there is no GPS" in said
+    assert not (out / "trajectory.geojson").exists()
+    assert json.loads((out / "slam.json").read_text())["frames"] == len(found)
+    assert list(out.glob("state-*")) == []
+
+
+def test_the_colmap_model_is_one(done):
+    pycolmap = pytest.importorskip("pycolmap")
+    model = pycolmap.Reconstruction(done[0] / "colmap")
+    assert model.num_points3D() > 100
+    assert model.compute_mean_reprojection_error() < 1.0
+
+
+def test_evaluate_prints_the_missions_errors(done, corridor, tmp_path):
+    trajectory_io.write(tmp_path / "truth.csv", corridor.truth)
+    said = command("slam", "evaluate", done[0] / "trajectory.csv", tmp_path / "truth.csv", "--segment", "5").output
+    figures = dict(line.split() for line in said.splitlines() if len(line.split()) == 2)
+    assert float(figures["drift_percent"]) < 1.0
+    assert float(figures["local_median_5_m"]) < 0.1
+
+
+def test_an_interrupted_run_goes_on_and_ends_the_same(corridor, tmp_path, monkeypatch):
+    monkeypatch.setattr(slam.track, "KEEP_EVERY", 0.0)
+    video, state = open_video(corridor.folder / "video.mp4"), tmp_path / "state"
+    params = OdometryParams.model_validate({"features": 300})
+
+    def start(warn):
+        return Odometry(corridor.camera, params, warn=warn)
+
+    def interrupt(odometry, grey):
+        if len(odometry.placed) == 20:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        track(video, start, state=state, watch=interrupt)
+    resumed = track(video, start, state=state)
+    whole = track(video, start)
+    assert resumed.names == whole.names
+    assert np.allclose(resumed.trajectory.positions, whole.trajectory.positions, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("change", "arguments", "text"),
+    [
+        (lambda p: None, ("absent.mp4",), "is missing"),
+        (lambda p: (p / "v.mp4").write_bytes(b"no video"), ("v.mp4",), "no readable video"),
+        (lambda p: (p / "empty").mkdir(), ("empty",), "no pictures"),
+        (lambda p: None, ("VIDEO", "--backend", "magic"), "there is no `magic`"),
+        (lambda p: None, ("VIDEO", "--set", "slam.windows=3"), "slam.windows"),
+        (lambda p: None, ("VIDEO", "--camera", "pinhole"), "needs a camera"),
+        (lambda p: (p / "m.png").write_bytes(b"x"), ("VIDEO", "--mask", "m.png"), "no readable picture"),
+        (lambda p: (p / "g.csv").write_text("a,b\n1,2\n"), ("VIDEO", "--gps", "g.csv"), "g.csv"),
+    ],
+)
+def test_bad_input_is_named(corridor, tmp_path, change, arguments, text):
+    change(tmp_path)
+    made = ("absent.mp4", "v.mp4", "empty", "m.png", "g.csv")
+    video = corridor.folder / "video.mp4"
+    shown = [video if a == "VIDEO" else tmp_path / a if a in made else a for a in arguments]
+    with pytest.raises(ScanError) as error:
+        command("slam", *shown, "--out", tmp_path / "out")
+    assert text in str(error.value)
+
+
+def test_a_video_that_ends_early_and_frames_of_another_size_are_told(corridor, tmp_path):
+    import cv2
+
+    for i in range(12):
+        size = (256, 128) if i < 8 else (128, 64)
+        cv2.imwrite(str(tmp_path / f"{i:03d}.png"), cv2.resize(corridor.greys[i], size))
+    said = []
+    assert len(list(open_video(tmp_path).frames(warn=said.append))) == 8
+    assert "128x64 instead of 256x128" in said[0]
+    (tmp_path / "003.png").write_bytes(b"")
+    with pytest.raises(InputError, match=r"003\.png"):
+        list(open_video(tmp_path).frames())
+
+
+def test_half_a_video_file_is_read_as_far_as_it_goes(corridor, tmp_path):
+    av = pytest.importorskip("av")
+    assert av
+    whole = tmp_path / "whole.ts"
+    with av.open(str(corridor.folder / "video.mp4")) as source, av.open(str(whole), "w", format="mpegts") as sink:
+        stream = sink.add_stream_from_template(source.streams.video[0])
+        for packet in source.demux(video=0):
+            if packet.dts is not None:
+                packet.stream = stream
+                sink.mux(packet)
+    half = tmp_path / "half.ts"
+    half.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
+    frames = len(list(open_video(half).frames()))
+    assert 5 < frames < len(corridor.greys)
+    shutil.rmtree(tmp_path, ignore_errors=True)

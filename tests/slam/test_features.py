@@ -1,0 +1,430 @@
+"""Features, matchers and weights: one contract for all backends, networks against transformers' own, bad files."""
+
+from __future__ import annotations
+
+import os
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.errors import InputError, SettingError, UnavailableError
+from slam import features, matchers, weights
+from slam.features import Found
+
+SIZE = (240, 320)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread() -> None:
+    """Tests run side by side; threads of torch that wait for each other would only slow them down."""
+    if weights.missing() is None:
+        import torch
+
+        torch.set_num_threads(1)
+
+
+def picture(seed: int = 0, height: int = SIZE[0] + 32, width: int = SIZE[1] + 32) -> Any:
+    """(height, width) rectangles of all sizes, as of a street with many signs, a little blurred."""
+    import cv2
+
+    rng = np.random.default_rng(seed)
+    out = np.full((height, width), 128, np.uint8)
+    for _ in range(400):
+        x, y, w, h = rng.integers((0, 0, 4, 4), (width, height, 40, 40))
+        cv2.rectangle(out, (int(x), int(y)), (int(x + w), int(y + h)), int(rng.integers(256)), -1)
+    return cv2.GaussianBlur(out, (0, 0), 1.0)
+
+
+def random_weights(model: weights.Model, seed: int = 0) -> dict[str, Any]:
+    """Tensors of a model's shapes, so that numbers neither vanish nor grow."""
+    import torch
+
+    made = torch.Generator().manual_seed(seed)
+    out = {}
+    for name, shape in model.shapes.items():
+        fan = int(np.prod(shape[1:])) if len(shape) > 1 else 1
+        value = torch.randn(shape, generator=made) * (2 / fan) ** 0.5 * (1 if len(shape) > 1 else 0.1)
+        out[name] = value.abs() + 0.5 if name.endswith(("running_var", "1.weight")) and len(shape) == 1 else value
+    return out
+
+
+def saved(path: Path, model: weights.Model) -> Path:
+    import torch
+
+    torch.save(random_weights(model), path)
+    return path
+
+
+def loaded(name: str, folder: Path, real_data: Path | None) -> features.Features:
+    """A backend that can run here: with real weights where there are any, else random ones."""
+    if features.missing(name):
+        pytest.skip(f"{name} needs {features.missing(name)}")
+    if name == "superpoint":
+        from slam.features.superpoint import MODEL
+
+        return features.named(name, saved(folder / "superpoint_v1.pth", MODEL), count=500, device="cpu")
+    if name == "aliked":
+        file = real_data / "weights" / "aliked" / "aliked-t16.pth" if real_data else None
+        if file is None or not file.is_file():
+            from slam.features.aliked import MODELS
+
+            file = saved(folder / "aliked.pth", MODELS[1])
+        return features.named(name, file, count=500, device="cpu")
+    return features.named(name, count=500)
+
+
+@pytest.fixture
+def data() -> Path | None:
+    from tests.conftest import DATA
+
+    return DATA if DATA.is_dir() else None
+
+
+@pytest.mark.parametrize("name", features.names())
+def test_features_move_with_the_picture(name: str, tmp_path: Path, data: Path | None) -> None:
+    backend = loaded(name, tmp_path, data)
+    large = picture()
+    a = np.ascontiguousarray(large[16 : 16 + SIZE[0], 16 : 16 + SIZE[1]])
+    b = np.ascontiguousarray(large[: SIZE[0], 8 : 8 + SIZE[1]])  # right by 8, down by 16
+    found, other = backend.detect(a), backend.detect(b)
+    assert found.uv.dtype == np.float32 and found.uv.shape == (len(found.uv), 2) and 100 < len(found.uv) <= 500
+    assert found.descriptors.shape == (len(found.uv), backend.dimension) and found.scores.shape == (len(found.uv),)
+    assert found.descriptors.dtype == (np.uint8 if backend.binary else np.float32)
+    assert (found.uv >= 0).all() and (found.uv <= (SIZE[1] - 1, SIZE[0] - 1)).all()
+    if not backend.binary:
+        assert np.allclose(np.linalg.norm(found.descriptors, axis=1), 1, atol=1e-4)
+    matcher = matchers.named("nearest")
+    matchers.check(backend, matcher)
+    pairs = matcher.match(found, other, (SIZE[::-1], SIZE[::-1]))
+    assert len(pairs) > 50 and len(np.unique(pairs[:, 0])) == len(np.unique(pairs[:, 1])) == len(pairs)
+    moved = other.uv[pairs[:, 1]] - found.uv[pairs[:, 0]]
+    assert (np.linalg.norm(moved - (8, 16), axis=1) < 3).mean() > 0.9  # ORB finds some in small copies of the picture
+    assert np.abs(np.median(moved, axis=0) - (8, 16)).max() < 0.1
+    assert name in backend.describe().lower()
+
+
+@pytest.mark.parametrize("name", features.names())
+def test_masks_flat_pictures_and_pickles(name: str, tmp_path: Path, data: Path | None) -> None:
+    backend = loaded(name, tmp_path, data)
+    a = picture()[: SIZE[0], : SIZE[1]]
+    mask = np.full(SIZE, 255, np.uint8)
+    mask[:, 160:] = 0
+    found = backend.detect(a, mask)
+    assert len(found.uv) > 20 and found.uv[:, 0].max() < 161
+    flat = backend.detect(np.full((40, 50), 90, np.uint8))
+    assert flat.descriptors.shape == (len(flat.uv), backend.dimension)
+    if name != "superpoint":  # random weights see something everywhere
+        assert len(flat.uv) == 0
+    assert matchers.named("nearest").match(found, Found(*(x[:0] for x in found)), (SIZE, SIZE)).shape == (0, 2)
+    again = pickle.loads(pickle.dumps(backend)).detect(a, mask)
+    assert np.array_equal(again.uv, found.uv) and np.array_equal(again.descriptors, found.descriptors)
+
+
+def test_enlarging_does_not_move_features() -> None:
+    a = picture()
+    found, large = (features.named("rootsift", count=500, upsample=n).detect(a) for n in (1, 2))
+    pairs = matchers.named("nearest").match(found, large, (SIZE, SIZE))
+    moved = large.uv[pairs[:, 1]] - found.uv[pairs[:, 0]]
+    near = np.linalg.norm(moved, axis=1) < 2
+    assert near.sum() > 50 and np.abs(np.median(moved[near], axis=0)).max() < 0.15
+
+
+def test_unknown_names_and_needless_weights() -> None:
+    for module in (features, matchers):
+        with pytest.raises(SettingError, match="Choose one of"):
+            module.named("surf")
+    with pytest.raises(SettingError, match="takes no weights"):
+        features.named("orb", Path("superpoint_v1.pth"))
+    with pytest.raises(SettingError, match="takes no weights"):
+        matchers.named("nearest", Path("superglue_outdoor.pth"))
+    assert features.names() == ["aliked", "orb", "rootsift", "superpoint"]
+    assert matchers.names() == ["lightglue", "nearest", "superglue"]
+
+
+def test_what_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(weights, "missing", lambda: "torch, safetensors")
+    for module, name in ((features, "aliked"), (features, "superpoint"), (matchers, "superglue")):
+        assert module.missing(name) == "torch, safetensors"
+        with pytest.raises(UnavailableError, match="pip install torch safetensors"):
+            module.named(name)
+
+
+def test_aliked_with_real_weights_sees_a_turned_picture(real_data: Path) -> None:
+    import cv2
+
+    pytest.importorskip("torch")
+    folder = real_data / "weights" / "aliked"
+    a = picture(1)[: SIZE[0], : SIZE[1]]
+    turn = cv2.getRotationMatrix2D((SIZE[1] / 2, SIZE[0] / 2), 25, 1.0)
+    turned: Any = cv2.warpAffine(a, turn, SIZE[::-1])
+    backend = features.named("aliked", folder / "aliked-n16rot.pth", count=400, device="cpu")
+    assert "as published (aliked-n16rot.pth)" in backend.describe() and "BSD" in backend.describe()
+    found, other = backend.detect(a), backend.detect(turned)
+    pairs = matchers.named("nearest").match(found, other, (SIZE, SIZE))
+    moved = found.uv[pairs[:, 0]] @ turn[:, :2].T + turn[:, 2]
+    right = np.linalg.norm(other.uv[pairs[:, 1]] - moved, axis=1) < 2
+    assert right.sum() > 80 and right.mean() > 0.9
+
+
+def test_deformed_convolution_is_a_plain_one_without_shifts() -> None:
+    torch = pytest.importorskip("torch")
+    from slam.features.aliked import deformed
+
+    x, kernel = torch.randn(1, 5, 9, 13), torch.randn(7, 5, 3, 3)
+    plain = torch.nn.functional.conv2d(x, kernel, padding=1)
+    assert torch.allclose(deformed(x, torch.zeros(1, 18, 9, 13), kernel), plain, atol=1e-4)
+    shifts = torch.zeros(1, 18, 9, 13)
+    shifts[:, 1::2] = 1  # all look one pixel further right
+    assert torch.allclose(deformed(x, shifts, kernel)[..., :-1], plain[..., 1:], atol=1e-4)
+
+
+# networks against transformers', which others wrote, with the same random weights
+
+
+def test_superpoint_agrees_with_transformers(tmp_path: Path) -> None:
+    torch, hf = pytest.importorskip("torch"), pytest.importorskip("transformers")
+    from slam.features.superpoint import MODEL
+
+    tensors = random_weights(MODEL)
+    torch.save(tensors, tmp_path / "superpoint_v1.pth")
+    theirs = hf.SuperPointForKeypointDetection(hf.SuperPointConfig(keypoint_threshold=0.005, max_keypoints=-1)).eval()
+    names = {f"conv{i + 1}{x}": f"encoder.conv_blocks.{i}.conv_{x}" for i in range(4) for x in "ab"}
+    names |= {f"convP{x}": f"keypoint_decoder.conv_score_{x}" for x in "ab"}
+    names |= {f"convD{x}": f"descriptor_decoder.conv_descriptor_{x}" for x in "ab"}
+    theirs.load_state_dict({names[k.split(".")[0]] + "." + k.split(".")[1]: v for k, v in tensors.items()})
+    a = picture(2, 96, 128)
+    ours = features.named("superpoint", tmp_path / "superpoint_v1.pth", count=10**6, device="cpu").detect(a)
+    with torch.inference_mode():
+        out = theirs(torch.from_numpy(a)[None, None].float().expand(1, 3, -1, -1) / 255)
+    uv = (out.keypoints[0] * torch.tensor([128, 96])).round().numpy()
+    inner = (uv < (124, 92)).all(axis=1)  # theirs keeps some that are nearer to the right and lower border
+    order, other = np.lexsort(ours.uv.T), np.flatnonzero(inner)[np.lexsort(uv[inner].T)]
+    assert len(order) > 50 and np.array_equal(ours.uv[order], uv[other])
+    assert np.allclose(ours.scores[order], out.scores[0].numpy()[other], atol=1e-5)
+    assert np.allclose(ours.descriptors[order], out.descriptors[0].numpy()[other], atol=1e-4)
+
+
+def two_views(dimension: int, n: int = 120) -> tuple[Found, Found]:
+    """The same features in two pictures of 640 x 480, in another order, a little changed."""
+    rng = np.random.default_rng(3)
+    uv, what = rng.uniform((0, 0), (639, 479), (n, 2)), rng.normal(size=(n, dimension))
+    order = rng.permutation(n)
+
+    def seen(uv: Any, what: Any) -> Found:
+        length = np.linalg.norm(what, axis=1, keepdims=True)
+        return Found(uv.astype(np.float32), (what / length).astype(np.float32), np.full(n, 0.5, np.float32))
+
+    return seen(uv, what), seen(uv[order] + (9, 2), what[order] + 0.2 * rng.normal(size=(n, dimension)))
+
+
+def theirs_of(model: Any, a: Found, b: Found, *scores: Any) -> tuple[Any, Any]:
+    """What a matcher of transformers says: rows of b (N,), probabilities (N,)."""
+    import torch
+
+    uv, what = (torch.from_numpy(np.stack([getattr(a, x), getattr(b, x)]))[None] for x in ("uv", "descriptors"))
+    with torch.inference_mode():
+        seen = torch.ones(1, 2, len(a.uv), dtype=torch.int)
+        out = model._match_image_pair(uv, what, *scores, 480, 640, mask=seen)
+    return tuple(x.reshape(-1, len(a.uv))[0].numpy() for x in out[:2])  # type: ignore[return-value]
+
+
+def agree(ours: Any, a: Found, b: Found, theirs: Any, share: Any) -> None:
+    """Same partners and probabilities."""
+    import torch
+
+    with torch.inference_mode():
+        shares = ours._shares(a, b, ((640, 480), (640, 480)))
+    pairs = matchers.mutual(shares, 0.0)
+    mine = np.full(len(a.uv), -1)
+    mine[pairs[:, 0]] = pairs[:, 1]
+    assert (mine >= 0).sum() > 30 and np.array_equal(mine, theirs)
+    rows = np.flatnonzero(mine >= 0)
+    assert np.allclose(shares.numpy()[rows, mine[rows]], share[rows], rtol=2e-3, atol=1e-6)
+
+
+def test_superglue_agrees_with_transformers(tmp_path: Path) -> None:
+    torch, hf = pytest.importorskip("torch"), pytest.importorskip("transformers")
+    from slam.matchers.superglue import MODEL
+
+    theirs = hf.SuperGlueForKeypointMatching(hf.SuperGlueConfig(matching_threshold=0.0)).eval()
+    state = {k: v for k, v in theirs.state_dict().items() if not k.startswith("keypoint_detector")}
+    tensors = {"bin_score": state["bin_score"]}
+    for name, value in state.items():
+        if name.endswith("num_batches_tracked"):
+            continue
+        if value.ndim == 1:  # nothing that begins as 0 or 1 is to stay so
+            value.add_(0.05 * torch.rand_like(value))
+        part = name.split(".")
+        value = value[..., None] if value.ndim == 2 else value
+        if part[0] == "keypoint_encoder":
+            index = 3 * int(part[2]) + (part[3] == "batch_norm")
+            tensors[f"kenc.encoder.{index}.{part[-1]}"] = value
+        elif part[0] == "final_projection":
+            tensors[f"final_proj.{part[-1]}"] = value
+        elif part[0] == "gnn" and part[3] == "mlp":
+            index = 3 * int(part[4]) + (part[5] == "batch_norm")
+            tensors[f"gnn.layers.{part[2]}.mlp.{index}.{part[-1]}"] = value
+        elif part[0] == "gnn" and part[4] == "self":  # the published files count heads fastest
+            value = value.reshape(4, 64, *value.shape[1:]).transpose(0, 1).reshape(value.shape)
+            number = ("query", "key", "value").index(part[5])
+            tensors[f"gnn.layers.{part[2]}.attn.proj.{number}.{part[-1]}"] = value
+        elif part[0] == "gnn":
+            if value.ndim == 3:
+                value = value.reshape(256, 4, 64).transpose(1, 2).reshape(256, 256, 1)
+            tensors[f"gnn.layers.{part[2]}.attn.merge.{part[-1]}"] = value
+    assert set(tensors) == set(MODEL.shapes)
+    torch.save(tensors, tmp_path / "superglue_outdoor.pth")
+    ours = matchers.named("superglue", tmp_path / "superglue_outdoor.pth", device="cpu")
+    a, b = two_views(256)
+    agree(ours, a, b, *theirs_of(theirs, a, b, torch.full((1, 2, len(a.uv)), 0.5)))
+    sizes = (640, 480), (640, 480)
+    assert ours.match(a, Found(*(x[:0] for x in b)), sizes).shape == (0, 2)
+
+
+def test_lightglue_agrees_with_transformers(tmp_path: Path) -> None:
+    torch, hf = pytest.importorskip("torch"), pytest.importorskip("transformers")
+    from safetensors.torch import save_file
+
+    config = hf.LightGlueConfig(depth_confidence=-1.0, width_confidence=-1.0, filter_threshold=0.0)
+    theirs = hf.LightGlueForKeypointMatching(config).eval()
+    state = {k: v for k, v in theirs.state_dict().items() if not k.startswith("keypoint_detector")}
+    for value in state.values():
+        value.add_(0.02 * torch.randn_like(value))
+    tensors = {"posenc.Wr.weight": state["positional_encoder.projector.weight"]}
+    for i in range(9):
+        layer = f"transformer_layers.{i}"
+        for x in ("weight", "bias"):
+            state[f"{layer}.cross_attention.k_proj.{x}"].copy_(state[f"{layer}.cross_attention.q_proj.{x}"])
+            three = torch.stack([state[f"{layer}.self_attention.{c}_proj.{x}"] for c in "qkv"])
+            rest = three.shape[2:]
+            three = three.reshape(3, 4, 64, *rest).permute(1, 2, 0, *range(3, 3 + len(rest))).reshape(768, *rest)
+            tensors[f"self_attn.{i}.Wqkv.{x}"] = three  # names as in the published files
+            tensors[f"self_attn.{i}.out_proj.{x}"] = state[f"{layer}.self_attention.o_proj.{x}"]
+            for ours_, his in (("to_qk", "q_proj"), ("to_v", "v_proj"), ("to_out", "o_proj")):
+                tensors[f"cross_attn.{i}.{ours_}.{x}"] = state[f"{layer}.cross_attention.{his}.{x}"]
+            for kind in ("self", "cross"):
+                for number, his in ((0, "fc1"), (1, "layer_norm"), (3, "fc2")):
+                    tensors[f"{kind}_attn.{i}.ffn.{number}.{x}"] = state[f"{layer}.{kind}_mlp.{his}.{x}"]
+            for ours_, his in (("matchability", "matchability"), ("final_proj", "final_projection")):
+                tensors[f"log_assignment.{i}.{ours_}.{x}"] = state[f"match_assignment_layers.{i}.{his}.{x}"]
+    file = tmp_path / "superpoint_lightglue.safetensors"
+    save_file({name: value.clone().contiguous() for name, value in tensors.items()}, file)
+    ours = matchers.named("lightglue", file, device="cpu")
+    assert (ours.takes, ours.dimension) == ("superpoint", 256)
+    a, b = two_views(256)
+    agree(ours, a, b, *theirs_of(theirs, a, b))
+    sizes = (640, 480), (640, 480)
+    assert np.array_equal(pickle.loads(pickle.dumps(ours)).match(a, b, sizes), ours.match(a, b, sizes))
+
+
+def test_lightglue_for_aliked_takes_128_numbers(tmp_path: Path) -> None:
+    pytest.importorskip("torch")
+    from slam.matchers.lightglue import _ALIKED
+
+    ours = matchers.named("lightglue", saved(tmp_path / "aliked_lightglue.pth", _ALIKED), device="cpu")
+    assert (ours.takes, ours.dimension) == ("aliked", 128)
+    pairs = ours.match(*two_views(128), ((640, 480), (640, 480)))
+    assert pairs.ndim == 2 and pairs.shape[1] == 2
+    with pytest.raises(SettingError, match=r"aliked of 128 numbers, not for orb of 32 bytes"):
+        matchers.check(features.named("orb"), ours)
+
+
+# bad files
+
+
+class Bomb:
+    """A pickle that runs a command when it's read."""
+
+    def __init__(self, mark: Path) -> None:
+        self.mark = mark
+
+    def __reduce__(self) -> Any:
+        return os.system, (f"touch {self.mark}",)
+
+
+def test_weights_of_the_wrong_model_name_both(tmp_path: Path) -> None:
+    pytest.importorskip("torch")
+    from slam.features import aliked, superpoint
+    from slam.matchers import lightglue, superglue
+
+    point, glue = saved(tmp_path / "p.pth", superpoint.MODEL), saved(tmp_path / "g.pth", superglue.MODEL)
+    light, ali = saved(tmp_path / "l.pth", lightglue._SUPERPOINT), saved(tmp_path / "a.pth", aliked.MODELS[0])
+    for file, found in ((glue, "SuperGlue"), (light, "LightGlue"), (ali, "ALIKED")):
+        with pytest.raises(InputError, match=f"weights of {found}, expected SuperPoint.*superpoint_v1.pth"):
+            features.named("superpoint", file)
+    with pytest.raises(InputError, match="weights of SuperPoint, expected ALIKED-n16 or ALIKED-t16"):
+        features.named("aliked", point)
+    with pytest.raises(InputError, match="weights of LightGlue, expected SuperGlue"):
+        matchers.named("superglue", light)
+    with pytest.raises(InputError, match="weights of SuperPoint, expected LightGlue for SuperPoint or LightGlue"):
+        matchers.named("lightglue", point)
+
+
+def test_weights_of_another_shape_or_unknown(tmp_path: Path) -> None:
+    torch = pytest.importorskip("torch")
+    from slam.features.superpoint import MODEL
+
+    file = tmp_path / "w.pth"
+    tensors = random_weights(MODEL)
+    torch.save(tensors | {"conv1a.weight": torch.zeros(32, 1, 3, 3)}, file)
+    with pytest.raises(InputError, match="SuperPoint of another shape.*conv1a.weight is 32 x 1 x 3 x 3, not 64 x 1"):
+        features.named("superpoint", file)
+    torch.save({"layer.weight": torch.zeros(3)}, file)
+    with pytest.raises(InputError, match=r"another network \(layer.weight .*expected SuperPoint"):
+        features.named("superpoint", file)
+    torch.save(tensors | {"convPb.bias": torch.full((65,), float("nan"))}, file)
+    with pytest.raises(InputError, match="aren't finite, in convPb.bias"):
+        features.named("superpoint", file)
+    torch.save([1, 2], file)
+    with pytest.raises(InputError, match="no tensors by name"):
+        features.named("superpoint", file)
+
+
+def test_damaged_missing_and_dangerous_files(tmp_path: Path) -> None:
+    torch = pytest.importorskip("torch")
+    from safetensors.torch import save_file
+
+    from slam.features.superpoint import MODEL
+
+    with pytest.raises(SettingError, match="comes without weights. Give Magic Leap's superpoint_v1.pth"):
+        features.named("superpoint")
+    with pytest.raises(InputError, match="is no file.*nothing is downloaded"):
+        features.named("superpoint", tmp_path / "none.pth")
+    whole = saved(tmp_path / "superpoint_v1.pth", MODEL)
+    safe = tmp_path / "superpoint.safetensors"
+    save_file(random_weights(MODEL), safe)
+    for file in (whole, safe):
+        half = tmp_path / f"half{file.suffix}"
+        for size in (0, 100, file.stat().st_size // 2):
+            half.write_bytes(file.read_bytes()[:size])
+            with pytest.raises(InputError, match="is no whole file of tensors alone"):
+                features.named("superpoint", half)
+    mark = tmp_path / "ran"
+    torch.save({"conv1a.weight": Bomb(mark)}, tmp_path / "bomb.pth")
+    (tmp_path / "bomb.pkl").write_bytes(pickle.dumps({"conv1a.weight": Bomb(mark)}, 2))
+    for file in (tmp_path / "bomb.pth", tmp_path / "bomb.pkl"):
+        with pytest.raises(InputError, match="holds code or objects besides tensors; not run"):
+            features.named("superpoint", file)
+    assert not mark.exists()
+
+
+def test_what_is_told_of_weights_and_files_that_change(tmp_path: Path) -> None:
+    torch = pytest.importorskip("torch")
+    import hashlib
+
+    from slam.features.superpoint import MODEL
+
+    file = saved(tmp_path / "superpoint_v1.pth", MODEL)
+    backend = features.named("superpoint", file, device="cpu")
+    told = backend.describe()
+    assert hashlib.sha256(file.read_bytes()).hexdigest() in told and "not a file known to the project" in told
+    assert "Magic Leap" in told and "noncommercial" in told
+    kept = pickle.dumps(backend)
+    assert len(kept) < 20_000, "tensors don't belong into the state of a run"
+    torch.save({name: value.half() for name, value in random_weights(MODEL, 1).items()}, file)
+    assert features.named("superpoint", file, device="cpu").detect(picture()).descriptors.dtype == np.float32
+    with pytest.raises(InputError, match="has changed since"):
+        pickle.loads(kept)
