@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterable, Iterator
-from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +16,9 @@ from data_samples.panorama import Panorama
 from data_samples.town import build
 from data_samples.traffic import Traffic
 from pipeline.errors import SettingError
+from pipeline.io.video import Encoder
 from pipeline.step import Report, silent
 from pipeline.types import F64, U8, Trajectory
-
-RATE = 90_000  # ticks a second of the video's clock
 
 
 def generate_drive(
@@ -151,35 +149,21 @@ def encode(frames: Iterable[U8], file: Path, fps: float, bitrate: float, size: t
     Returns:
         The number of frames. The file appears when it is complete.
     """
-    import av
+    import cv2
 
-    rate = Fraction(fps).limit_denominator(1001)
     part = file.with_name(f".{file.name}.part")
-    count = 0
+    options = {"preset": "superfast", "g": str(max(1, round(1.5 * fps)))}
+    options |= {"maxrate": str(int(1.5 * bitrate)), "bufsize": str(int(2 * bitrate))}
     try:
-        with av.open(str(part), "w", format="mp4", options={"movflags": "faststart"}) as container:
-            stream = container.add_stream("libx264", rate=rate)
-            stream.width, stream.height = size
-            stream.pix_fmt = "yuv420p"
-            stream.bit_rate = int(bitrate)
-            stream.time_base = stream.codec_context.time_base = Fraction(1, RATE)
-            stream.codec_context.gop_size = max(1, round(1.5 * fps))
-            stream.codec_context.options = {
-                "preset": "superfast",
-                "maxrate": str(int(1.5 * bitrate)),
-                "bufsize": str(int(2 * bitrate)),
-            }
-            for count, image in enumerate(frames, 1):
-                frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
-                if (frame.width, frame.height) != size:
-                    frame = frame.reformat(*size, interpolation="AREA")
-                frame.pts, frame.time_base = round((count - 1) * RATE / rate), Fraction(1, RATE)
-                container.mux(stream.encode(frame))
-            container.mux(stream.encode())
+        with Encoder(part, size, fps, bitrate=bitrate, container={"movflags": "faststart"}, **options) as encoder:
+            for count, image in enumerate(frames):
+                if (image.shape[1], image.shape[0]) != size:
+                    image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+                encoder.add(cv2.cvtColor(image, cv2.COLOR_RGB2YUV_I420), count / fps)
         part.replace(file)
     finally:
         part.unlink(missing_ok=True)
-    return count
+    return encoder.count
 
 
 def main() -> None:

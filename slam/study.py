@@ -27,9 +27,9 @@ import numpy as np
 
 from pipeline.errors import InputError, ScanError, SettingError, SpaceError, UnavailableError, from_os_error
 from pipeline.io.trajectory import replacing
+from pipeline.io.video import Encoder
 from pipeline.step import Report, silent
 from pipeline.types import U8, Camera, Trajectory
-from slam.encode import Encoder
 from slam.evaluate import SEGMENT, evaluate, way
 from slam.gps import GpsTrack, smooth
 from slam.odometry import Odometry, OdometryParams

@@ -12,8 +12,8 @@ import numpy.typing as npt
 
 from pipeline.cameras import project
 from pipeline.errors import from_os_error
+from pipeline.io.video import Encoder
 from pipeline.types import F64, U8
-from slam.encode import Encoder
 from slam.geometry import angular_errors, inverse
 from slam.odometry import Odometry
 

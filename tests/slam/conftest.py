@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from pipeline.cameras import pixel_rays
+from pipeline.io.video import Encoder
 from pipeline.types import Camera, Trajectory
-from slam.encode import Encoder
 from slam.geometry import exp_so3
 
 HEIGHT, FPS, SECONDS, SPEED = 128, 10.0, 3.6, 6.0

@@ -132,3 +132,17 @@ def test_half_a_video_file_is_read_as_far_as_it_goes(corridor, tmp_path):
     frames = len(list(open_video(half).frames()))
     assert 5 < frames < len(corridor.greys)
     shutil.rmtree(tmp_path, ignore_errors=True)
+
+
+def test_frames_out_of_order_are_left_out_and_told(corridor, tmp_path):
+    import cv2
+
+    for i in range(4):
+        cv2.imwrite(str(tmp_path / f"{i}.png"), corridor.greys[i])
+    (tmp_path / "times.txt").write_text("0\n0.1\n0.05\n0.2\n")
+    said = []
+    frames = list(open_video(tmp_path, times=tmp_path / "times.txt").frames(warn=said.append))
+    assert [f.name for f in frames] == ["0.png", "1.png", "3.png"] and "out of order" in said[0]
+    (tmp_path / "times.txt").write_text("0\n0.1\n")
+    with pytest.raises(InputError, match="2 times for 4 pictures"):
+        open_video(tmp_path, times=tmp_path / "times.txt")
