@@ -13,12 +13,17 @@ import numpy as np
 from pipeline.errors import UnavailableError
 from pipeline.types import Trajectory
 from slam.evaluate import umeyama
+from slam.geometry import angles
 from slam.odometry import Odometry
 from slam.output import SparseMap, write_colmap
 from slam.sparse import kept, move
 
 LOSS = 1.0
 """Pixels, of Cauchy's loss."""
+WRONG = 2.0
+"""Observations off by more than so many times the odometry's gate are left out."""
+EDGE, POLE = 20.0, 0.9
+"""Pixels from a 360 frame's seam, and sine of the elevation, beyond which observations are left out."""
 
 
 def adjust(odometry: Odometry) -> dict[str, float]:
@@ -38,11 +43,20 @@ def adjust(odometry: Odometry) -> dict[str, float]:
     keyframes = odometry.map.keyframes
     poses = np.stack([k.T_world_cam for k in keyframes])
     known = kept(odometry)
-    uv, inside = project(odometry.map.camera, known.bearing)
+    camera = odometry.map.camera
+    uv, inside = project(camera, known.bearing)
+    error = angles(poses[known.keyframe], known.xyz[known.point], known.bearing)
+    inside &= error < WRONG * odometry.map.gate
+    if (
+        camera.model == "equirectangular"
+    ):  # pycolmap measures in pixels, which jump at the seam and stretch at the poles
+        inside &= (np.abs(uv[:, 0] - camera.width / 2) < camera.width / 2 - EDGE) & (np.abs(known.bearing[:, 1]) < POLE)
+    seen = np.bincount(known.point[inside], minlength=len(known.xyz))
+    inside &= seen[known.point] > 1
     path = Trajectory(np.arange(len(poses), dtype=np.float64), poses[:, :3, 3], poses[:, :3, :3])
     sparse = SparseMap(known.xyz, known.point[inside], known.keyframe[inside], uv[inside].astype(np.float64))
     with tempfile.TemporaryDirectory(prefix="scan2sim-adjust-") as folder:
-        write_colmap(Path(folder), path, odometry.map.camera, [f"{i:06d}" for i in range(len(poses))], sparse)
+        write_colmap(Path(folder), path, camera, [f"{i:06d}" for i in range(len(poses))], sparse)
         model = pycolmap.Reconstruction(folder)
     before = model.compute_mean_reprojection_error()
     options = pycolmap.BundleAdjustmentOptions()

@@ -111,6 +111,12 @@ def triangulate(poses, starts, camera_of, bearing):  # type: ignore[no-untyped-d
     return points, angle
 
 
+def angles(poses: F64, points: F64, bearing: F64) -> F64:
+    """(N,) radians between bearings (N, 3) of cameras (N, 4, 4) to world and the directions of points (N, 3)."""
+    seen = np.einsum("nji,nj->ni", poses[:, :3, :3], points - poses[:, :3, 3])
+    return np.arctan2(np.linalg.norm(np.cross(seen, bearing), axis=1), np.einsum("ni,ni->n", seen, bearing))
+
+
 def angular_errors(T_cam_world: F64, points: F64, bearing: F64) -> F64:
     """(N,) radians between bearings (N, 3) and the directions of points (N, 3) seen by one camera."""
     seen = points @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]

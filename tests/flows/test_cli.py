@@ -298,7 +298,7 @@ def test_ctrl_c_ends_with_a_message_and_frees_the_folder(street: Path, tmp_path:
     while child.poll() is None and not (tmp_path / "out" / "steps" / "poisson.terrain").exists():
         time.sleep(0.02)
     child.send_signal(signal.SIGINT)
-    _, message = child.communicate(timeout=30)
+    _, message = child.communicate(timeout=120)
     assert child.returncode == 130 and "what was finished is kept" in message and "Traceback" not in message
     bad(scan2sim("run", street, "--out", tmp_path / "out", "--from", "roof"), 2, "no such step")  # not locked
 
