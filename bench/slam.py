@@ -48,7 +48,7 @@ def drive_of(out: Path, path: str, length: float) -> Path:
         print(f"rendering {length:.0f} m of {path}: about a second a frame", flush=True)
         way = paths.kitti_path(file, length) if file.is_file() else paths.town_path(0, length)
         shutil.rmtree(folder, ignore_errors=True)
-        generate_drive(folder, way, length=length, fps=15, height=1024, bitrate=10e6)
+        generate_drive(folder, way, length=length, speed=15, fps=15, height=1024, bitrate=10e6, samples=4)
     return folder
 
 

@@ -112,17 +112,9 @@ def triangulate(poses, starts, camera_of, bearing):  # type: ignore[no-untyped-d
 
 
 def angles(poses: F64, points: F64, bearing: F64) -> F64:
-    """(N,) radians between bearings (N, 3) of cameras (N, 4, 4) to world and the directions of points (N, 3)."""
-    seen = np.einsum("nji,nj->ni", poses[:, :3, :3], points - poses[:, :3, 3])
+    """(N,) radians from bearings (N, 3) to the directions of points (N, 3); poses (4, 4) or (N, 4, 4), to world."""
+    seen = ((points - poses[..., :3, 3])[:, None, :] @ poses[..., :3, :3])[:, 0]
     return np.arctan2(np.linalg.norm(np.cross(seen, bearing), axis=1), np.einsum("ni,ni->n", seen, bearing))
-
-
-def angular_errors(T_cam_world: F64, points: F64, bearing: F64) -> F64:
-    """(N,) radians between bearings (N, 3) and the directions of points (N, 3) seen by one camera."""
-    seen = points @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]
-    seen /= np.maximum(np.linalg.norm(seen, axis=1, keepdims=True), 1e-12)
-    sine = np.linalg.norm(np.cross(seen, bearing), axis=1)
-    return np.arctan2(sine, np.einsum("ij,ij->i", seen, bearing))
 
 
 def epipolar_errors(E: F64, a: F64, b: F64) -> F64:

@@ -18,7 +18,7 @@ from pydantic import Field
 
 from pipeline.types import F64, U8, Camera
 from slam.charts import Charts
-from slam.geometry import angular_errors, exp_so3, inverse, log_so3, relative_pose, rigid
+from slam.geometry import angles, exp_so3, inverse, log_so3, relative_pose, rigid
 from slam.gps import GpsTrack
 from slam.graph import backend_named
 from slam.graph.problem import Graph
@@ -186,7 +186,7 @@ class Odometry:
             shared_sigma=np.full(len(self.map.shared), 1e-9),
         )  # fmt: skip
         pose = backend_named(self._backend).solve(graph, points=False).poses[0]
-        error = angular_errors(inverse(pose), xyz, bearing)
+        error = angles(pose, xyz, bearing)
         self.tracker.drop(tracks.ids[known][error > 3 * self.map.gate])
         return pose, int((error < self.map.gate).sum()), n
 

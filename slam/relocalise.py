@@ -11,7 +11,7 @@ import numpy as np
 
 from pipeline.types import F64, U8
 from slam.charts import Charts
-from slam.geometry import angular_errors, epipolar_errors, inverse, relative_pose, rigid, triangulate
+from slam.geometry import angles, epipolar_errors, essential, inverse, relative_pose, rigid, triangulate
 from slam.graph import lm
 from slam.graph.problem import Graph
 
@@ -80,13 +80,7 @@ def relocalise(
         rng: for samples.
     """
     pairs = matches(before.seen.descriptor, beside.seen.descriptor)
-    T = inverse(beside.T_world_cam) @ before.T_world_cam
-    t = T[:3, 3]
-    E = (
-        np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
-        @ T[:3, :3]
-        / max(float(np.linalg.norm(t)), 1e-9)
-    )
+    E = essential(inverse(beside.T_world_cam) @ before.T_world_cam)
     a, b = before.seen.bearing[pairs[:, 0]], beside.seen.bearing[pairs[:, 1]]
     pairs = pairs[epipolar_errors(E, a, b) < 4 * sigma]
     if len(pairs) < ENOUGH:
@@ -112,6 +106,6 @@ def relocalise(
             guess[None], xyz, np.arange(n, dtype=np.int32), np.zeros(n, np.int32), bearing, np.zeros(1, bool), sigma
         )
         pose = lm.solve(graph, points=False, iterations=20).poses[0]
-        agree = int((angular_errors(inverse(pose), xyz, bearing) < 4 * sigma).sum())
+        agree = int((angles(pose, xyz, bearing) < 4 * sigma).sum())
         best = max(best, (agree, pose), key=lambda item: item[0])
     return best[1] if best[0] >= max(ENOUGH, 0.4 * n) else None

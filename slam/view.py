@@ -14,7 +14,7 @@ from pipeline.cameras import project
 from pipeline.errors import from_os_error
 from pipeline.io.video import Encoder
 from pipeline.types import F64, U8
-from slam.geometry import angular_errors, inverse
+from slam.geometry import angles
 from slam.odometry import Odometry
 
 Bools = npt.NDArray[np.bool_]
@@ -127,7 +127,7 @@ class Recorder:
                 cv2.circle(picture, (x, y), 24, CANDIDATE, -1, cv2.LINE_8, 4)
             if known.any():
                 pose = odometry.pose_of(odometry.placed[-1])
-                error = angular_errors(inverse(pose), map_.landmarks.xyz[rows[known]], tracks.bearing[known])
+                error = angles(pose, map_.landmarks.xyz[rows[known]], tracks.bearing[known])
                 inliers = int((error < map_.gate).sum())
                 share = np.clip(error / map_.gate, 0, 1)[:, None]
                 colours = ((1 - share) * KNOWN + share * OFF).tolist()
