@@ -32,7 +32,8 @@ from data_samples.layout import FRAME, lay_out
 from data_samples.scanner import plan_drive
 from data_samples.scene import Scene
 from data_samples.street import generate
-from flows.execute import execute, plan
+from flows.execute import execute
+from flows.planning import plan
 from flows.recipe import Node, Output, recipe
 from flows.settings import Settings
 from pipeline import visibility

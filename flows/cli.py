@@ -108,6 +108,61 @@ def plan(
 
 
 @app.command()
+def tile(
+    corridor: Annotated[Path, typer.Argument(metavar="CORRIDOR", help="A tile.toml too long for one tile.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The survey's folder.")],
+    length: Annotated[float, typer.Option(help="Metres of road a tile.")] = 100.0,
+    buffer: Annotated[float, typer.Option(help="Metres that tiles' clouds reach beyond their borders.")] = 5.0,
+    reach: Annotated[float, typer.Option(help="Metres from the trajectory beyond which points are left out.")] = 60.0,
+    photo_reach: Annotated[float, typer.Option(help="Metres beyond a tile up to which photos are taken.")] = 40.0,
+    name: Annotated[str | None, typer.Option(help="The survey's name; default: the corridor's.")] = None,
+    copy: Annotated[bool, typer.Option("--copy", help="Copy photos into the tiles instead of naming them.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a survey that is there already.")] = False,
+) -> None:
+    """Cut a long corridor into tiles that overlap: a survey."""
+    from flows.cut import Options, cut_survey
+    from flows.display import progress
+
+    told: list[str] = []
+    options = Options(length, buffer, reach, photo_reach, copy)
+    with progress("tile") as report:
+        path = cut_survey(corridor, out, options, name=name, overwrite=overwrite, report=report, warn=told.append)
+    for warning in told:
+        typer.secho(f"warning: {warning}", fg="yellow", err=True)
+    typer.echo(f"Survey: {path}")
+
+
+@app.command()
+def survey(
+    source: Annotated[
+        str, typer.Argument(metavar="SOURCE", help="A survey.toml, tile.toml or drive.toml, or its folder.")
+    ],
+    out: Annotated[
+        str, typer.Option("--out", "-o", help="Folder for worlds, reports and kept results, or its s3:// URL.")
+    ],
+    length: Annotated[float, typer.Option(help="Metres of road a tile, where it is cut here.")] = 100.0,
+    buffer: Annotated[float, typer.Option(help="Metres of overlap, where it is cut here.")] = 5.0,
+    set_: Sets = None,
+    config: Config = None,
+    hold_out: HoldOut = None,
+    jobs: Annotated[int, typer.Option(min=0, help="Steps at a time; 0: as the cores allow.")] = 0,
+    memory: Annotated[str | None, typer.Option(help="What steps may need together, as 20GB.")] = None,
+    runner: Annotated[
+        Literal["processes", "threads", "dask", "ray"], typer.Option(help="The last three: through Prefect.")
+    ] = "processes",
+    address: Annotated[str | None, typer.Option(help="Of a Dask scheduler or Ray cluster.")] = None,
+    cores: Annotated[int | None, typer.Option(min=1, help="That a step may use; default: all.")] = None,
+) -> None:
+    """Make the worlds of all tiles of a survey, which meet, and one of them all."""
+    from flows.surveying import run_source
+
+    run_source(
+        source, out, _settings(set_, config, hold_out), length=length, buffer=buffer, jobs=jobs, memory=memory,
+        runner=runner, address=address, cores=cores,
+    )  # fmt: skip
+
+
+@app.command()
 def inspect(path: Annotated[Path, typer.Argument(help="A cloud, a tile, a mesh, or a world.")]) -> None:
     """Show one screen of facts."""
     from flows.inspect import inspect_path

@@ -76,10 +76,11 @@ class RunDisplay:
             self._done += 1
             self._kept += event == "kept"
             self._bars.update(self._whole, completed=self._done)
-            if event == "done":
+            if event in ("done", "failed"):
                 self._bars.remove_task(self._tasks.pop(node.label))  # type: ignore[arg-type]
                 seconds = time.perf_counter() - self._started[node.label]
-                console.print(f"[green]✓[/] {node.label:<22}[dim]{seconds:7.1f} s  {self._done}/{self._nodes}")
+                mark = "[green]✓[/]" if event == "done" else "[red]✗[/]"
+                console.print(f"{mark} {node.label:<22}[dim]{seconds:7.1f} s  {self._done}/{self._nodes}")
 
 
 def log_unexpected(error: BaseException) -> Path:

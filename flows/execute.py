@@ -6,133 +6,185 @@ import fcntl
 import importlib.metadata
 import multiprocessing
 import os
+import platform
 import shutil
 import signal
 import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import Any, Literal
 
-from flows.recipe import Node, Output
-from pipeline.errors import BusyError, ScanError, StepError, from_os_error
+from flows.memory import need
+from flows.planning import Planned
+from flows.recipe import Node
+from pipeline.errors import BusyError, ScanError, StepError, UnavailableError, from_os_error
 from pipeline.step import Report, silent
-from pipeline.store import Manifest, Store, digest, key_of
+from pipeline.store import Manifest, Store
 
-Event = Literal["start", "progress", "done", "kept"]
+Event = Literal["start", "progress", "done", "kept", "failed"]
 Watch = Callable[[Node, Event, float, str], None]
 """Told what happens: node, event, fraction done, message."""
+Executor = Callable[["list[Planned]", Store, dict[str, ScanError]], dict[str, Manifest]]
+"""Runs what a plan says is missing, notes failures by label, and returns what is done."""
 
 
-@dataclass(frozen=True)
-class Planned:
-    """A node with its key, and why it will run (None: its result is kept).
+class Frontier:
+    """Which nodes of a plan can run next, as results come in.
 
     Attributes:
-        keys: input name to the key (of a node's output) or digest (of a file).
+        done: results by label; what is kept from before comes by itself.
     """
 
-    node: Node
-    key: str
-    keys: dict[str, str]
-    reason: str | None
+    def __init__(self, planned: Sequence[Planned], store: Store, watch: Watch) -> None:
+        self.done: dict[str, Manifest] = {}
+        self._store, self._watch = store, watch
+        self._waiting = {item.node.label: item for item in planned}
+        self._missing: set[str] = set()  # known not to be kept
+        self._lost: set[str] = set()  # failed, or in need of what failed
+
+    def __bool__(self) -> bool:
+        return bool(self._waiting)
+
+    def ready(self) -> Iterator[Planned]:
+        """Nodes that can run now, in the plan's order; to be taken, or offered again."""
+        for label, item in list(self._waiting.items()):
+            if not self._lost.isdisjoint(item.upstream):
+                self.fail(label)
+            elif all(name in self.done for name in item.upstream):
+                kept = None if label in self._missing else item.kept(self._store)
+                if kept is None:
+                    self._missing.add(label)
+                    yield item
+                else:
+                    self.take(label)
+                    self.done[label] = kept
+                    self._watch(item.node, "kept", 1.0, "")
+
+    def take(self, label: str) -> None:
+        """The node has been started."""
+        self._waiting.pop(label, None)
+
+    def fail(self, label: str) -> None:
+        """The node, and whatever depends on it, will not be done."""
+        self.take(label)
+        self._lost.add(label)
 
 
-def plan(nodes: Sequence[Node], store: Store, *, force: bool = False, start: str | None = None) -> list[Planned]:
-    """What would run and why, in order.
+def execute(
+    planned: Sequence[Planned],
+    store: Store,
+    *,
+    jobs: int,
+    watch: Watch,
+    failures: dict[str, ScanError] | None = None,
+    memory: float | None = None,
+) -> dict[str, Manifest]:
+    """Run what the plan says is missing, up to `jobs` nodes at a time, each in a process of its own.
 
     Args:
-        force: everything runs again.
-        start: the name of a step that runs again, with all that depends on it.
-    """
-    planned: dict[str, Planned] = {}
-    digests: dict[Path, str] = {}
-    for node in nodes:
-        keys = {}
-        for name, source in sorted(node.inputs.items()):
-            if isinstance(source, Output):
-                keys[name] = f"{planned[source.node].key}/{source.name}"
-            else:
-                if source not in digests:
-                    digests[source] = digest(source)
-                keys[name] = digests[source]
-        key = key_of(node.step, node.params, keys)
-        reason = _reason(node, key, store)
-        if force:
-            reason = "forced"
-        elif start is not None and node.step.name == start:
-            reason = f"asked for by --from {start}"
-        elif start is not None:
-            upstream = [s.node for s in node.inputs.values() if isinstance(s, Output)]
-            again = [name for name in upstream if (planned[name].reason or "").startswith(("asked", "follows"))]
-            reason = f"follows {again[0]}" if again else reason
-        planned[node.label] = Planned(node, key, keys, reason)
-    return list(planned.values())
-
-
-def _reason(node: Node, key: str, store: Store) -> str | None:
-    if store.find(node.label, key) is not None:
-        return None
-    if store.folder(node.label, key).exists():
-        return "its result was damaged or deleted"
-    others = [p for p in (store.root / node.label).glob("*") if not p.name.startswith(".")]
-    return "its input, settings or version changed" if others else "it was never run"
-
-
-def execute(planned: Sequence[Planned], store: Store, *, jobs: int, watch: Watch) -> dict[str, Manifest]:
-    """Run what the plan says is missing, up to `jobs` nodes at a time, each in a process of its own.
+        failures: gets what went wrong, by node's label: what doesn't depend on it is run all the same.
+            Without it the first failure ends the run.
+        memory: GB that nodes may need together (`flows.memory`); one that needs more runs alone.
 
     Raises:
         ScanError: of the first node that failed; what was finished is kept.
         KeyboardInterrupt: likewise.
     """
-    done: dict[str, Manifest] = {}
-    waiting = list(planned)
-    running: dict[Connection, tuple[Planned, ForkServerProcess]] = {}
-    context = _processes()
+    front = Frontier(planned, store, watch)
+    running: dict[Connection, tuple[Planned, ForkServerProcess, float]] = {}
     try:
-        while waiting or running:
-            for item in list(waiting):
+        while front or running:
+            for item in front.ready():
                 if len(running) >= jobs:
                     break
-                if not all(s.node in done for s in item.node.inputs.values() if isinstance(s, Output)):
+                needed = 0.0 if memory is None else need(item, store)
+                if memory is not None and running and sum(r[2] for r in running.values()) + needed > memory:
                     continue
-                waiting.remove(item)
-                kept = store.find(item.node.label, item.key) if item.reason is None else None
-                if kept is not None:
-                    done[item.node.label] = kept
-                    watch(item.node, "kept", 1.0, "")
-                    continue
-                ours, theirs = context.Pipe(duplex=False)
-                inputs = _paths(item.node, store, {p.node.label: p for p in planned}, done)
-                process = context.Process(target=_child, args=(theirs, item, store, inputs))
+                front.take(item.node.label)
                 watch(item.node, "start", 0.0, "")
-                process.start()
-                theirs.close()
-                running[ours] = (item, process)
+                started, process = _start(item, store)
+                running[started] = (item, process, needed)
             for connection in wait(list(running), timeout=1.0) if running else ():
                 assert isinstance(connection, Connection)
-                item, process = running[connection]
-                manifest = _receive(connection, item, process, watch)
-                if manifest is not None:
-                    done[item.node.label] = manifest
-                    process.join()
-                    del running[connection]
+                item, process, _ = running[connection]
+                label = item.node.label
+                try:
+                    manifest = _receive(connection, item, process, watch)
+                except ScanError as error:
+                    if failures is None:
+                        raise
+                    failures[label] = error
+                    front.fail(label)
+                    watch(item.node, "failed", 1.0, error.cause)
+                else:
+                    if manifest is None:
+                        continue
+                    front.done[label] = manifest
                     watch(item.node, "done", 1.0, "")
+                process.join()
+                del running[connection]
     finally:
-        for _, process in running.values():
+        for _, process, _ in running.values():
             _stop(process)
-    return done
+    return front.done
+
+
+def check_version(item: Planned, wanted: Mapping[str, str]) -> None:
+    """Refuse to run a node with other code than the flow's that planned it.
+
+    Args:
+        wanted: the flow's `versions()`.
+
+    Raises:
+        UnavailableError: this machine has another version of the project, of the step, or of what computes it.
+    """
+    from flows.recipe import STEPS
+
+    mine, name = versions(), item.node.step.name
+    others = [f"{k} {mine.get(k, 'none')} instead of {v}" for k, v in wanted.items() if mine.get(k) != v]
+    local = next((step.version for step in STEPS if step.name == name), item.node.step.version)
+    if local != item.node.step.version:
+        others.append(f"version {local} of step {name} instead of {item.node.step.version}")
+    if others:
+        remedy = "Install the same version on all workers as where the flow runs, and start them again"
+        raise UnavailableError(platform.node(), f"this worker has {', '.join(others)}", remedy)
+
+
+def limit_cores(cores: int | None) -> None:
+    """Let steps that this process starts use so many cores each; None: all. Counts from the first step on."""
+    if cores is not None:
+        for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENCV_FOR_THREADS_NUM", "OPENBLAS_NUM_THREADS"):
+            os.environ[name] = str(cores)
+
+
+def run_apart(item: Planned, store: Store, watch: Watch) -> Manifest:
+    """Run one node in a process of its own and wait for it; a result that is there by now is kept.
+
+    Raises:
+        ScanError: as `run_node`.
+    """
+    kept = item.kept(store)
+    if kept is not None:
+        return kept
+    connection, process = _start(item, store)
+    try:
+        while True:
+            manifest = _receive(connection, item, process, watch)
+            if manifest is not None:
+                process.join()
+                return manifest
+    finally:
+        _stop(process)
 
 
 def run_node(item: Planned, store: Store, inputs: dict[str, Path], report: Report = silent) -> Manifest:
-    """Run one node in this process and keep its result; what a Prefect task calls too.
+    """Run one node in this process and keep its result.
 
     Raises:
         ScanError: as the step says; a full disk as `SpaceError`; anything else as `StepError`.
@@ -147,6 +199,7 @@ def run_node(item: Planned, store: Store, inputs: dict[str, Path], report: Repor
             "version": node.step.version,
             "params": node.params.model_dump(mode="json"),
             "inputs": item.keys,
+            "fed": item.fed(store),
             "seconds": round(time.perf_counter() - start, 3),
             "peak_mb": _peak_mb(),
         }
@@ -208,15 +261,16 @@ def _processes() -> Any:
     return context
 
 
-def _paths(node: Node, store: Store, planned: dict[str, Planned], done: dict[str, Manifest]) -> dict[str, Path]:
-    paths = {}
-    for name, source in node.inputs.items():
-        if isinstance(source, Output):
-            folder = store.folder(source.node, planned[source.node].key)
-            paths[name] = folder / done[source.node].files[source.name]
-        else:
-            paths[name] = source
-    return paths
+def _start(item: Planned, store: Store) -> tuple[Connection, ForkServerProcess]:
+    """Start a node in a process of its own."""
+    # workers of a cluster are daemons, which may not have children; ours end with them (`_end_with_the_run`)
+    multiprocessing.current_process()._config["daemon"] = False  # type: ignore[attr-defined]
+    context = _processes()
+    ours, theirs = context.Pipe(duplex=False)
+    process = context.Process(target=_child, args=(theirs, item, store, item.inputs(store)))
+    process.start()
+    theirs.close()
+    return ours, process
 
 
 def _child(connection: Connection, item: Planned, store: Store, inputs: dict[str, Path]) -> None:

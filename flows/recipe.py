@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,12 +11,15 @@ from flows.settings import Settings
 from pipeline.classes import GROUPS
 from pipeline.io import views as views_io
 from pipeline.step import Params, Step
+from pipeline.steps.clip import CLIP
 from pipeline.steps.collision import COLLISION
 from pipeline.steps.decimate import DECIMATE
 from pipeline.steps.export import EXPORT
 from pipeline.steps.geometry import GEOMETRY
 from pipeline.steps.ingest import INGEST
 from pipeline.steps.islands import ISLANDS
+from pipeline.steps.join import JOIN
+from pipeline.steps.overlap import OVERLAP
 from pipeline.steps.path import PATH
 from pipeline.steps.pictures import PICTURES
 from pipeline.steps.plants import PLANTS
@@ -30,17 +33,20 @@ from pipeline.types import Tile
 from segmentation.label import LABEL
 from segmentation.segment import SEGMENT
 from texturing.agreement import AGREEMENT
+from texturing.borders import BORDERS
 from texturing.choose import CHOOSE
 from texturing.exposure import EXPOSURE
+from texturing.level import LEVEL
 from texturing.score import SCORE
 from texturing.texture import TEXTURE
 from texturing.unwrap import UNWRAP
 
 STEPS: tuple[Step, ...] = (
-    INGEST, PATH, VIEWS, LABEL, SEGMENT, SPLIT, VOXEL, POISSON, TRIM, ISLANDS, DECIMATE, PLANTS, UNWRAP,
-    VISIBILITY, EXPOSURE, AGREEMENT, CHOOSE, TEXTURE, COLLISION, EXPORT, GEOMETRY, SCORE, PICTURES,
+    INGEST, PATH, VIEWS, LABEL, SEGMENT, OVERLAP, SPLIT, VOXEL, POISSON, TRIM, ISLANDS, CLIP, JOIN, DECIMATE, PLANTS,
+    UNWRAP, VISIBILITY, EXPOSURE, AGREEMENT, CHOOSE, TEXTURE, LEVEL, COLLISION, EXPORT, GEOMETRY, SCORE, PICTURES,
+    BORDERS,
 )  # fmt: skip
-PER_CLASS: tuple[Step, ...] = (VOXEL, POISSON, TRIM, ISLANDS, DECIMATE, CHOOSE, UNWRAP, TEXTURE)
+PER_CLASS: tuple[Step, ...] = (VOXEL, POISSON, TRIM, ISLANDS, CLIP, JOIN, DECIMATE, CHOOSE, UNWRAP, TEXTURE, LEVEL)
 
 
 @dataclass(frozen=True)
@@ -67,8 +73,14 @@ class Node:
     inputs: Mapping[str, Path | Output]
 
 
-def recipe(tile: Tile, settings: Settings) -> list[Node]:
-    """The graph of a tile, each node after those that it reads.
+def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None) -> list[Node]:
+    """The graph of a tile, each node after those that it reads of the same tile.
+
+    Args:
+        tile: to be made.
+        settings: of all steps.
+        beside: names of the tiles of its survey that are made, too: labels are `tile/step` then, and what happens at
+            borders reads neighbours' results. Without it the tile is made for itself, and ends at its borders.
 
     Raises:
         SettingError: a setting that doesn't exist or is out of range.
@@ -76,71 +88,122 @@ def recipe(tile: Tile, settings: Settings) -> list[Node]:
     settings.check(STEPS, PER_CLASS)
     nodes: list[Node] = []
 
-    def add(step: Step, inputs: Mapping[str, Path | Output], group: str | None = None, **given: Any) -> str:
+    def at(label: str, name: str, other: str = tile.name) -> Output:
+        """An output of a node of this tile, or of a neighbour."""
+        return Output(label if beside is None else f"{other}/{label}", name)
+
+    def add(step: Step, inputs: Mapping[str, Path | Output], group: str | None = None, **given: Any) -> None:
         label = f"{step.name}.{group}" if group else step.name
-        nodes.append(Node(label, step, settings.params(step, group, **given), inputs))
-        return label
+        nodes.append(Node(at(label, "").node, step, settings.params(step, group, **given), inputs))
 
     frame: dict[str, Any] = {"crs": tile.frame.crs, "origin": tile.frame.origin, "unit": tile.frame.unit}
     add(INGEST, {f"cloud.{i:04d}": path for i, path in enumerate(tile.clouds)}, **frame)
-    whole = {"cloud": Output("ingest", "cloud")}
+    whole = {"cloud": at("ingest", "cloud")}
     path = scanner_path(tile)
     if path:
         add(PATH, {}, **path)
-    scanner = {"path": Output("path", "path")} if path else {}
+    scanner = {"path": at("path", "path")} if path else {}
     photos: dict[str, Path | Output] = {f"photo.{i}": view.photo for i, view in enumerate(tile.views)}
     masks: dict[str, Path | Output] = {f"mask.{i}": view.mask for i, view in enumerate(tile.views) if view.mask}
     add(VIEWS, photos | masks | whole, poses=tuple(views_io.to_json(view, with_paths=False) for view in tile.views))
-    seen: dict[str, Path | Output] = {"views": Output("views", "views")}
+    seen: dict[str, Path | Output] = {"views": at("views", "views")}
     if tile.views:
         add(LABEL, whole | seen | _weights(settings), **_kept(settings))
-    add(SEGMENT, whole | scanner | ({**seen, "labels": Output("label", "labels")} if tile.views else {}))
-    add(SPLIT, {"cloud": Output("segment", "cloud")})
+    add(SEGMENT, whole | scanner | ({**seen, "labels": at("label", "labels")} if tile.views else {}))
+    cloud = at("segment", "cloud")
+    cell: dict[str, Any] = {"seed": tile.cell.seed, "neighbours": dict(tile.cell.neighbours)} if tile.cell else {}
+    met = [name for name in cell.get("neighbours", {}) if name in (beside or ())]
+    first = [name for name in met if name < tile.name]  # they own the borders with this one
+    if met and tile.cell:
+        others = {f"cloud.{name}": at("segment", "cloud", name) for name in met}
+        add(OVERLAP, {"cloud": cloud} | others, name=tile.name, buffer=tile.cell.buffer, **cell)
+        cloud = at("overlap", "cloud")
+    add(SPLIT, {"cloud": cloud})
 
     vegetation = settings.params(SPLIT).vegetation
     groups = [g for g in GROUPS if g != "vegetation" or vegetation != "locations"]
     for part in (*GROUPS, "rest"):
-        add(VOXEL, {"cloud": Output("split", part)} | scanner, part)
+        add(VOXEL, {"cloud": at("split", part)} | scanner, part)
     for group in groups:
-        cloud, size = Output(f"voxel.{group}", "cloud"), settings.params(VOXEL, group).size
+        cloud, size = at(f"voxel.{group}", "cloud"), settings.params(VOXEL, group).size
         add(POISSON, {"cloud": cloud}, group, voxel=size)
-        add(TRIM, {"mesh": Output(f"poisson.{group}", "mesh"), "cloud": cloud}, group, voxel=size)
-        add(ISLANDS, {"mesh": Output(f"trim.{group}", "mesh")}, group)
-        add(DECIMATE, {"mesh": Output(f"islands.{group}", "mesh")}, group)
-    meshes = {f"mesh.{g}": Output(f"decimate.{g}", "mesh") for g in groups}
-    clouds = {f"cloud.{part}": Output(f"voxel.{part}", "cloud") for part in (*GROUPS, "rest")}
+        add(TRIM, {"mesh": at(f"poisson.{group}", "mesh"), "cloud": cloud}, group, voxel=size)
+        add(ISLANDS, {"mesh": at(f"trim.{group}", "mesh")}, group)
+        surface = at(f"islands.{group}", "mesh")
+        if cell:
+            add(CLIP, {"mesh": surface}, group, **cell)
+            clipped = {"mesh": at(f"clip.{group}", "mesh"), "on": at(f"clip.{group}", "on")}
+            surface = clipped["mesh"]
+        if met:
+            others = {f"{k}.{name}": at(f"clip.{group}", k, name) for name in first for k in clipped}
+            add(JOIN, clipped | others, group, name=tile.name, **cell)
+            surface = at(f"join.{group}", "mesh")
+        add(DECIMATE, {"mesh": surface}, group, keep_border=bool(cell))
+    meshes = {f"mesh.{g}": at(f"decimate.{g}", "mesh") for g in groups}
+    clouds = {f"cloud.{part}": at(f"voxel.{part}", "cloud") for part in (*GROUPS, "rest")}
     plants: dict[str, Path | Output] = {}
     if vegetation != "mesh":
-        add(PLANTS, {name: Output(f"voxel.{name}", "cloud") for name in ("vegetation", "terrain")})
-        plants = {"plants": Output("plants", "geojson"), "plants_csv": Output("plants", "csv")}
+        add(PLANTS, {name: at(f"voxel.{name}", "cloud") for name in ("vegetation", "terrain")}, **cell)
+        plants = {"plants": at("plants", "geojson"), "plants_csv": at("plants", "csv")}
 
     add(VISIBILITY, meshes | clouds | seen)
-    seen = seen | {"depth": Output("visibility", "depth")}
+    seen = seen | {"depth": at("visibility", "depth")}
     prior = settings.params(EXPOSURE).prior
     add(EXPOSURE, seen | ({"prior": Path(prior)} if prior else {}))
-    seen = seen | {"exposures": Output("exposure", "exposures")}
+    seen = seen | {"exposures": at("exposure", "exposures")}
     add(AGREEMENT, seen)
-    seen = seen | {"agreement": Output("agreement", "agreement")}
+    seen = seen | {"agreement": at("agreement", "agreement")}
     for group in groups:
-        mesh = {"mesh": Output(f"decimate.{group}", "mesh")}
+        mesh = {"mesh": at(f"decimate.{group}", "mesh")}
         add(CHOOSE, mesh | seen, group)
-        choice = {"choice": Output(f"choose.{group}", "choice")}
+        choice = {"choice": at(f"choose.{group}", "choice")}
         by_photo = {**choice, **seen} if settings.params(UNWRAP, group).backend == "photo" else {}
         add(UNWRAP, mesh | by_photo, group)
-        unwrapped = {name: Output(f"unwrap.{group}", name) for name in ("mesh", "pages")}
+        unwrapped = {name: at(f"unwrap.{group}", name) for name in ("mesh", "pages")}
         add(TEXTURE, {**unwrapped, **choice, **clouds, **seen}, group)
-    textured = {g: Output(f"texture.{g}", "textured") for g in groups}
-    add(COLLISION, {g: Output(f"decimate.{g}", "mesh") for g in groups})
-    add(EXPORT, textured | plants | {"collision": Output("collision", "mesh")}, name=tile.name)
+    textured = {g: at(f"texture.{g}", "textured") for g in groups}
+    for group in groups if met else ():
+        others = {f"neighbour.{name}": at(f"texture.{group}", "textured", name) for name in met}
+        add(LEVEL, {"textured": textured[group]} | others, group)
+        textured[group] = at(f"level.{group}", "textured")
+    add(COLLISION, {g: at(f"decimate.{g}", "mesh") for g in groups}, keep_border=bool(cell))
+    add(EXPORT, textured | plants | {"collision": at("collision", "mesh")}, name=tile.name)
 
     truth: dict[str, Path | Output] = {}
     if tile.truth_mesh and tile.truth_points:
         truth = {"truth.mesh": tile.truth_mesh, "truth.points": tile.truth_points}
-    add(GEOMETRY, meshes | clouds | truth)
+    add(GEOMETRY, meshes | clouds | truth, **cell)
     add(SCORE, textured | {name: seen[name] for name in ("views", "depth")} | truth)
-    stages = {f"decimate.{g}": Output(f"decimate.{g}", "mesh") for g in groups}
+    stages = {f"decimate.{g}": at(f"decimate.{g}", "mesh") for g in groups}
+    if met:
+        mine = {f"textured.{g}": at(f"level.{g}", "textured") for g in groups}
+        theirs = {f"textured.{g}.{n}": at(f"level.{g}", "textured", n) for g in groups for n in first}
+        add(BORDERS, mine | theirs, **cell)
     add(PICTURES, textured | stages | clouds | {"views": seen["views"]} | scanner)
     return nodes
+
+
+def survey_recipe(tiles: Sequence[Tile], settings: Settings) -> list[Node]:
+    """The graph of several tiles of a survey, which meet.
+
+    Each node comes after those that it reads; else tile after tile, so that the first are finished early.
+
+    Raises:
+        SettingError: as `recipe`.
+    """
+    names = [tile.name for tile in tiles]
+    nodes = {node.label: node for tile in tiles for node in recipe(tile, settings, names)}
+    ordered: dict[str, Node] = {}
+
+    def add(node: Node) -> None:
+        for source in node.inputs.values():
+            if isinstance(source, Output) and source.node not in ordered:
+                add(nodes[source.node])
+        ordered.setdefault(node.label, node)
+
+    for node in nodes.values():
+        add(node)
+    return list(ordered.values())
 
 
 def _weights(settings: Settings) -> dict[str, Path | Output]:

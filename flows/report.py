@@ -10,7 +10,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from flows.execute import Planned, versions
+from flows.execute import versions
+from flows.planning import Planned
 from pipeline.classes import GROUPS
 from pipeline.io import crs
 from pipeline.store import Manifest, Store

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import time
 import traceback
 from collections.abc import Iterator
@@ -14,7 +13,9 @@ from pathlib import Path
 from rich.markup import escape
 
 from flows.display import RunDisplay, console
-from flows.execute import Event, Planned, execute, locked, plan, versions
+from flows.execute import Event, Executor, execute, locked, versions
+from flows.planning import Planned, plan
+from flows.publish import publish
 from flows.recipe import Node, recipe
 from flows.report import write_report
 from flows.settings import Settings
@@ -24,17 +25,25 @@ from pipeline.store import Manifest, Store
 from pipeline.types import Tile
 
 STORE = "steps"
-EDITED = (".sdf", ".config", ".json", ".mtl", ".geojson", ".csv")  # what users change by hand
-BULKY = ("poses", "positions", "times")  # parameters that repeat the tile
 
 
 def run_tile(
-    path: Path, out: Path, settings: Settings, *, force: bool = False, start: str | None = None, jobs: int = 0
+    path: Path,
+    out: Path,
+    settings: Settings,
+    *,
+    force: bool = False,
+    start: str | None = None,
+    jobs: int = 0,
+    run: Executor | None = None,
 ) -> Path:
     """Make the world of the tile at `path` in `out`; returns the report's path.
 
     `out` gets: `world/`, `report.html`, `report.json`, `config.json` (all settings as resolved),
     `run.log`, and `steps/` (kept results).
+
+    Args:
+        run: runs the steps; by default up to `jobs` processes at a time.
 
     Raises:
         ScanError: see `pipeline.errors`; earlier results stay.
@@ -47,8 +56,11 @@ def run_tile(
         log.write(f"tile {tile.path}, settings {json.dumps(settings.values)}, versions {json.dumps(versions())}")
         missing = sum(p.reason is not None for p in planned)
         with log.errors(out):
-            done = execute_shown(planned, store, log, jobs)
-            _publish(store, planned, done, out, tile, settings)
+            failures: dict[str, ScanError] = {}
+            done = run(planned, store, failures) if run else execute_shown(planned, store, log, jobs)
+            for error in failures.values():
+                raise error
+            publish(store, planned, done, out, tile, settings)
             report = write_report(tile, planned, done, store, out, seconds=time.perf_counter() - began)
         store.sweep({p.node.label: p.key for p in planned})
     show_warnings(done)
@@ -60,7 +72,14 @@ def run_tile(
     return report
 
 
-def execute_shown(planned: list[Planned], store: Store, log: Log, jobs: int = 0) -> dict[str, Manifest]:
+def execute_shown(
+    planned: list[Planned],
+    store: Store,
+    log: Log,
+    jobs: int = 0,
+    failures: dict[str, ScanError] | None = None,
+    memory: float | None = None,
+) -> dict[str, Manifest]:
     """`execute`, with bars on the screen and lines in the log."""
     with RunDisplay(len(planned)) as display:
 
@@ -69,7 +88,8 @@ def execute_shown(planned: list[Planned], store: Store, log: Log, jobs: int = 0)
             if event != "progress":
                 log.write(f"{node.label}: {event}")
 
-        done = execute(planned, store, jobs=jobs or default_jobs(), watch=watch)
+        jobs = jobs or default_jobs()
+        done = execute(planned, store, jobs=jobs, watch=watch, failures=failures, memory=memory)
     for label, manifest in done.items():
         told = [manifest.facts["told"]] if "told" in manifest.facts else []
         for line in told + [f"warning: {text}" for text in manifest.warnings]:
@@ -108,48 +128,6 @@ def _plan(tile: Tile, out: Path, settings: Settings, force: bool, start: str | N
         raise SettingError(f"--from {start}", "there is no such step", f"Steps are: {', '.join(sorted(names))}")
     store = Store(out / STORE)
     return plan(nodes, store, force=force, start=start), store
-
-
-def _publish(
-    store: Store, planned: list[Planned], done: dict[str, Manifest], out: Path, tile: Tile, settings: Settings
-) -> None:
-    """Put the world, the exposures and the resolved settings beside the report; a world that is there stays."""
-    key = next(p.key for p in planned if p.node.label == "export")
-    source = store.folder("export", key) / done["export"].files["world"]
-    _publish_world(source, out, key)
-    key = next(p.key for p in planned if p.node.label == "exposure")
-    solved = store.folder("exposure", key) / done["exposure"].files["exposures"]
-    shutil.copyfile(solved, out / "exposure.json")  # for the next tile, as its `exposure.prior`
-    config = {
-        "tile": str(tile.path),
-        "versions": versions(),
-        "set": settings.values,
-        "steps": {label: {k: v for k, v in m.params.items() if k not in BULKY} for label, m in done.items()},
-    }
-    (out / "config.json").write_text(json.dumps(config, indent=1), encoding="utf-8")
-
-
-def _publish_world(source: Path, out: Path, key: str) -> None:
-    """Copy the world from the store (meshes and textures as hard links, where that can be), unless it is the same."""
-    stamp = out / "world" / ".result"
-    files = [path.relative_to(source) for path in source.rglob("*") if path.is_file()]
-    if stamp.is_file() and stamp.read_text() == key and all((out / "world" / file).is_file() for file in files):
-        return
-    fresh = out / ".world"
-    shutil.rmtree(fresh, ignore_errors=True)
-    shutil.copytree(source, fresh, copy_function=_link)
-    shutil.rmtree(out / "world", ignore_errors=True)
-    fresh.rename(out / "world")
-    stamp.write_text(key)
-
-
-def _link(source: str, target: str) -> None:
-    try:
-        if Path(source).suffix in EDITED:
-            raise OSError("a user's edit must not reach the store")
-        os.link(source, target)
-    except OSError:
-        shutil.copy2(source, target)
 
 
 class Log:

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from flows.display import console, progress
-from flows.execute import locked, plan
+from flows.execute import locked
+from flows.planning import plan
 from flows.recipe import Node, Output, recipe
 from flows.run import STORE, Log, execute_shown, show_warnings
 from flows.settings import Settings

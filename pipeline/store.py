@@ -13,14 +13,16 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import shutil
 import tempfile
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from pipeline.errors import from_os_error
+from pipeline.io.remote import Remote
 from pipeline.step import Done, Params, Step
 
 KEY_LENGTH = 24
@@ -34,6 +36,8 @@ class Manifest:
     Attributes:
         label: the node's name in the recipe (`poisson.terrain`).
         version, params, inputs: what the key was made of; inputs are keys or digests by name.
+        fed: like the key, but of the contents of what was read, whatever made them.
+        content: digest of all output files.
         files: output name to path relative to the result's folder.
         sizes: bytes of every file below it.
         facts, warnings: as the step gave them.
@@ -44,6 +48,8 @@ class Manifest:
     version: int
     params: dict[str, Any]
     inputs: dict[str, str]
+    fed: str
+    content: str
     files: dict[str, str]
     sizes: dict[str, int]
     facts: dict[str, Any]
@@ -63,6 +69,50 @@ def digest(path: Path) -> str:
         raise from_os_error(error, path) from None
 
 
+class Digests:
+    """`digest`, remembered in a file for sources whose size and time of change are as they were.
+
+    A kilometre of survey is gigabytes: looking for what changed must not read them all again.
+    """
+
+    def __init__(self, file: Path) -> None:
+        self._file = file
+        try:
+            self._known: dict[str, list[Any]] = json.loads(file.read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            self._known = {}
+        self._used: dict[str, list[Any]] = {}
+
+    def __call__(self, path: Path) -> str:
+        try:
+            stat = path.stat()
+        except OSError:
+            return digest(path)
+        mark = [stat.st_size, stat.st_mtime_ns, stat.st_ino]
+        known = self._known.get(str(path))
+        found = known[3] if known and known[:3] == mark else digest(path)
+        self._used[str(path)] = [*mark, found]
+        return str(found)
+
+    def save(self) -> None:
+        """Write what was asked for."""
+        try:
+            self._file.parent.mkdir(parents=True, exist_ok=True)
+            fresh = self._file.with_suffix(".tmp")
+            fresh.write_text(json.dumps(self._used), encoding="utf-8")
+            fresh.replace(self._file)
+        except OSError as error:
+            raise from_os_error(error, self._file) from None
+
+
+def content_of(folder: Path, files: Mapping[str, int]) -> str:
+    """One digest of files (paths below `folder`); what links lead to counts, not where they lead."""
+    together = hashlib.sha256()
+    for name in sorted(files):
+        together.update(f"{name}\0{digest(folder / name)}\n".encode())
+    return together.hexdigest()
+
+
 def key_of(step: Step, params: Params, inputs: Mapping[str, str]) -> str:
     """The key of a result: step, version, parameters and the keys of what it reads."""
     text = json.dumps([step.name, step.version, params.model_dump(mode="json"), dict(inputs)], sort_keys=True)
@@ -70,10 +120,20 @@ def key_of(step: Step, params: Params, inputs: Mapping[str, str]) -> str:
 
 
 class Store:
-    """Results below one folder."""
+    """Results below one folder.
 
-    def __init__(self, root: Path) -> None:
-        self.root = root
+    Args:
+        root: the folder.
+        remote: where results are kept besides, for machines that share no disk; `root` is its likeness then.
+        sources: where files of the survey come from that aren't on this machine.
+    """
+
+    def __init__(self, root: Path, remote: Remote | None = None, sources: Remote | None = None) -> None:
+        self.root, self.remote, self.sources = root, remote, sources
+
+    def within(self, name: str) -> Store:
+        """The store of the labels that begin with `name/`."""
+        return Store(self.root / name, self.remote and self.remote.below(name), self.sources)
 
     def folder(self, label: str, key: str) -> Path:
         """Where the result is, or will be."""
@@ -81,16 +141,37 @@ class Store:
 
     def find(self, label: str, key: str) -> Manifest | None:
         """The manifest of a complete result; None where it is absent or a file of it was deleted."""
-        folder = self.folder(label, key)
+        manifest = self._manifest(label, key)
+        if manifest is None or self._complete(label, key, manifest):
+            return manifest
+        return manifest if self.remote is not None else None  # its files are fetched when they are read
+
+    def read(self, label: str, key: str) -> Manifest | None:
+        """As `find`, with its files on this machine."""
+        manifest = self.find(label, key)
+        if manifest is not None and self.remote is not None and not self._complete(label, key, manifest):
+            return manifest if self.remote.pull(f"{label}/{key}/{name}" for name in manifest.sizes) else None
+        return manifest
+
+    def source(self, path: Path) -> Path:
+        """A source file, fetched if it isn't on this machine and it is known where from."""
+        if self.sources is not None and not path.exists() and path.is_relative_to(self.sources.local):
+            self.sources.pull([path.relative_to(self.sources.local).as_posix()])
+        return path
+
+    def _manifest(self, label: str, key: str) -> Manifest | None:
+        path = self.folder(label, key) / "manifest.json"
+        if self.remote is not None and not path.is_file():
+            self.remote.pull([f"{label}/{key}/manifest.json"])
         try:
-            manifest = Manifest(**json.loads((folder / "manifest.json").read_text(encoding="utf-8")))
+            return Manifest(**json.loads(path.read_text(encoding="utf-8")))
         except (OSError, ValueError, TypeError):
             return None
-        for name, size in manifest.sizes.items():
-            path = folder / name
-            if not path.is_file() or path.stat().st_size != size:
-                return None
-        return manifest
+
+    def _complete(self, label: str, key: str, manifest: Manifest) -> bool:
+        folder = self.folder(label, key)
+        paths = ((folder / name, size) for name, size in manifest.sizes.items())
+        return all(path.is_file() and path.stat().st_size == size for path, size in paths)
 
     def begin(self, label: str) -> Path:
         """A fresh temporary folder to write a result in."""
@@ -106,28 +187,55 @@ class Store:
 
         Args:
             folder: what `begin` gave, holding the outputs.
-            about: the manifest's version, params, inputs, seconds and peak_mb.
+            about: the manifest's version, params, inputs, fed, seconds and peak_mb.
         """
+        sizes = {p.relative_to(folder).as_posix(): p.stat().st_size for p in sorted(folder.rglob("*")) if p.is_file()}
         manifest = Manifest(
             label=label,
+            content=content_of(folder, sizes),
             files={name: path.relative_to(folder).as_posix() for name, path in done.files.items()},
-            sizes={
-                p.relative_to(folder).as_posix(): p.stat().st_size for p in sorted(folder.rglob("*")) if p.is_file()
-            },
+            sizes=sizes,
             facts=done.facts,
             warnings=done.warnings,
             **about,
         )
+        self._place(manifest, key, folder)
+        return manifest
+
+    def adopt(self, label: str, key: str, fed: str, inputs: Mapping[str, str]) -> Manifest | None:
+        """Take a result over that was made of the same contents by the same step, whatever made those; None: no such.
+
+        What was made anew and came out the same ends the need to redo what depends on it.
+        """
+        for other in self.folder(label, key).parent.glob("*/manifest.json"):
+            old = self.find(label, other.parent.name)
+            if old is not None and old.fed == fed:
+                folder = self.begin(label)
+                try:
+                    shutil.copytree(other.parent, folder, symlinks=True, copy_function=os.link, dirs_exist_ok=True)
+                    (folder / "manifest.json").unlink()  # shared with the old result
+                    manifest = replace(old, inputs=dict(inputs))
+                    self._place(manifest, key, folder)
+                except OSError:
+                    return None  # no hard links here: it is made again
+                finally:
+                    shutil.rmtree(folder, ignore_errors=True)
+                return manifest
+        return None
+
+    def _place(self, manifest: Manifest, key: str, folder: Path) -> None:
+        """Write the manifest into a finished folder and move it into place."""
         try:
             text = json.dumps(asdict(manifest), indent=1)
             (folder / "manifest.json").write_text(text, encoding="utf-8")
-            place = self.folder(label, key)
+            place = self.folder(manifest.label, key)
             if place.exists():
                 shutil.rmtree(place)
             folder.replace(place)
         except OSError as error:
             raise from_os_error(error, self.root) from None
-        return manifest
+        if self.remote is not None:  # the manifest last: with it the result counts
+            self.remote.push(f"{manifest.label}/{key}/{name}" for name in (*manifest.sizes, "manifest.json"))
 
     def sweep(self, used: Mapping[str, str]) -> None:
         """Remove what `used` (label to key) does not name, leftovers of killed runs included."""

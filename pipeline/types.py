@@ -15,6 +15,8 @@ from typing import Any, Literal, Self
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.cells import Cell
+
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
 U8 = npt.NDArray[np.uint8]
@@ -349,6 +351,7 @@ class Tile:
         clouds: point cloud files.
         views: posed photos, poses in the frame's local coordinates.
         trajectory: the scanner's path, or None.
+        cell: what of the survey that it was cut from is the tile's own, or None: all of it.
         truth_mesh: ground-truth surface (.npz `Mesh` with `label`), for generated tiles, or None.
         truth_points: ground-truth coloured surface samples (LAZ), for generated tiles, or None.
     """
@@ -359,5 +362,6 @@ class Tile:
     clouds: tuple[Path, ...]
     views: tuple[View, ...] = ()
     trajectory: Trajectory | None = None
+    cell: Cell | None = None
     truth_mesh: Path | None = None
     truth_points: Path | None = None

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
+
+import numpy as np
 
 from pipeline.errors import InputError
 from pipeline.io import las, ply
@@ -48,3 +51,22 @@ def read(path: Path, frame: Frame) -> PointCloud:
         InputError: missing, truncated, or of an unknown format.
     """
     return _reader(path).read(path, frame)
+
+
+def chunks(path: Path, frame: Frame, size: int = las.CHUNK) -> Iterator[PointCloud]:
+    """A cloud's points in their order, `size` at a time; a PLY file's all at once.
+
+    Args:
+        path: of the cloud.
+        frame: its CRS and unit count; each part is in a frame of its own, with its origin near its points.
+        size: points.
+
+    Raises:
+        InputError: missing, truncated (on reaching the end), or of an unknown format.
+    """
+    if _reader(path) is las:
+        yield from las.chunks(path, frame, size)
+    else:
+        header = read_header(path)
+        x, y, z = np.floor((header.low + header.high) / 2 * frame.unit).tolist()
+        yield read(path, replace(frame, origin=(x, y, z)))

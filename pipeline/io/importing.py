@@ -1,4 +1,4 @@
-"""What importers share: a tile folder appears whole or not at all, and files are copied or linked into it."""
+"""What importers share: a tile's or survey's folder appears whole or not at all; files are copied or linked into it."""
 
 from __future__ import annotations
 
@@ -7,13 +7,19 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Literal
 
 from pipeline.errors import InputError, SettingError, from_os_error
 
 
 @contextmanager
-def tile_folder(out: Path, overwrite: bool = False) -> Iterator[Path]:
+def tile_folder(out: Path, overwrite: bool = False, kind: Literal["tile", "survey"] = "tile") -> Iterator[Path]:
     """A temporary folder beside `out` that takes its place when the block ends well, and is removed otherwise.
+
+    Args:
+        out: the folder.
+        overwrite: replace one that holds a tile (or what `kind` says).
+        kind: what is made; its file marks a folder that may be overwritten.
 
     Raises:
         SettingError: `out` exists, holds something, and `overwrite` is false; or it is a file.
@@ -24,8 +30,8 @@ def tile_folder(out: Path, overwrite: bool = False) -> Iterator[Path]:
         raise SettingError(out, "is a file, not a folder", "Name another folder")
     if out.is_dir() and any(out.iterdir()) and not overwrite:
         raise SettingError(out, "exists and is not empty", "Name a new folder, or say that it may be overwritten")
-    if out.is_dir() and any(out.iterdir()) and not (out / "tile.toml").is_file():
-        raise SettingError(out, "is no tile, and is not overwritten", "Name a new folder, or a tile's")
+    if out.is_dir() and any(out.iterdir()) and not (out / f"{kind}.toml").is_file():
+        raise SettingError(out, f"is no {kind}, and is not overwritten", f"Name a new folder, or a {kind}'s")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         work = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))

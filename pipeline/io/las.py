@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from datetime import date
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +16,10 @@ from pipeline.errors import InputError
 from pipeline.types import F64, Frame, PointCloud
 
 CHUNK = 2_000_000
+DAY = date(2000, 1, 1)
+"""Of creation, in every header: the same points are the same bytes on every day."""
+FEW = 50_000
+"""Points at a time, where the first ones mostly tell all."""
 
 
 def _open(path: Path) -> Any:
@@ -46,31 +54,72 @@ def read(path: Path, frame: Frame) -> PointCloud:
         time = np.empty(n, np.float64) if "gps_time" in names else None
         rgb = np.empty((n, 3), np.uint16) if "red" in names else None
         at = 0
-        try:
-            for part in reader.chunk_iterator(CHUNK):
-                here = slice(at, at + len(part))
-                xyz[here] = frame.to_local(np.column_stack([part.x, part.y, part.z]))
-                label[here] = part.classification
-                intensity[here] = part.intensity
-                if time is not None:
-                    time[here] = part.gps_time
-                if rgb is not None:
-                    rgb[here] = np.column_stack([part.red, part.green, part.blue])
-                at += len(part)
-        except Exception as error:  # the decompressors raise their own kinds, a panic among them
-            raise _truncated(path, at, n, str(error)) from None
-        if at < n:
-            raise _truncated(path, at, n, "end of file")
+        for part in _parts(path, reader, CHUNK):
+            here = slice(at, at + len(part))
+            xyz[here] = frame.to_local(_places(part))
+            label[here] = part.classification
+            intensity[here] = part.intensity
+            if time is not None:
+                time[here] = part.gps_time
+            if rgb is not None:
+                rgb[here] = _colours(part)
+            at += len(part)
+    if time is not None and not time.any():  # a format with times that were never filled
+        time = None
     return PointCloud(frame, xyz, _eight_bits(rgb), label=label, time=time, intensity=intensity)
+
+
+def chunks(path: Path, frame: Frame, size: int = CHUNK) -> Iterator[PointCloud]:
+    """The points in their order, `size` at a time, as `read` reads them.
+
+    Each part is in a frame of its own, with its origin near its points: over kilometres float32 would lose
+    millimetres.
+    """
+    shift = _colour_shift(path)
+    with _open(path) as reader:
+        timed = "gps_time" in set(reader.header.point_format.dimension_names)
+        for part in _parts(path, reader, size):
+            places = _places(part)
+            x, y, z = np.floor(places.mean(axis=0) * frame.unit).tolist()
+            near = replace(frame, origin=(x, y, z))
+            yield PointCloud(
+                near,
+                near.to_local(places).astype(np.float32),
+                None if shift is None else (_colours(part) >> shift).astype(np.uint8),
+                label=np.array(part.classification, np.uint8),
+                time=np.array(part.gps_time, np.float64) if timed else None,
+                intensity=np.array(part.intensity, np.uint16),
+            )
 
 
 def write(path: Path, cloud: PointCloud, scale: float = 0.001) -> None:
     """Write a LAS 1.4 file (LAZ by suffix), CRS and class names included; coordinates back in the CRS."""
+    write_parts(path, [cloud], scale)
+
+
+def write_parts(path: Path, parts: Iterable[PointCloud], scale: float = 0.001) -> None:
+    """Write what `write` would of all parts together, which are in one frame and have the same attributes.
+
+    Args:
+        parts: at least one; only one at a time is in memory.
+        scale: metres, the precision of coordinates.
+    """
+    import laspy
+
+    rest = iter(parts)
+    first = next(rest)
+    header = _header(first, scale)
+    with laspy.open(path, mode="w", header=header) as writer:
+        for part in chain([first], rest):
+            writer.write_points(_record(part, header))
+
+
+def _header(cloud: PointCloud, scale: float) -> Any:
     import laspy
     from laspy.vlrs.known import WktCoordinateSystemVlr
 
-    has_rgb = cloud.rgb is not None
-    header = laspy.LasHeader(point_format=7 if has_rgb else 6, version="1.4")
+    header = laspy.LasHeader(point_format=6 if cloud.rgb is None else 7, version="1.4")
+    header.creation_date = DAY
     header.scales = np.full(3, scale / cloud.frame.unit)
     header.offsets = np.floor(cloud.frame.to_crs(np.zeros(3)))
     if cloud.frame.crs != "local":
@@ -78,17 +127,60 @@ def write(path: Path, cloud: PointCloud, scale: float = 0.001) -> None:
 
         header.vlrs.append(WktCoordinateSystemVlr(CRS.from_user_input(cloud.frame.crs).to_wkt("WKT1_GDAL")))
         header.global_encoding.wkt = True
-    las = laspy.LasData(header)
-    las.x, las.y, las.z = cloud.frame.to_crs(cloud.xyz).T
+    return header
+
+
+def _record(cloud: PointCloud, header: Any) -> Any:
+    import laspy
+
+    record = laspy.ScaleAwarePointRecord.zeros(len(cloud), header=header)
+    record["x"], record["y"], record["z"] = cloud.frame.to_crs(cloud.xyz).T
     if cloud.label is not None:
-        las.classification = cloud.label
+        record["classification"] = cloud.label
     if cloud.time is not None:
-        las.gps_time = cloud.time
+        record["gps_time"] = cloud.time
     if cloud.intensity is not None:
-        las.intensity = cloud.intensity
+        record["intensity"] = cloud.intensity
     if cloud.rgb is not None:
-        las.red, las.green, las.blue = (cloud.rgb.astype(np.uint16) * 257).T
-    las.write(str(path))
+        record["red"], record["green"], record["blue"] = (cloud.rgb.astype(np.uint16) * 257).T
+    return record
+
+
+def _parts(path: Path, reader: Any, size: int) -> Iterator[Any]:
+    """All points of an open file, `size` at a time, in laspy's records; less than all is an error."""
+    at, n = 0, reader.header.point_count
+    try:
+        for part in reader.chunk_iterator(size):
+            yield part
+            at += len(part)
+    except Exception as error:  # the decompressors raise their own kinds, a panic among them
+        raise _truncated(path, at, n, str(error)) from None
+    if at < n:
+        raise _truncated(path, at, n, "end of file")
+
+
+def _places(part: Any) -> F64:
+    """(N, 3) CRS coordinates of a record."""
+    return np.column_stack([part.x, part.y, part.z])
+
+
+def _colours(part: Any) -> Any:
+    """(N, 3) uint16 of a record."""
+    return np.column_stack([part.red, part.green, part.blue])
+
+
+def _colour_shift(path: Path) -> int | None:
+    """By how many bits colours must be shifted to be of 8; None without any. Mostly the first points tell it."""
+    with _open(path) as reader:
+        if "red" not in set(reader.header.point_format.dimension_names):
+            return None
+        filled = False
+        for part in _parts(path, reader, FEW):
+            most = _colours(part).max()
+            if most > 255:
+                return 8
+            filled |= bool(most)
+    return 0 if filled else None
 
 
 def _eight_bits(rgb: Any) -> Any:

@@ -1,4 +1,4 @@
-"""SDF 1.9: a Gazebo world and the static model of a tile.
+"""SDF 1.9: a Gazebo world, the static model of a tile, and a world of many tiles in levels.
 
 Choices, and why:
 
@@ -12,20 +12,42 @@ Choices, and why:
   the tile's surfaces cast no shadow a second time; robots do.
 - No `<material>`: it would replace the mesh's own textures.
 - Every visual carries its class's LAS code for Gazebo's segmentation cameras.
+- Gazebo loads a level when a performer's box meets the level's box, and unloads it when the performer
+  is `<buffer>` away from it (gz-sim #28: the buffer is no help on the way in). So a level's box is
+  larger than its tile, or a robot would see nothing until it stands on it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from xml.sax.saxutils import escape
 
 from pipeline.classes import CODE
 from pipeline.io import crs
 from pipeline.types import Frame
 
 LABEL = {"terrain": CODE["terrain"], "building": CODE["building"], "vegetation": CODE["high_vegetation"]}
+HEADROOM = 500.0
+"""Metres that a level reaches above and below its tile: whatever flies over it sees it."""
 Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A tile's model in a world.
+
+    Attributes:
+        name: of the model.
+        offset: metres from the world's origin to the model's.
+        low, high: corners of the box around its meshes, metres from the model's origin.
+    """
+
+    name: str
+    offset: Vector
+    low: Vector
+    high: Vector
 
 
 @dataclass(frozen=True)
@@ -51,6 +73,16 @@ class Georeference:
         here = crs.to_wgs84(frame)
         return None if here is None else cls(*here, -degrees(crs.convergence(frame)))
 
+    def facts(self) -> dict[str, float | str]:
+        """The same as metadata.json has it."""
+        return {
+            "latitude_deg": self.latitude,
+            "longitude_deg": self.longitude,
+            "height_m": self.elevation,
+            "height_system": "as in the CRS",
+            "heading_deg": self.heading,
+        }
+
 
 def write_world(path: Path, name: str, place: Georeference | None, offset: Vector) -> None:
     """Write a world that includes `model://<name>`.
@@ -61,45 +93,36 @@ def write_world(path: Path, name: str, place: Georeference | None, offset: Vecto
         place: of the world's origin, or None.
         offset: metres from the world's origin to the model's.
     """
+    path.write_text(_world(path, name, place, _include(name, offset)), encoding="utf-8")
+
+
+def write_levels(
+    path: Path, name: str, place: Georeference | None, tiles: Sequence[Placed], buffer: float, performer: str
+) -> None:
+    """Write a world of many models, each in a level of its own, so that Gazebo can load those near a robot only.
+
+    Without Gazebo's option `--levels` all are loaded, whether there is a robot or not.
+
+    Args:
+        path: of the world's .sdf.
+        name: of the world.
+        place: of the world's origin, or None.
+        tiles: models, found as `model://<name>`.
+        buffer: metres around a tile within which a performer has it loaded; it is unloaded twice as far away.
+        performer: name of the model that levels are loaded for. It need not be there: Gazebo says so, and goes on.
+    """
     path.write_text(
-        f"""<?xml version="1.0"?>
-<!-- Run in this folder: GZ_SIM_RESOURCE_PATH=$PWD/models gz sim {path.name}
-     (Fortress: IGN_GAZEBO_RESOURCE_PATH=$PWD/models ign gazebo {path.name}) -->
-<sdf version="1.9">
-  <world name="{name}">
-    <physics name="dart_1ms" type="dart">
-      <max_step_size>0.001</max_step_size>
-      <real_time_factor>1</real_time_factor>
-    </physics>
-    <gravity>0 0 -9.8</gravity>
-    <plugin filename="gz-sim-physics-system" name="gz::sim::systems::Physics"/>
-    <plugin filename="gz-sim-user-commands-system" name="gz::sim::systems::UserCommands"/>
-    <plugin filename="gz-sim-scene-broadcaster-system" name="gz::sim::systems::SceneBroadcaster"/>
-    <plugin filename="gz-sim-contact-system" name="gz::sim::systems::Contact"/>
-    <plugin filename="gz-sim-imu-system" name="gz::sim::systems::Imu"/>
-    <plugin filename="gz-sim-navsat-system" name="gz::sim::systems::NavSat"/>
-    <plugin filename="gz-sim-sensors-system" name="gz::sim::systems::Sensors">
-      <render_engine>ogre2</render_engine>
-    </plugin>
-{_spherical(place)}    <scene>
-      <ambient>0.7 0.7 0.7 1</ambient>
-      <background>0.7 0.8 0.9 1</background>
-      <grid>false</grid>
-    </scene>
-    <light name="sun" type="directional">
-      <cast_shadows>true</cast_shadows>
-      <pose>0 0 100 0 0 0</pose>
-      <diffuse>0.4 0.4 0.4 1</diffuse>
-      <specular>0.1 0.1 0.1 1</specular>
-      <direction>-0.4 0.2 -0.9</direction>
-    </light>
-    <include>
-      <uri>model://{name}</uri>
-      <pose>{_numbers(offset)} 0 0 0</pose>
-    </include>
-  </world>
-</sdf>
-""",
+        _world(
+            path,
+            name,
+            place,
+            "".join(_include(tile.name, tile.offset) for tile in tiles) + _levels(tiles, buffer, performer),
+            f"""
+     All tiles are loaded then. With the option "levels" (two dashes before it, which XML forbids here) only those
+     near a performer are: the model that <performer> names below, if it is in this file when Gazebo starts, and
+     any model that is named to the service /world/{name}/level/set_performer later.
+     Fortress reads levels only where the last plugin below is named ignition::gazebo.""",
+        ),
         encoding="utf-8",
     )
 
@@ -152,6 +175,77 @@ def write_model(folder: Path, name: str, visuals: Mapping[str, str], collision: 
 """,
         encoding="utf-8",
     )
+
+
+def _world(path: Path, name: str, place: Georeference | None, content: str, note: str = "") -> str:
+    """A world's SDF: physics, systems and light, and what is in it."""
+    return f"""<?xml version="1.0"?>
+<!-- Run in this folder: GZ_SIM_RESOURCE_PATH=$PWD/models gz sim {path.name}
+     (Fortress: IGN_GAZEBO_RESOURCE_PATH=$PWD/models ign gazebo {path.name}){note} -->
+<sdf version="1.9">
+  <world name="{name}">
+    <physics name="dart_1ms" type="dart">
+      <max_step_size>0.001</max_step_size>
+      <real_time_factor>1</real_time_factor>
+    </physics>
+    <gravity>0 0 -9.8</gravity>
+    <plugin filename="gz-sim-physics-system" name="gz::sim::systems::Physics"/>
+    <plugin filename="gz-sim-user-commands-system" name="gz::sim::systems::UserCommands"/>
+    <plugin filename="gz-sim-scene-broadcaster-system" name="gz::sim::systems::SceneBroadcaster"/>
+    <plugin filename="gz-sim-contact-system" name="gz::sim::systems::Contact"/>
+    <plugin filename="gz-sim-imu-system" name="gz::sim::systems::Imu"/>
+    <plugin filename="gz-sim-navsat-system" name="gz::sim::systems::NavSat"/>
+    <plugin filename="gz-sim-sensors-system" name="gz::sim::systems::Sensors">
+      <render_engine>ogre2</render_engine>
+    </plugin>
+{_spherical(place)}    <scene>
+      <ambient>0.7 0.7 0.7 1</ambient>
+      <background>0.7 0.8 0.9 1</background>
+      <grid>false</grid>
+    </scene>
+    <light name="sun" type="directional">
+      <cast_shadows>true</cast_shadows>
+      <pose>0 0 100 0 0 0</pose>
+      <diffuse>0.4 0.4 0.4 1</diffuse>
+      <specular>0.1 0.1 0.1 1</specular>
+      <direction>-0.4 0.2 -0.9</direction>
+    </light>
+{content}  </world>
+</sdf>
+"""
+
+
+def _include(name: str, offset: Vector) -> str:
+    return f"""    <include>
+      <uri>model://{name}</uri>
+      <pose>{_numbers(offset)} 0 0 0</pose>
+    </include>
+"""
+
+
+def _levels(tiles: Sequence[Placed], buffer: float, performer: str) -> str:
+    """The plugin that Gazebo looks for by its name; there is no such file, and it needs none."""
+    return f"""    <plugin filename="dummy" name="gz::sim">
+      <performer name="performer">
+        <ref>{escape(performer)}</ref>
+        <geometry><box><size>2 2 2</size></box></geometry>
+      </performer>
+{"".join(_level(tile, buffer) for tile in tiles)}    </plugin>
+"""
+
+
+def _level(tile: Placed, buffer: float) -> str:
+    reach = (buffer, buffer, HEADROOM)
+    corners = list(zip(tile.offset, tile.low, tile.high, strict=True))
+    x, y, z = (offset + (low + high) / 2 for offset, low, high in corners)
+    dx, dy, dz = (high - low + 2 * r for (_, low, high), r in zip(corners, reach, strict=True))
+    return f"""      <level name="{tile.name}_level">
+        <pose>{_numbers((x, y, z))} 0 0 0</pose>
+        <geometry><box><size>{_numbers((dx, dy, dz))}</size></box></geometry>
+        <buffer>{buffer:g}</buffer>
+        <ref>{tile.name}</ref>
+      </level>
+"""
 
 
 def _visual(name: str, mesh: str, group: str) -> str:

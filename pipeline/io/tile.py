@@ -22,8 +22,11 @@ position = [500010.2, 5400020.1, 210.5]               # camera centre, CRS coord
 rotation = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]        # camera to world; x right, y down, z forward
 time = 1234.5               # optional: GPS time, seconds
 mask = "masks/0001.png"     # optional: 0 where the photo must not be used
+name = "photos/0001"        # optional: what it is called; default: the file without its suffix
 ```
-Paths are relative to the `tile.toml`. A generated tile also names its ground truth:
+Paths are relative to the `tile.toml`. A tile that was cut from a survey also says what of it is its own:
+`[cell]` with `seed` (x, y in the CRS) and `[cell.neighbours]`, names of tiles to their seeds (`pipeline.cells`).
+A generated tile also names its ground truth:
 `[truth]` with `mesh` and `points`.
 """
 
@@ -37,6 +40,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from pipeline.cells import Cell
 from pipeline.errors import InputError
 from pipeline.io import clouds as cloud_io
 from pipeline.io import crs as crs_io
@@ -71,6 +75,7 @@ class PhotoEntry(_Strict):
     rotation: tuple[Vector, Vector, Vector]
     time: float | None = None
     mask: str | None = None
+    name: str | None = None
 
 
 class TruthEntry(_Strict):
@@ -78,6 +83,14 @@ class TruthEntry(_Strict):
 
     mesh: str
     points: str
+
+
+class CellEntry(_Strict):
+    """The `[cell]` entry of a tile that was cut from a survey; seeds in CRS coordinates, the buffer in metres."""
+
+    seed: tuple[float, float]
+    neighbours: dict[str, tuple[float, float]] = {}
+    buffer: float = Field(5.0, ge=0)
 
 
 class TileFile(_Strict):
@@ -90,6 +103,7 @@ class TileFile(_Strict):
     trajectory: str | None = None
     cameras: tuple[CameraEntry, ...] = ()
     photos: tuple[PhotoEntry, ...] = ()
+    cell: CellEntry | None = None
     truth: TruthEntry | None = None
 
 
@@ -119,6 +133,7 @@ def read_tile(path: Path) -> Tile:
         clouds=clouds,
         views=tuple(_view(path, i, entry, cameras, frame) for i, entry in enumerate(spec.photos)),
         trajectory=_trajectory(path, spec, frame),
+        cell=_cell(spec.cell, unit),
         truth_mesh=_existing(path, spec.truth.mesh, "truth.mesh") if spec.truth else None,
         truth_points=_existing(path, spec.truth.points, "truth.points") if spec.truth else None,
     )
@@ -134,6 +149,7 @@ def write_tile(
     photos: Sequence[dict[str, Any]] = (),
     trajectory: str | None = None,
     units: str | None = None,
+    cell: dict[str, Any] | None = None,
     truth: dict[str, str] | None = None,
 ) -> Path:
     """Write `folder/tile.toml` and return its path.
@@ -151,6 +167,8 @@ def write_tile(
         body["trajectory"] = trajectory
     if truth:
         body["truth"] = truth
+    if cell:
+        body["cell"] = cell
     body["cameras"] = [_camera_entry(key, camera) for key, camera in cameras.items()]
     body["photos"] = [
         {k: (v.tolist() if isinstance(v, np.ndarray) else v) for k, v in photo.items() if v is not None}
@@ -162,6 +180,16 @@ def write_tile(
     path = folder / "tile.toml"
     path.write_text(tomli_w.dumps(body), encoding="utf-8")
     return path
+
+
+def sources_of(path: Path) -> list[Path]:
+    """What a tile is made of but for its photos: the `tile.toml`, clouds, trajectory.
+
+    Raises:
+        InputError: it can't be read.
+    """
+    spec = _parse(path)
+    return [path, *(path.parent / name for name in (*spec.clouds, *([spec.trajectory] if spec.trajectory else [])))]
 
 
 def tile_name(text: str) -> str:
@@ -235,13 +263,24 @@ def _view(tile: Path, index: int, entry: PhotoEntry, cameras: dict[str, Camera],
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = u @ vt, frame.to_local(position)
     return View(
-        name=Path(entry.file).with_suffix("").as_posix(),
+        name=entry.name or Path(entry.file).with_suffix("").as_posix(),
         camera=cameras[entry.camera],
         T_world_cam=pose,
         photo=tile.parent / entry.file,
         mask=tile.parent / entry.mask if entry.mask else None,
         time=entry.time,
     )
+
+
+def _cell(entry: CellEntry | None, unit: float) -> Cell | None:
+    if entry is None:
+        return None
+
+    def metres(seed: tuple[float, float]) -> tuple[float, float]:
+        return seed[0] * unit, seed[1] * unit
+
+    neighbours = {name: metres(seed) for name, seed in entry.neighbours.items()}
+    return Cell(metres(entry.seed), neighbours, entry.buffer)
 
 
 def _trajectory(tile: Path, spec: TileFile, frame: Frame) -> Trajectory | None:

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from pipeline.types import Mesh
 
 SAMPLES = 100_000  # points at which the deviation is measured
+MOST = 200_000  # triangles, whatever the borders need
 
 
 class CollisionParams(Params):
@@ -23,22 +24,24 @@ class CollisionParams(Params):
         triangles: at most; physics engines stay interactive up to about 50 thousand.
         vegetation: whether plants are solid too.
         seed: of the points at which the deviation is measured.
+        keep_border: never thin borders, be there too many triangles; set by the recipe where tiles meet.
     """
 
-    triangles: int = Field(50_000, ge=100, le=200_000)
+    triangles: int = Field(50_000, ge=100, le=MOST)
     vegetation: bool = False
     seed: int = 0
+    keep_border: bool = False
 
 
 def collision(inputs: Inputs, params: CollisionParams, out: Path, report: Report) -> Done:
     """Simplify `terrain` and `building` (and `vegetation`, if asked) into one mesh.
 
     They are simplified together, so the budget goes where the error would be greatest. Borders are
-    kept where the budget allows it; if not, a warning says so.
+    kept where the budget allows it (or always, with `keep_border`); if not, a warning says so.
 
     Raises:
         DataError: no mesh has a face.
-        StepError: the budget can't be met.
+        StepError: the budget can't be met; with `keep_border`, the borders alone need over 200,000 triangles.
     """
     from pipeline.steps.decimate import simplify
 
@@ -46,14 +49,17 @@ def collision(inputs: Inputs, params: CollisionParams, out: Path, report: Report
     source = _joined(inputs, groups)
     report(0.1, f"{len(source):,} triangles")
     small, warnings = simplify(source, params.triangles), []
-    border_kept = len(small) <= params.triangles
-    if not border_kept:
+    border_kept = len(small) <= params.triangles or params.keep_border
+    if len(small) > params.triangles and params.keep_border:
+        warnings.append(f"collision: the borders alone need {len(small):,} triangles, kept since other tiles join them")
+    elif not border_kept:
         warnings.append(f"collision: the borders alone need {len(small):,} triangles, so they were thinned too")
         small = simplify(small, params.triangles, preserve_border=False)
-    if len(small) > params.triangles:
+    allowed = MOST if params.keep_border else params.triangles
+    if len(small) > allowed:
         raise StepError(
             "collision",
-            f"{len(small):,} triangles are left where {params.triangles:,} are allowed",
+            f"{len(small):,} triangles are left where {allowed:,} are allowed",
             "Raise collision.triangles, or remove small islands",
         )
     report(0.7, "deviation")

@@ -18,23 +18,27 @@ class DecimateParams(Params):
 
     Attributes:
         target: triangles; the mission's 100 K for terrain and buildings, 300 K for vegetation.
+        keep_border: never thin the border, be there too many triangles; set by the recipe where tiles meet.
     """
 
     target: int = Field(100_000, ge=10_000, le=1_000_000)
+    keep_border: bool = False
 
 
 def decimate(inputs: Inputs, params: DecimateParams, out: Path, report: Report) -> Done:
     """Collapse edges of `mesh` down to the target, borders kept (tiles and classes meet there).
 
-    Where the border alone is more than the target allows, the border is thinned as well, and a
-    warning says so.
+    Where the border alone is more than the target allows, the border is thinned as well (but for `keep_border`),
+    and a warning says so.
     """
     from pipeline.types import Mesh
 
     mesh = Mesh.load(inputs["mesh"])
     small, warnings = simplify(mesh, params.target), []
     border_kept = True
-    if len(small) > params.target * 1.05:
+    if len(small) > params.target * 1.05 and params.keep_border:
+        warnings.append(f"the border alone needs {len(small):,} triangles, {params.target:,} were asked for: kept")
+    elif len(small) > params.target * 1.05:
         warnings.append(f"the border alone needs {len(small):,} triangles: thinned too, to {params.target:,}")
         small, border_kept = simplify(small, params.target, preserve_border=False), False
     small.save(out / "mesh.npz")

@@ -19,9 +19,14 @@ class GeometryParams(Params):
 
     Attributes:
         samples: points a class, drawn from the cloud and from the mesh.
+        seed: the tile's (x, y), world metres, where it meets others: the mesh ends at its cell's borders, so only
+            points within them count; set by the recipe.
+        neighbours: names of tiles whose cells touch to their seeds, world metres; set by the recipe.
     """
 
     samples: int = Field(200_000, ge=1000)
+    seed: tuple[float, float] | None = None
+    neighbours: dict[str, tuple[float, float]] = Field(default_factory=dict)
 
 
 def geometry(inputs: Inputs, params: GeometryParams, out: Path, report: Report) -> Done:
@@ -32,6 +37,7 @@ def geometry(inputs: Inputs, params: GeometryParams, out: Path, report: Report) 
     """
     import numpy as np
 
+    from pipeline.cells import Cell
     from pipeline.types import Mesh, PointCloud
 
     facts: dict[str, dict[str, Any]] = {}
@@ -41,7 +47,12 @@ def geometry(inputs: Inputs, params: GeometryParams, out: Path, report: Report) 
             continue
         report(i / len(GROUPS), group)
         mesh, cloud = Mesh.load(inputs[f"mesh.{group}"]), PointCloud.load(inputs[f"cloud.{group}"])
-        if len(mesh) == 0:
+        if params.seed is not None:
+            own = (
+                Cell(params.seed, params.neighbours).outside(cloud.xyz[:, :2] + np.asarray(cloud.frame.origin[:2])) <= 0
+            )
+            cloud = cloud.take(own)
+        if len(mesh) == 0 or len(cloud) == 0:
             continue
         points = cloud.xyz[:: max(1, len(cloud) // params.samples)]
         distance = distances(points, mesh)
@@ -104,4 +115,4 @@ def spread(mesh: Mesh, count: int, seed: int = 0) -> F32:
     return ((1 - u) * a + u * (1 - v) * b + u * v * c).astype(np.float32)
 
 
-GEOMETRY = Step("geometry", 1, geometry, GeometryParams)
+GEOMETRY = Step("geometry", 2, geometry, GeometryParams)

@@ -25,10 +25,15 @@ class PlantsParams(Params):
     Attributes:
         min_height: metres above the ground.
         min_distance: metres between two plants' tops.
+        seed: the tile's (x, y), world metres, where it meets others: plants beyond its cell are theirs; set by the
+            recipe.
+        neighbours: names of tiles whose cells touch to their seeds, world metres; set by the recipe.
     """
 
     min_height: float = Field(0.4, gt=0)
     min_distance: float = Field(1.5, gt=0)
+    seed: tuple[float, float] | None = None
+    neighbours: dict[str, tuple[float, float]] = Field(default_factory=dict)
 
 
 def plants(inputs: Inputs, params: PlantsParams, out: Path, report: Report) -> Done:
@@ -39,10 +44,14 @@ def plants(inputs: Inputs, params: PlantsParams, out: Path, report: Report) -> D
     """
     import numpy as np
 
+    from pipeline.cells import Cell
     from pipeline.types import PointCloud
 
     cloud, ground = PointCloud.load(inputs["vegetation"]), PointCloud.load(inputs["terrain"])
     found = crowns(cloud.xyz, ground.xyz, params) if len(cloud) else np.empty((0, 5))
+    if params.seed is not None:
+        cell = Cell(params.seed, params.neighbours)
+        found = found[cell.outside(found[:, :2] + np.asarray(cloud.frame.origin[:2])) <= 0]
     places = cloud.frame.to_crs(found[:, :3])
     rows = [
         {"x": round(x, 3), "y": round(y, 3), "z": round(z, 3), "height_m": round(h, 2), "crown_radius_m": round(r, 2)}
@@ -72,7 +81,7 @@ def crowns(xyz: F32, ground: F32, params: PlantsParams) -> npt.NDArray[np.float6
     from scipy import ndimage
     from scipy.spatial import cKDTree
 
-    low = xyz[:, :2].min(axis=0)
+    low = np.floor(xyz[:, :2].min(axis=0) / CELL) * CELL  # whole cells: neighbouring tiles find the same tops
     cell = ((xyz[:, :2] - low) / CELL).astype(int)
     canopy = np.full(cell.max(axis=0) + 1, -np.inf)
     np.maximum.at(canopy, (cell[:, 0], cell[:, 1]), xyz[:, 2])
@@ -114,4 +123,4 @@ def _geojson_crs(crs: str) -> dict[str, object] | None:
     return {"type": "name", "properties": {"name": f"urn:ogc:def:crs:EPSG::{code}"}} if code else None
 
 
-PLANTS = Step("plants", 1, plants, PlantsParams)
+PLANTS = Step("plants", 2, plants, PlantsParams)

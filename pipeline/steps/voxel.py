@@ -50,10 +50,16 @@ def voxel(inputs: Inputs, params: VoxelParams, out: Path, report: Report) -> Don
 
 
 def sample(cloud: PointCloud, size: float) -> PointCloud:
-    """One point a voxel of `size` metres: mean position, colour and intensity; class and time of one member."""
+    """One point a voxel of `size` metres: mean position and colour; class, intensity and time of one member.
+
+    Means are rounded to `pipeline.border.GRID`, so that tiles which know the same points around their border, in
+    the same order (`overlap`), have the same samples there.
+    """
     from dataclasses import replace
 
     import numpy as np
+
+    from pipeline.border import on_grid
 
     if len(cloud) == 0:
         return cloud
@@ -66,7 +72,7 @@ def sample(cloud: PointCloud, size: float) -> PointCloud:
         return total / counts[:, None]
 
     thin = cloud.take(first)
-    thin = replace(thin, xyz=mean(cloud.xyz).astype(np.float32), normal=None)
+    thin = replace(thin, xyz=on_grid(mean(cloud.xyz)).astype(np.float32), normal=None)
     if cloud.rgb is not None:
         thin = replace(thin, rgb=np.rint(mean(cloud.rgb)).astype(np.uint8))
     return thin
@@ -75,18 +81,24 @@ def sample(cloud: PointCloud, size: float) -> PointCloud:
 def voxel_groups(xyz: F32, size: float) -> tuple[np.ndarray, np.ndarray]:  # type: ignore[name-defined]  # noqa: F821
     """Points sorted by voxel, and where each voxel starts in that order.
 
+    Voxels lie around whole multiples of `size` (so that a level floor at a round height isn't split in two), and
+    tiles, whose origins are whole metres, have the same ones wherever a metre is a whole number of voxels.
+
     Returns:
         order (N,) int64 into `xyz`, stable within a voxel; starts (V,) int64 into `order`.
     """
     import numpy as np
 
-    cell = np.floor((xyz - xyz.min(axis=0)) / size).astype(np.int64)
-    span = cell.max(axis=0) + 1
-    code = (cell[:, 2] * span[1] + cell[:, 1]) * span[0] + cell[:, 0]
+    code = np.zeros(len(xyz), np.int64)
+    for column in (xyz[:, 2], xyz[:, 1], xyz[:, 0]):
+        # a little more than half: a place on the face of two voxels is in the same one, whatever the origin
+        cell = np.floor(column.astype(np.float64) / size + 0.5 + 1e-6).astype(np.int64)
+        cell -= cell.min()
+        code = code * (cell.max() + 1) + cell
     order = np.argsort(code, kind="stable")
     code = code[order]
     starts = np.flatnonzero(np.concatenate([[True], code[1:] != code[:-1]]))
     return order, starts
 
 
-VOXEL = Step("voxel", 1, voxel, VoxelParams)
+VOXEL = Step("voxel", 2, voxel, VoxelParams)

@@ -12,9 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from flows.execute import execute, locked, plan
+from flows.execute import execute, locked
+from flows.planning import plan
 from pipeline.errors import BusyError, DataError, StepError
-from pipeline.store import Manifest, Store
+from pipeline.store import Digests, Manifest, Store, digest
 from tests.conftest import ROOT
 from tests.flows.toy import chain
 
@@ -78,6 +79,36 @@ def test_touching_a_source_without_changing_it_reruns_nothing(run: Run, ran: Cal
     assert ran() == ""
 
 
+def test_what_comes_out_the_same_ends_the_need_to_redo(run: Run, ran: Callable[[], str], source: Path) -> None:
+    run()
+    ran()
+    source.write_text("1\n")  # other bytes, the same number
+    assert run()["d"].facts == {"total": 2}
+    assert ran() == "a"
+    run()
+    assert ran() == ""
+    run(force=True)
+    assert ran() == "abcd"
+
+
+def test_digests_are_remembered_until_a_file_changes(tmp_path: Path, source: Path) -> None:
+    file = tmp_path / "digests.json"
+    first = Digests(file)
+    told = first(source)
+    first.save()
+    assert Digests(file)(source) == told == digest(source)
+    source.write_text("2")
+    assert Digests(file)(source) == digest(source) != told
+
+
+def test_a_failure_is_noted_and_the_rest_goes_on(tmp_path: Path, source: Path, ran: Callable[[], str]) -> None:
+    store, failures = Store(tmp_path / "store"), {}
+    nodes = chain(source, tmp_path / "log", b={"does": "fail"})
+    done = execute(plan(nodes, store), store, jobs=1, watch=lambda *_: None, failures=failures)
+    assert set(done) == {"a", "c"} and set(failures) == {"b"}
+    assert ran() == "abc"
+
+
 def test_a_deleted_output_is_rebuilt_and_nothing_else(run: Run, ran: Callable[[], str], tmp_path: Path) -> None:
     run()
     ran()
@@ -131,7 +162,8 @@ def test_two_runs_do_not_share_a_folder(tmp_path: Path) -> None:
 
 def test_kill_9_leaves_nothing_half_made_and_no_process_behind(tmp_path: Path, source: Path, run: Run) -> None:
     script = (
-        "from pathlib import Path; from flows.execute import *; from tests.flows.toy import chain\n"
+        "from pathlib import Path; from flows.execute import *; from flows.planning import plan\n"
+        "from tests.flows.toy import chain\n"
         f"p = Path({str(tmp_path)!r}); s = Store(p / 'store')\n"
         "execute(plan(chain(p / 'source.txt', p / 'log', b={'does': 'hang'}), s), s, jobs=1, watch=lambda *_: None)\n"
     )

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flows.execute import Planned
+from flows.planning import Planned
 from flows.recipe import Node
 from flows.report import telling, write_report
 from pipeline.io import image
@@ -54,7 +54,7 @@ def report(tmp_path: Path) -> Any:
         for label, facts in {**FACTS, "score": scored}.items():
             folder = store.begin(label)
             files = {"error": album(folder, list(scored["photos"]))} if label == "score" else {}
-            about = {"version": 1, "params": {}, "inputs": {}, "seconds": 1.0, "peak_mb": 100.0}
+            about = {"version": 1, "params": {}, "inputs": {}, "fed": "", "seconds": 1.0, "peak_mb": 100.0}
             done[label] = store.commit(label, "key", folder, Done(files, facts), about)
             planned.append(Planned(Node(label, Step(label, 1, no_step), Params(), {}), "key", {}, None))
         tile = Tile(tmp_path / "tile.toml", "made_up", Frame(), ())

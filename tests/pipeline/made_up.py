@@ -74,7 +74,7 @@ def textured(folder: Path, mesh: Mesh) -> Path:
     return folder
 
 
-def world(folder: Path, frame: Frame = UTM, **params: object) -> Done:
+def world(folder: Path, frame: Frame = UTM, name: str = "street", **params: object) -> Done:
     """The made-up tile, collision made and exported below `folder`."""
     meshes = {"terrain": ground(frame=frame), "building": house(frame)}
     inputs = {group: textured(folder / group, mesh) for group, mesh in meshes.items()}
@@ -84,7 +84,7 @@ def world(folder: Path, frame: Frame = UTM, **params: object) -> Done:
     made = COLLISION.run(sources, CollisionParams(triangles=1000), solid, silent)
     out = folder / "export"
     out.mkdir()
-    return EXPORT.run({**inputs, "collision": made.files["mesh"]}, ExportParams(name="street", **params), out, silent)
+    return EXPORT.run({**inputs, "collision": made.files["mesh"]}, ExportParams(name=name, **params), out, silent)
 
 
 def by_page(mesh: Mesh) -> dict[int, tuple[np.ndarray, np.ndarray]]:

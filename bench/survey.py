@@ -1,0 +1,181 @@
+"""A kilometre in ten tiles: workers, rerun, borders, and what Prefect costs.
+
+`python -m bench.survey [--out bench-out/survey] [--parts one two ray plain rerun photo]`. The synthetic street is
+generated and cut once; every part runs the same survey into a folder of its own, each step on one core, so that two
+workers are two cores and one is one. Parts that aren't asked for are read from their last run's notes. Ends with
+`RESULT {json}`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import shutil
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bench.measure import measure
+from data_samples.photos import Effects
+from data_samples.street import generate
+from flows.cut import Options, cut_survey
+
+ROOT = Path(__file__).resolve().parent.parent
+PARTS = ("plain", "one", "two", "ray", "rerun", "photo")
+LENGTH, POINTS, PHOTOS, WIDTH, SEED = 1000.0, 1.0e7, 200, 800, 3
+RUNS = {  # part: options of `scan2sim survey`
+    "plain": ("--runner", "processes", "--jobs", "1"),
+    "one": ("--runner", "dask", "--jobs", "1"),
+    "two": ("--runner", "dask", "--jobs", "2"),
+    "ray": ("--runner", "ray", "--jobs", "2"),
+}
+EMPTY = """
+import flows.prefect_settings
+from prefect import flow
+from flows.survey import task_runner
+flow(lambda: None, name="empty", task_runner=task_runner("dask", 2))()
+"""
+
+
+def main() -> None:
+    """Run the parts and print their figures."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=ROOT / "bench-out" / "survey")
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
+    arguments = parser.parse_args()
+    out: Path = arguments.out
+    survey = street(out)
+    notes = out / "notes.json"
+    known: dict[str, dict[str, Any]] = json.loads(notes.read_text()) if notes.is_file() else {}
+    for part in (name for name in PARTS if name in arguments.parts):
+        if part in RUNS:
+            known[part] = whole(survey, out / part, RUNS[part])
+        elif part == "rerun":
+            known[part] = rerun(survey, out / "two")
+        else:
+            known[part] = photo(survey, out)
+        print(part, json.dumps(known[part]), flush=True)
+        notes.write_text(json.dumps(known, indent=1))
+    told(known, out)
+
+
+def street(out: Path) -> Path:
+    """The kilometre, generated and cut if it isn't there; path of its survey."""
+    corridor, survey = out / "street", out / "tiles"
+    if not (corridor / "tile.toml").is_file():
+        generate(
+            corridor, length=LENGTH, points=POINTS, photos=PHOTOS, seed=SEED, photo_width=WIDTH, truth_density=20.0,
+            effects=Effects(quality=90),
+        )  # fmt: skip
+    if not (survey / "survey.toml").is_file():
+        began = time.perf_counter()
+        cut_survey(corridor, survey, Options(length=100.0, buffer=5.0))
+        print(f"cut: {time.perf_counter() - began:.1f} s")
+    return survey
+
+
+def command(survey: Path, out: Path, options: tuple[str, ...]) -> list[str]:
+    """The command that runs a survey, a core a step."""
+    scan2sim = str(Path(sys.executable).parent / "scan2sim")
+    return [scan2sim, "survey", str(survey), "--out", str(out), "--cores", "1", *options]
+
+
+def whole(survey: Path, out: Path, options: tuple[str, ...]) -> dict[str, Any]:
+    """Run all tiles from nothing."""
+    shutil.rmtree(out, ignore_errors=True)
+    ran = measure(command(survey, out, options))
+    if ran.status != 0:
+        sys.exit(f"{' '.join(options)}: exit status {ran.status}")
+    body = json.loads((out / "survey.json").read_text())
+    figures = [tile["figures"] for tile in body["tiles"].values()]
+    return {
+        "seconds": round(ran.seconds, 1),
+        "peak_gb": round(ran.peak_gb, 2),
+        "step_seconds": round(sum(f["seconds"] for f in figures), 1),
+        "largest_step_gb": round(max(f["peak_mb"] for f in figures) / 1000, 2),
+        "gb_written": round(sum(f["bytes_written"] for f in figures) / 1e9, 2),
+        "gb_worlds": round(sum(f["bytes"] for f in figures) / 1e9, 2),
+        "contents": hashlib.sha256(json.dumps(contents(out), sort_keys=True).encode()).hexdigest()[:16],
+    }
+
+
+def rerun(survey: Path, out: Path) -> dict[str, Any]:
+    """Run an unchanged survey again, and a flow that does nothing."""
+    empty = measure([sys.executable, "-c", EMPTY])
+    again = measure(command(survey, out, RUNS["two"]))
+    return {"seconds": round(again.seconds, 1), "empty_flow_seconds": round(empty.seconds, 1)}
+
+
+def photo(survey: Path, out: Path) -> dict[str, Any]:
+    """Change one photo in the middle of the street, and see what is made anew."""
+    place = out / "street" / "photos"
+    changed = sorted(place.glob("*.jpg"))[len(list(place.glob("*.jpg"))) // 2]
+    seen = [path.parent.name for path in survey.glob("*/tile.toml") if changed.name in path.read_text()]
+    before, original, stat = contents(out / "two"), changed.read_bytes(), changed.stat()
+    try:
+        import cv2
+
+        picture = cv2.imread(str(changed))
+        picture[: picture.shape[0] // 3] //= 2
+        cv2.imwrite(str(changed), picture)
+        ran = measure(command(survey, out / "two", RUNS["two"]))
+        after = contents(out / "two")
+    finally:
+        changed.write_bytes(original)
+        os.utime(changed, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+    anew = sorted({label for label, content in after.items() if before.get(label) != content})
+    made = json.loads((out / "two" / "survey.json").read_text())["tiles"]
+    return {
+        "seconds": round(ran.seconds, 1),
+        "tiles_that_see_it": sorted(seen),
+        "tiles_made": sorted(name for name, tile in made.items() if tile["state"] == "done"),
+        "results_changed": len(anew),
+        "results": len(after),
+    }
+
+
+def contents(out: Path) -> dict[str, str]:
+    """Digests of all results of a run, by tile and step."""
+    manifests = [json.loads(path.read_text()) for path in (out / "steps").glob("*/*/*/manifest.json")]
+    return {manifest["label"]: manifest["content"] for manifest in manifests}
+
+
+def borders(out: Path) -> dict[str, float]:
+    """The widest gap, the mean colour step, and lengths, over all borders."""
+    body = json.loads((out / "survey.json").read_text())["borders"]
+    length = np.array([b["length_m"] for b in body])
+    return {
+        "border_gap_m": max(b["gap_m"] for b in body),
+        "border_colour_step": round(float(np.average([b["colour_step"] for b in body], weights=length)), 3),
+        "border_one_sided": round(float(sum(b["one_sided_m"] for b in body) / length.sum() / 2), 4),
+        "border_shared": round(float(np.average([b["shared"] for b in body], weights=length)), 4),
+    }
+
+
+def told(known: dict[str, dict[str, Any]], out: Path) -> None:
+    """Print the table and RESULT."""
+    for part, values in known.items():
+        print(f"{part:<8}", " ".join(f"{name} {value}" for name, value in values.items()))
+    result: dict[str, Any] = {}
+    if {"one", "two"} <= known.keys():
+        result["speedup_two_workers"] = round(known["one"]["seconds"] / known["two"]["seconds"], 2)
+        result["same_bytes"] = known["one"]["contents"] == known["two"]["contents"]
+    if {"one", "ray"} <= known.keys():
+        result["speedup_ray"] = round(known["one"]["seconds"] / known["ray"]["seconds"], 2)
+        result["same_bytes_ray"] = known["one"]["contents"] == known["ray"]["contents"]
+    if "rerun" in known:
+        result["rerun_seconds"] = round(known["rerun"]["seconds"] - known["rerun"]["empty_flow_seconds"], 1)
+    if "two" in known:
+        result |= borders(out / "two")
+    if {"one", "plain"} <= known.keys():
+        result["prefect_overhead"] = round(known["one"]["seconds"] / known["plain"]["seconds"] - 1, 3)
+    print("RESULT " + json.dumps(result))
+
+
+if __name__ == "__main__":
+    main()

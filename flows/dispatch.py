@@ -1,0 +1,113 @@
+"""A plan handed step by step to whatever runs elsewhere (a cluster, say), and how far its tiles are."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from queue import SimpleQueue
+from typing import Any, Protocol
+
+from flows.execute import Frontier
+from flows.planning import Planned
+from pipeline.errors import ScanError, StepError
+from pipeline.store import Manifest, Store
+
+PERIOD = 1.0  # seconds between two looks; what shows it may cost a tenth of one
+
+
+class Future(Protocol):
+    """Of a step that runs elsewhere (Prefect's futures are such)."""
+
+    def add_done_callback(self, fn: Callable[[Any], None]) -> None:
+        """Have `fn` called once the step has ended."""
+
+    def result(self, *, raise_on_failure: bool) -> Any:
+        """What the step returned, or its exception."""
+
+
+def dispatch(
+    planned: Sequence[Planned],
+    store: Store,
+    failures: dict[str, ScanError],
+    submit: Callable[[Planned], Future],
+    at_once: int,
+    show: Callable[[str, float], None],
+) -> dict[str, Manifest]:
+    """Submit what a plan says is missing as soon as what it reads is there; an `execute.Executor` but for the rest.
+
+    Steps are submitted when they can run, not before: those that wait would take the places of those that could.
+
+    Args:
+        submit: has a step run, which leaves its result in the store.
+        at_once: steps are submitted and not yet ended at a time.
+        show: told a tile's name and how many percent of its steps are done, once a second at most.
+    """
+    board = Board(planned, show)
+    front = Frontier(planned, store, lambda node, *_: board.end(node.label))
+    running: dict[str, tuple[Planned, Future]] = {}
+    ended: SimpleQueue[str] = SimpleQueue()
+    while front or running:
+        for item in front.ready():
+            if len(running) >= at_once:
+                break
+            label = item.node.label
+            front.take(label)
+            running[label] = (item, submit(item))
+            running[label][1].add_done_callback(partial(_tell, ended, label))
+        if running:
+            label = ended.get()
+            item, future = running.pop(label)
+            outcome = future.result(raise_on_failure=False)
+            manifest = None if isinstance(outcome, BaseException) else store.find(label, item.key)
+            if manifest is not None:
+                front.done[label] = manifest
+            else:
+                cause = f"its worker failed ({type(outcome).__name__}: {outcome})"
+                lost = StepError(label, cause, "Run again: what is finished is kept; the worker's log tells more")
+                failures[label] = outcome if isinstance(outcome, ScanError) else lost
+                front.fail(label)
+            board.end(label)
+    board.flush()
+    return front.done
+
+
+def _tell(ended: SimpleQueue[str], label: str, _: object) -> None:
+    ended.put(label)
+
+
+class Board:
+    """Counts each tile's steps as they end.
+
+    Args:
+        planned: of one tile or several.
+        show: told a tile's name and how many percent of its steps are done.
+    """
+
+    def __init__(self, planned: Sequence[Planned], show: Callable[[str, float], None]) -> None:
+        self._show = show
+        self._left: dict[str, set[str]] = {}
+        for item in planned:
+            self._left.setdefault(self._tile(item.node.label), set()).add(item.node.label)
+        self._steps = {name: len(labels) for name, labels in self._left.items()}
+        self._changed: set[str] = set()
+        self._next = 0.0
+
+    def end(self, label: str) -> None:
+        """A step has ended."""
+        name = self._tile(label)
+        self._left[name].discard(label)
+        self._changed.add(name)
+        if time.monotonic() >= self._next:
+            self.flush()
+
+    def flush(self) -> None:
+        """Show what has changed."""
+        for name in sorted(self._changed):
+            self._show(name, 100.0 * (1 - len(self._left[name]) / self._steps[name]))
+        self._changed.clear()
+        self._next = time.monotonic() + PERIOD
+
+    @staticmethod
+    def _tile(label: str) -> str:
+        return label.rpartition("/")[0] or "tile"

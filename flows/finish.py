@@ -1,0 +1,167 @@
+"""What is made of a survey's tiles once they are done: their pages, one world, a catalogue, one report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flows.planning import Planned
+from flows.publish import publish
+from flows.report import figures, write_report
+from flows.settings import Settings
+from flows.survey_report import TileState, write_survey_report
+from pipeline.cells import outline
+from pipeline.errors import ScanError
+from pipeline.io import clouds, stac, worlds
+from pipeline.io.survey import Survey
+from pipeline.store import Digests, Manifest, Store
+from pipeline.types import Tile
+
+TILES = "tiles"
+SHOWN = {"export", "exposure", "pictures", "score"}
+"""Steps whose files, not just figures, are shown."""
+
+
+@dataclass(frozen=True)
+class Made:
+    """A tile of a survey after a run.
+
+    Attributes:
+        tile: None if it can't be read.
+        planned, done: its nodes and results, by their names within the tile.
+        error: why it failed, or None.
+    """
+
+    name: str
+    tile: Tile | None
+    planned: Sequence[Planned] = ()
+    done: Mapping[str, Manifest] | None = None
+    error: ScanError | None = None
+
+    @property
+    def kept(self) -> bool:
+        """Whether nothing of it had to be run."""
+        return all(item.reason is None for item in self.planned)
+
+
+def finish(survey: Survey, made: Sequence[Made], store: Store, out: Path, settings: Settings, digests: Digests) -> Path:
+    """Write all that users look at below `out`; returns the survey's page.
+
+    Raises:
+        ScanError: see `pipeline.errors`; what was there stays.
+    """
+    whole = [one for one in made if one.done is not None]
+    for one in whole:
+        _finish_tile(one, store.within(one.name), out / TILES / one.name, settings)
+    if whole:
+        _together(survey, whole, out, digests)
+    return write_survey_report(out, survey.name, [_state(one) for one in made])
+
+
+def _finish_tile(one: Made, store: Store, out: Path, settings: Settings) -> None:
+    """A tile's folder, as `scan2sim run` leaves it; what is no longer of use is removed from the store."""
+    assert one.tile is not None and one.done is not None
+    planned, done = list(one.planned), dict(one.done)
+    keys = {item.node.label: item.key for item in planned}
+    out.mkdir(parents=True, exist_ok=True)
+    if not (one.kept and (out / "report.json").is_file() and (out / "world").is_dir()):
+        for label in SHOWN & keys.keys():
+            store.read(label, keys[label])
+        publish(store, planned, done, out, one.tile, settings)
+        seconds = sum(done[item.node.label].seconds for item in planned if item.reason is not None)
+        write_report(one.tile, planned, done, store, out, seconds=seconds)
+    store.sweep(keys)
+
+
+def _together(survey: Survey, whole: Sequence[Made], out: Path, digests: Digests) -> None:
+    """The world of all tiles, the STAC catalogue and the virtual point cloud."""
+    tiles, items = [], []
+    for one in whole:
+        assert one.tile is not None
+        place = out / TILES / one.name
+        tiles.append(worlds.TileWorld(one.name, place / "world", one.tile.frame))
+        sources = tuple(stac.Cloud(path, clouds.read_header(path), digests(path)) for path in one.tile.clouds)
+        times = one.tile.trajectory.times if one.tile.trajectory is not None else None
+        scanned = datetime.fromtimestamp(max(path.stat().st_mtime for path in one.tile.clouds), UTC)
+        items.append(
+            stac.TileItem(
+                one.name, one.tile.frame, sources, scanned,
+                None if times is None or not np.isfinite(times).all() else (float(times[0]), float(times[-1])),
+                _there(place / "world" / f"{one.name}.sdf"), _there(place / "world" / f"{one.name}.glb"),
+                _there(place / "report.html"),
+            )
+        )  # fmt: skip
+    worlds.assemble(out, survey.name, tiles)
+    stac.write(out, survey.name, f"{len(tiles)} tiles of {survey.name}, made by scan2sim", items)
+    stac.write_vpc(out / f"{survey.name}.vpc", items)
+
+
+def _there(path: Path) -> Path | None:
+    return path if path.is_file() else None
+
+
+def _state(one: Made) -> TileState:
+    """What the survey's page tells of a tile."""
+    cell = one.tile.cell if one.tile else None
+    ring = np.zeros((0, 2)) if one.tile is None or cell is None else outline(cell, *_bounds(one.tile))
+    done = one.done or {}
+    return TileState(
+        name=one.name,
+        outline=ring,
+        state="failed" if one.error else ("kept" if one.kept else "done"),
+        reason=str(one.error) if one.error else None,
+        figures=_figures(one.tile, done) if one.tile and done else {},
+        report=f"{TILES}/{one.name}/report.html" if done else None,
+        warnings=[f"{label}: {text}" for label, manifest in done.items() for text in manifest.warnings],
+        borders=_borders(done),
+    )
+
+
+def _bounds(tile: Tile) -> tuple[np.ndarray, np.ndarray]:
+    """Low and high corner (2,) of a tile's clouds, world metres."""
+    headers = [clouds.read_header(path) for path in tile.clouds]
+    low, high = np.min([h.low for h in headers], axis=0), np.max([h.high for h in headers], axis=0)
+    return low[:2] * tile.frame.unit, high[:2] * tile.frame.unit
+
+
+def _figures(tile: Tile, done: Mapping[str, Manifest]) -> dict[str, Any]:
+    """The figures of a tile that surveys are compared by."""
+    body = figures(tile, done)
+    return {
+        "seconds": body["seconds"],
+        "peak_mb": body["peak_mb"],
+        "points": done["ingest"].facts["points"],
+        "photos": len(tile.views),
+        "coverage": body["texture"]["coverage"],
+        "psnr_db": body["texture"].get("psnr_db"),
+        "cloud_to_mesh_m": body["geometry"].get("cloud_to_mesh_mean_m", {}),
+        "triangles": sum(body["world"]["triangles"].values()),
+        "bytes": body["world"]["bytes"],
+        "bytes_written": sum(sum(manifest.sizes.values()) for manifest in done.values()),
+    }
+
+
+def _borders(done: Mapping[str, Manifest]) -> list[dict[str, Any]]:
+    """A tile's borders with the neighbours before it: over all classes, the widest gap and the mean colour step."""
+    found = done["borders"].facts["neighbours"] if "borders" in done else {}
+    rows = []
+    for name, classes in found.items():
+        values = list(classes.values())
+        length = sum(v["length_m"] for v in values)
+        rows.append(
+            {
+                "neighbour": name,
+                "length_m": round(length, 2),
+                "gap_m": max(v["gap_m"] for v in values),
+                "one_sided_m": round(sum(v["one_sided_m"] for v in values), 2),
+                "shared": round(sum(v["shared"] * v["length_m"] for v in values) / max(length, 1e-9), 4),
+                "overlap_m": max(v["overlap_m"] for v in values),
+                "colour_step": round(sum(v["colour_step"] * v["length_m"] for v in values) / max(length, 1e-9), 3),
+            }
+        )
+    return rows

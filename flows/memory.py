@@ -1,0 +1,111 @@
+"""How much memory a step needs, and a machine's memory shared out among the steps that run on it."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import re
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pipeline.errors import SettingError, from_os_error
+
+if TYPE_CHECKING:
+    from flows.planning import Planned
+    from pipeline.store import Store
+
+SLOT = 0.25  # GB; memory is shared out in pieces of it
+PAUSE = 0.2  # seconds between looks for free memory
+NEEDS: dict[str, tuple[float, float]] = {
+    "ingest": (0.4, 12),
+    "label": (1.5, 3),
+    "segment": (0.5, 6),
+    "poisson": (0.4, 70),
+    "trim": (0.4, 12),
+    "decimate": (0.4, 30),
+    "unwrap": (0.5, 10),
+    "visibility": (0.7, 3),
+    "texture": (1.2, 3),
+    "level": (1.0, 3),
+    "pictures": (1.3, 3),
+    "score": (1.3, 3),
+}
+"""Of a step: GB at least, and GB for every GB that it reads; measured on generated streets (docs/scale.md)."""
+OTHERS = (0.5, 6)
+PHOTO = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
+
+
+def need(item: Planned, store: Store) -> float:
+    """GB that a node is expected to need at its peak, from the sizes of what it reads."""
+    least, share = NEEDS.get(item.node.step.name, OTHERS)
+    # photos are read one after the other, and are no matter of the whole
+    sizes = [_size(path) for path in item.inputs(store).values() if path.suffix.lower() not in PHOTO]
+    return least + share * sum(sizes) / 1e9
+
+
+def _size(path: Path) -> int:
+    if path.is_dir():
+        return 0  # depth maps, pages: one at a time
+    return path.stat().st_size if path.exists() else 0
+
+
+def parse(text: str | None) -> float | None:
+    """GB of "20GB", "800 MB" or "20"; None of None.
+
+    Raises:
+        SettingError: it is none.
+    """
+    if text is None:
+        return None
+    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*(GB|G|MB|M)?\s*", text, re.IGNORECASE)
+    size = float(match[1]) * (1e-3 if (match[2] or "G").upper().startswith("M") else 1) if match else 0.0
+    if size <= 0:
+        raise SettingError("--memory", f"`{text}` is no amount of memory", "Write 20GB, or 800MB")
+    return size
+
+
+@contextmanager
+def share(total: float | None, gigabytes: float) -> Iterator[None]:
+    """Hold `gigabytes` of the `total` that steps on this machine may take together; waits until so much is free.
+
+    All processes of a user that declare a total take from the same memory, whichever survey or runner they belong
+    to. What a killed process held is free at once: the kernel lets go of its locks. One that needs more than the
+    total runs alone.
+    """
+    if total is None:
+        yield
+        return
+    slots = max(1, int(total / SLOT))
+    wanted = min(slots, max(1, round(gigabytes / SLOT)))
+    folder = Path(tempfile.gettempdir()) / f"scan2sim-memory-{os.getuid()}"
+    with ExitStack() as held:
+        try:
+            folder.mkdir(exist_ok=True)
+            with open(folder / "queue", "w") as queue:  # held while waiting: nobody small overtakes
+                fcntl.flock(queue, fcntl.LOCK_EX)
+                while not _taken(folder, slots, wanted, held):
+                    time.sleep(PAUSE)
+        except OSError as error:
+            raise from_os_error(error, folder) from error
+        yield
+
+
+def _taken(folder: Path, slots: int, wanted: int, held: ExitStack) -> bool:
+    """Try to lock `wanted` slots, all or none."""
+    with ExitStack() as stack:
+        count = 0
+        for i in range(slots):
+            file = stack.enter_context(open(folder / f"{i:05d}", "w"))
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                count += 1
+            except BlockingIOError:
+                file.close()
+            if count == wanted:
+                held.enter_context(stack.pop_all())
+                return True
+    return False

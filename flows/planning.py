@@ -1,0 +1,130 @@
+"""What of a recipe would run, and why: keys of all results, and which of them are there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from flows.recipe import Node, Output
+from pipeline.errors import StepError
+from pipeline.store import Manifest, Store, digest, key_of
+
+AGAIN = ("forced", "asked", "follows")
+"""How reasons begin by which a node runs though its result is there."""
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A node with its key, and why it will run (None: its result is kept).
+
+    Attributes:
+        keys: input name to the key (of a node's output) or digest (of a file).
+    """
+
+    node: Node
+    key: str
+    keys: dict[str, str]
+    reason: str | None
+
+    @property
+    def again(self) -> bool:
+        """Whether it is to run though its result may be there."""
+        return (self.reason or "").startswith(AGAIN)
+
+    @property
+    def upstream(self) -> list[str]:
+        """Labels of the nodes whose outputs it reads."""
+        return [source.node for source in self.node.inputs.values() if isinstance(source, Output)]
+
+    def fed(self, store: Store) -> str:
+        """The key by contents: of what it reads, whatever made it.
+
+        Raises:
+            StepError: a result that it reads is gone.
+        """
+        contents = dict(self.keys)
+        for name, source in self.node.inputs.items():
+            if isinstance(source, Output):
+                manifest = self._found(store.find(source.node, self._key(name)), source)
+                contents[name] = f"{manifest.content}/{source.name}"
+        return key_of(self.node.step, self.node.params, contents)
+
+    def kept(self, store: Store) -> Manifest | None:
+        """Its result if there is one: made before, or made of the same contents; None if it is to run."""
+        if self.again:
+            return None
+        label = self.node.label
+        return store.find(label, self.key) or store.adopt(label, self.key, self.fed(store), self.keys)
+
+    def inputs(self, store: Store) -> dict[str, Path]:
+        """Where the files are that it reads.
+
+        Raises:
+            StepError: a result that it reads is gone.
+        """
+        paths = {}
+        for name, source in self.node.inputs.items():
+            if isinstance(source, Output):
+                manifest = self._found(store.read(source.node, self._key(name)), source)
+                paths[name] = store.folder(source.node, self._key(name)) / manifest.files[source.name]
+            else:
+                paths[name] = store.source(source)
+        return paths
+
+    def _key(self, name: str) -> str:
+        return self.keys[name].split("/")[0]
+
+    def _found(self, manifest: Manifest | None, source: Output) -> Manifest:
+        if manifest is None:
+            raise StepError(source.node, "its result has gone in the meantime", "Run again: it is rebuilt")
+        return manifest
+
+
+def plan(
+    nodes: Sequence[Node],
+    store: Store,
+    *,
+    force: bool = False,
+    start: str | None = None,
+    digest: Callable[[Path], str] = digest,
+) -> list[Planned]:
+    """What would run and why, in order.
+
+    Args:
+        force: everything runs again.
+        digest: of a source file.
+        start: the name of a step that runs again, with all that depends on it.
+    """
+    planned: dict[str, Planned] = {}
+    digests: dict[Path, str] = {}
+    for node in nodes:
+        keys = {}
+        for name, source in sorted(node.inputs.items()):
+            if isinstance(source, Output):
+                keys[name] = f"{planned[source.node].key}/{source.name}"
+            else:
+                if source not in digests:
+                    digests[source] = digest(source)
+                keys[name] = digests[source]
+        key = key_of(node.step, node.params, keys)
+        reason = _reason(node, key, store)
+        if force:
+            reason = "forced"
+        elif start is not None and node.step.name == start:
+            reason = f"asked for by --from {start}"
+        elif start is not None:
+            upstream = [s.node for s in node.inputs.values() if isinstance(s, Output)]
+            again = [name for name in upstream if planned[name].again]
+            reason = f"follows {again[0]}" if again else reason
+        planned[node.label] = Planned(node, key, keys, reason)
+    return list(planned.values())
+
+
+def _reason(node: Node, key: str, store: Store) -> str | None:
+    if store.find(node.label, key) is not None:
+        return None
+    if store.folder(node.label, key).exists():
+        return "its result was damaged or deleted"
+    others = [p for p in (store.root / node.label).glob("*") if not p.name.startswith(".")]
+    return "its input, settings or version changed" if others else "it was never run"

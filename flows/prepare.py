@@ -1,0 +1,245 @@
+"""What comes before a survey's tiles: SLAM where it is asked for, import, and the cut; each redone if it must be.
+
+A drive is what a vehicle brought home, in a `drive.toml`:
+
+```toml
+[slam]                      # where GPS is poor: the camera's path from its video
+video = "drive.mp4"
+gps = "gps.csv"             # optional, like all but the video: mask, camera, focal, centre, offset
+[sweeps]                    # the scanner's sweeps, placed by that path (or by `poses`, a trajectory file)
+folder = "velodyne"
+extrinsics = "calib.txt"
+photos = "image_02"
+crs = "EPSG:32633"
+[tiles]
+length = 100.0
+buffer = 5.0
+```
+With `corridor = "tile.toml"` instead of sweeps, what is there already is cut.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from flows.execute import locked
+from pipeline.errors import InputError, from_os_error
+from pipeline.io.remote import is_remote, likeness
+from pipeline.step import Report, silent
+from pipeline.store import Digests
+
+Say = Callable[[str], None]
+PREPARED = "prepared"
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class SlamEntry(_Strict):
+    """What SLAM is given; as the options of `scan2sim slam`."""
+
+    video: Path
+    gps: Path | None = None
+    gps_offset: float | None = None
+    mask: Path | None = None
+    camera: str = "auto"
+    focal: float | None = None
+    centre: tuple[float, float] | None = None
+    fps: float = 10.0
+
+
+class SweepsEntry(_Strict):
+    """What is imported; as the options of `scan2sim import sweeps`."""
+
+    folder: Path
+    poses: Path | None = None
+    extrinsics: Path | None = None
+    times: Path | None = None
+    photos: Path | None = None
+    photo_times: Path | None = None
+    camera: str = "auto"
+    focal: float | None = None
+    centre: tuple[float, float] | None = None
+    max_range: float = 50.0
+    voxel: float | None = None
+    crs: str = "local"
+
+
+class TilesEntry(_Strict):
+    """How the corridor is cut; as the options of `scan2sim tile`."""
+
+    length: float = Field(100.0, gt=0)
+    buffer: float = Field(5.0, ge=0)
+
+
+class Drive(_Strict):
+    """All of `drive.toml`."""
+
+    corridor: Path | None = None
+    slam: SlamEntry | None = None
+    sweeps: SweepsEntry | None = None
+    tiles: TilesEntry = TilesEntry.model_validate({})
+
+
+def survey_of(
+    place: str | Path,
+    target: str | Path,
+    *,
+    tiles: TilesEntry | None = None,
+    say: Say = print,
+    report: Report = silent,
+) -> str:
+    """The `survey.toml` of a source: a survey itself, a corridor (`tile.toml`), or a drive (`drive.toml`).
+
+    What has to be made of it is kept in the target, and made again only where what it is made of has changed.
+
+    Args:
+        place: a file, or a folder that holds one; in object storage a survey's folder.
+        target: gets `prepared/` with `slam/`, `corridor/` and `survey/`, as needed.
+        tiles: how it is cut, if not as the drive says.
+        say: told what was warned of.
+
+    Raises:
+        InputError: it is none of these, or says something impossible.
+        ScanError: as SLAM, import and cut.
+    """
+    if is_remote(place):
+        return str(place)
+    source, out = Path(place), likeness(target)
+    names = ("survey.toml", "drive.toml", "tile.toml")
+    if source.is_dir():
+        source = next((source / name for name in names if (source / name).is_file()), source)
+    if not source.is_file():
+        raise InputError(source, "there is no survey here", f"Name one of {', '.join(names)}, or a folder that has it")
+    if source.name == "survey.toml":
+        return str(source)
+    with locked(out / PREPARED):
+        digests = Digests(out / PREPARED / "digests.json")
+        once = _Once(digests)
+        corridor = source
+        if source.name == "drive.toml":
+            drive = read_drive(source)
+            tiles = tiles or drive.tiles
+            corridor = _corridor(drive, source, out / PREPARED, once, say, report)
+        survey = _cut(corridor, out / PREPARED / "survey", tiles or TilesEntry.model_validate({}), once, say, report)
+        digests.save()
+    return str(survey)
+
+
+def read_drive(path: Path) -> Drive:
+    """Read and check a `drive.toml`; its files are relative to it.
+
+    Raises:
+        InputError: naming the field.
+    """
+    try:
+        drive = Drive.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InputError(path, f"can't be read as TOML ({error})", "Mend the line that the message names") from None
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise InputError(path, f"field `{where}`: {first['msg']}", "docs/scale.md lists the fields") from None
+    if (drive.corridor is None) == (drive.sweeps is None):
+        raise InputError(path, "says neither or both of `corridor` and `[sweeps]`", "Give one: what is to be cut")
+    if drive.sweeps and not (drive.sweeps.poses or drive.slam):
+        raise InputError(path, "has sweeps, but nothing that places them", "Give sweeps.poses, or [slam]")
+    return drive
+
+
+class _Once:
+    """Makes what isn't there, or was made of something else."""
+
+    def __init__(self, digests: Digests) -> None:
+        self._digests = digests
+
+    def __call__(self, folder: Path, sources: list[Path], options: Any, make: Callable[[], None]) -> None:
+        """Make `folder`, unless it was made of the same sources with the same options."""
+        contents = {str(path): self._digests(path) for path in sources}
+        key = hashlib.sha256(json.dumps([contents, options], sort_keys=True, default=str).encode()).hexdigest()
+        stamp = folder.with_name(f"{folder.name}.made")
+        if folder.is_dir() and stamp.is_file() and stamp.read_text() == key:
+            return
+        make()
+        try:
+            stamp.write_text(key)
+        except OSError as error:
+            raise from_os_error(error, stamp) from None
+
+
+def _corridor(drive: Drive, source: Path, out: Path, once: _Once, say: Say, report: Report) -> Path:
+    """The corridor's `tile.toml`, by SLAM and import if need be."""
+    here = source.parent
+    if drive.corridor is not None:
+        corridor = here / drive.corridor
+        return corridor / "tile.toml" if corridor.is_dir() else corridor
+    poses = None
+    if drive.slam is not None:
+        poses = _slam(drive.slam, here, out / "slam", once)
+    assert drive.sweeps is not None
+    return _sweeps(drive.sweeps, here, poses, out / "corridor", once, say, report)
+
+
+def _slam(entry: SlamEntry, here: Path, out: Path, once: _Once) -> Path:
+    from flows.settings import Settings
+    from flows.slam import Options, slam_video
+
+    options = Options(
+        gps=entry.gps and here / entry.gps, gps_offset=entry.gps_offset, mask=entry.mask and here / entry.mask,
+        camera=entry.camera, focal=entry.focal, centre=entry.centre, fps=entry.fps,
+    )  # fmt: skip
+    sources = [here / path for path in (entry.video, entry.gps, entry.mask) if path is not None]
+
+    def make() -> None:
+        slam_video(sources[0], out, options, Settings())
+
+    once(out, sources, entry.model_dump(), make)
+    return out / "trajectory.csv"
+
+
+def _sweeps(
+    entry: SweepsEntry, here: Path, poses: Path | None, out: Path, once: _Once, say: Say, report: Report
+) -> Path:
+    from pipeline.io import sweeps as io
+
+    place = poses or here / (entry.poses or "")
+    files = sorted((here / entry.folder).glob("*")) + sorted((here / entry.photos).glob("*") if entry.photos else [])
+    rest = [here / path for path in (entry.extrinsics, entry.times, entry.photo_times) if path is not None]
+
+    def make() -> None:
+        pictures = None
+        if entry.photos is not None:
+            file = here / entry.camera if entry.camera.endswith(".toml") else None
+            model = "auto" if file else entry.camera
+            shape = io.camera_of_photos(
+                here / entry.photos, model=model, focal=entry.focal, centre=entry.centre, file=file
+            )
+            pictures = io.Pictures(here / entry.photos, shape, entry.photo_times and here / entry.photo_times)
+        io.import_sweeps(
+            here / entry.folder, place, out, photos=pictures, times=entry.times and here / entry.times,
+            extrinsics=io.read_extrinsics(here / entry.extrinsics) if entry.extrinsics else None,
+            max_range=entry.max_range, voxel=entry.voxel, crs=entry.crs, link=True, overwrite=True, warn=say,
+            report=report,
+        )  # fmt: skip
+
+    once(out, [place, *files, *rest], entry.model_dump(), make)
+    return out / "tile.toml"
+
+
+def _cut(corridor: Path, out: Path, entry: TilesEntry, once: _Once, say: Say, report: Report) -> Path:
+    from flows.cut import Options, cut_survey
+    from pipeline.io.tile import sources_of
+
+    def make() -> None:
+        cut_survey(corridor, out, Options(entry.length, entry.buffer), overwrite=True, report=report, warn=say)
+
+    once(out, sources_of(corridor), entry.model_dump(), make)
+    return out / "survey.toml"

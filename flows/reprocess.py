@@ -1,0 +1,37 @@
+"""Prefect: the flow that is scheduled: finds what changed since the last run and redoes just that."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import flows.prefect_settings  # noqa: F401  # isort: skip  # before prefect
+from prefect import flow, get_run_logger
+from prefect.states import Completed, State
+
+from flows.settings import Settings
+from flows.survey import prepare, survey
+from flows.surveying import changes
+from pipeline.errors import BusyError
+
+
+@flow(name="reprocess")
+def reprocess(
+    source: str, out: str, length: float = 100.0, buffer: float = 5.0, settings: dict[str, Any] | None = None,
+    runner: str = "threads", workers: int = 2, memory: str | None = None, cores: int | None = None,
+    address: str | None = None,
+) -> State[Any]:  # fmt: skip
+    """Redo what depends on new or changed clouds, photos, poses, settings or steps; arguments as `survey`'s.
+
+    Does nothing where nothing changed, and where the last run is still going on.
+    """
+    try:
+        path = prepare(source, out, length, buffer)
+        found = changes(path, out, Settings(settings))
+        for tile, reasons in found.items():
+            get_run_logger().info(f"{tile}: {reasons}")
+        if not found:
+            return Completed(message="Nothing has changed")
+        report = survey(source, out, length, buffer, settings, runner, workers, memory, cores, address)
+    except BusyError as error:
+        return Completed(message=f"Skipped: {error}", name="Skipped")
+    return Completed(message=f"{len(found)} tiles made anew: {report}", data=report)

@@ -1,0 +1,309 @@
+"""The report of a survey: `survey.json` for programs, `survey.html`, one page with a map of all tiles, for people."""
+
+from __future__ import annotations
+
+import base64
+import functools
+import itertools
+import json
+import time
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from flows.execute import versions
+from flows.report import _replace
+from pipeline.classes import GROUPS
+from pipeline.errors import from_os_error
+
+F64 = npt.NDArray[np.float64]
+State = Literal["done", "kept", "failed", "waiting"]
+STATES: tuple[State, ...] = ("failed", "waiting", "done", "kept")
+TEMPLATE = "survey.html.j2"
+PAGE, DATA = "survey.html", "survey.json"
+WIDTH, HEIGHT, RIM = 1100.0, 600.0, 24.0
+"""Pixels: the largest map, and what is left free around it."""
+LABELLED = 60  # tiles at most, if their names are to be read on the map
+TINY = 10.0  # pixels: smaller tiles are drawn larger than they are, to be seen at all
+THUMBNAIL = 96  # pixels wide: three kilobytes a tile
+SHOWN = 40  # borders and warnings on the page; survey.json has all
+SCALES = {  # colours from low to high, told apart by people who see no red or green, in light and in dark
+    "quality": ("#440154", "#3b528b", "#21918c", "#5ec962", "#fde725"),
+    "cost": ("#cfe3ef", "#8fb9d9", "#5287bd", "#3d5a9b", "#33276b"),
+}
+
+
+@dataclass(frozen=True)
+class TileState:
+    """How a tile of a survey fares.
+
+    Attributes:
+        name: unique in the survey.
+        outline: (K, 2) world metres, of its cell; empty where it isn't known.
+        state: "done" now, "kept" as it was before, "failed", or "waiting" to be made.
+        reason: why it failed.
+        figures: what is known of `points`, `photos`, `coverage` (share of the surface that a photo saw), `psnr_db`
+            (or None: nothing was held out), `cloud_to_mesh_m` (mean, by class), `triangles`, `bytes` of its world,
+            `bytes_written` in all, `seconds` of work, `peak_mb`.
+        report: its own page, relative to the survey's, or None.
+        thumbnail: a picture of it, or None.
+        warnings: of its steps.
+        borders: with each `neighbour`: `gap_m`, `colour_step` (grey levels) and `one_sided_m` (metres of border where
+            only one of both has a surface), as far as they are known.
+    """
+
+    name: str
+    outline: F64
+    state: State
+    reason: str | None = None
+    figures: Mapping[str, Any] = field(default_factory=dict)
+    report: str | None = None
+    thumbnail: Path | None = None
+    warnings: Sequence[str] = ()
+    borders: Sequence[Mapping[str, Any]] = ()
+
+
+def write_survey_report(out: Path, name: str, tiles: Sequence[TileState], *, path: npt.ArrayLike | None = None) -> Path:
+    """Write both reports into `out`, each whole or not at all; returns the page's path.
+
+    Args:
+        tiles: in the order in which they are told.
+        path: (N, 2) or (N, 3) world metres, along the drive, or None.
+
+    Raises:
+        SpaceError: the disk is full or can't be written to.
+    """
+    drive = np.zeros((0, 2)) if path is None else np.asarray(path, np.float64)[:, :2]
+    body = summary(name, tiles, drive)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        _replace(out / DATA, json.dumps(body, indent=1))
+        _replace(out / PAGE, _render(body, tiles, drive))
+    except OSError as error:
+        raise from_os_error(error, out) from None
+    return out / PAGE
+
+
+def summary(name: str, tiles: Sequence[TileState], path: F64) -> dict[str, Any]:
+    """All figures as one JSON-able table; keys as docs/formats.md names them."""
+    return {
+        "survey": name,
+        "made": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        "versions": versions(),
+        "totals": _totals(tiles, path),
+        "tiles": {
+            tile.name: {
+                "state": tile.state,
+                "reason": tile.reason,
+                "report": tile.report,
+                "outline_m": np.round(tile.outline, 2).tolist(),
+                "figures": dict(tile.figures),
+                "warnings": list(tile.warnings),
+            }
+            for tile in tiles
+        },
+        "borders": _borders(tiles),
+    }
+
+
+def overview(out: Path) -> str:
+    """How a survey fares, as Markdown, from its `survey.json`."""
+    body = _read(out)
+    if body is None:
+        return "No tile is made yet."
+    totals = body["totals"]
+    lines = [f"**{body['survey']}**: " + ", ".join(f"{totals[state]} {state}" for state in STATES)]
+    lines += [f"- {name}: {tile['reason']}" for name, tile in body["tiles"].items() if tile["state"] == "failed"]
+    return "\n".join(lines)
+
+
+def rows(out: Path) -> list[dict[str, Any]]:
+    """A row a tile: its name, state and figures, from the survey's `survey.json`."""
+    body = _read(out)
+    if body is None:
+        return []
+    plain = [(name, tile["state"], tile["figures"]) for name, tile in body["tiles"].items()]
+    return [
+        {"tile": name, "state": state} | {k: v for k, v in figures.items() if not isinstance(v, dict)}
+        for name, state, figures in plain
+    ]
+
+
+def _read(out: Path) -> dict[str, Any] | None:
+    try:
+        return dict(json.loads((out / DATA).read_text(encoding="utf-8")))
+    except OSError:
+        return None
+
+
+def _totals(tiles: Sequence[TileState], path: F64) -> dict[str, Any]:
+    def known(key: str) -> list[float]:
+        return [value for tile in tiles if (value := tile.figures.get(key)) is not None]
+
+    def mean(key: str) -> float | None:
+        return float(np.mean(known(key))) if known(key) else None
+
+    states = Counter(tile.state for tile in tiles)
+    return (
+        {"tiles": len(tiles)}
+        | {state: states[state] for state in STATES}
+        | {key: sum(known(key)) for key in ("points", "photos", "triangles", "bytes", "bytes_written", "seconds")}
+        | {"peak_mb": max(known("peak_mb"), default=0.0)}
+        | {key: mean(key) for key in ("coverage", "psnr_db")}
+        | {
+            "area_m2": round(sum(_area(tile.outline) for tile in tiles), 1),
+            "length_m": round(float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()), 1) if len(path) else None,
+            "warnings": sum(len(tile.warnings) for tile in tiles),
+        }
+    )
+
+
+def _area(outline: F64) -> float:
+    if len(outline) < 3:
+        return 0.0
+    x, y = (outline - outline[0]).T
+    return abs(float(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1)))) / 2
+
+
+def _borders(tiles: Sequence[TileState]) -> list[dict[str, Any]]:
+    """Every border once, the worst first; where both tiles tell of it, the worse of both figures."""
+    found: dict[tuple[str, ...], dict[str, Any]] = {}
+    for tile in tiles:
+        for border in tile.borders:
+            pair = tuple(sorted((tile.name, border["neighbour"])))
+            told = found.setdefault(pair, {"tiles": list(pair)})
+            for key, value in border.items():
+                if key != "neighbour" and value is not None:
+                    told[key] = max(told.get(key, value), value)
+    return sorted(found.values(), key=lambda b: (b.get("gap_m", 0), b.get("colour_step", 0)), reverse=True)
+
+
+# --- the page ---
+
+
+def _render(body: Mapping[str, Any], tiles: Sequence[TileState], path: F64) -> str:
+    from jinja2 import Environment, FileSystemLoader
+
+    environment = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True)
+    ordered = sorted(tiles, key=lambda tile: STATES.index(tile.state) if tile.state in STATES[:2] else len(STATES))
+    warnings = Counter(text for tile in tiles for text in set(tile.warnings))
+    return environment.get_template(TEMPLATE).render(
+        body=body,
+        tiles=ordered,
+        map=_map(tiles, path),
+        warnings=sorted(warnings.items(), key=lambda told: (-told[1], told[0])),
+        thumbnails={tile.name: _thumbnail(tile.thumbnail) for tile in tiles if tile.thumbnail},
+        groups=GROUPS,
+        shown=SHOWN,
+    )
+
+
+def _map(tiles: Sequence[TileState], path: F64) -> dict[str, Any] | None:
+    """What the template draws: polygons with their colours, the path, a scale bar; None where there is no outline."""
+    drawn = sorted((t for t in tiles if len(t.outline) >= 3), key=lambda t: -STATES.index(t.state))  # failed on top
+    if not drawn:
+        return None
+    places = np.concatenate([tile.outline for tile in drawn] + [path])
+    low, high = places.min(axis=0), places.max(axis=0)
+    scale = float(min((WIDTH, HEIGHT) / np.maximum(high - low, 1e-9)))  # pixels a metre
+    quality = "psnr_db" if any(tile.figures.get("psnr_db") is not None for tile in drawn) else "coverage"
+    colours, legends = {}, {}
+    for attribute, key in (("quality", quality), ("cost", "seconds")):
+        colours[attribute], legends[attribute] = _colours(attribute, [tile.figures.get(key) for tile in drawn])
+
+    def pixels(xy: F64) -> F64:
+        return np.column_stack([xy[:, 0] - low[0], high[1] - xy[:, 1]]) * scale + RIM
+
+    prefix = _prefix([tile.name for tile in drawn])
+    width, height = ((high - low) * scale + 2 * RIM).tolist()
+    return {
+        "width": round(width, 1),
+        "height": round(height + 20, 1),  # below: the scale bar
+        "tiny": float(np.median([np.ptp(tile.outline, axis=0).max() for tile in drawn])) * scale < TINY,
+        "quality": quality,
+        "legends": legends,
+        "tiles": [
+            {
+                "tile": tile,
+                "points": _points(pixels(tile.outline)),
+                "middle": pixels(tile.outline).mean(axis=0).round(1).tolist(),
+                "label": tile.name[len(prefix) :] if len(drawn) <= LABELLED else None,
+                "quality": colours["quality"][i],
+                "cost": colours["cost"][i],
+            }
+            for i, tile in enumerate(drawn)
+        ],
+        "path": _points(_thinned(pixels(path))) if len(path) else None,
+        "bar": _bar(scale),
+    }
+
+
+def _colours(
+    attribute: str, values: Sequence[float | None]
+) -> tuple[list[str | None], tuple[float, float, str] | None]:
+    """Each value's colour, and the legend: lowest and highest value, and their gradient in CSS."""
+    known = [value for value in values if value is not None]
+    if not known:
+        return [None] * len(values), None
+    low, high = min(known), max(known)
+    stops = np.array([[int(stop[i : i + 2], 16) for i in (1, 3, 5)] for stop in SCALES[attribute]], float)
+    at = np.linspace(0, 1, len(stops))
+
+    def colour(value: float | None) -> str | None:
+        if value is None:
+            return None
+        share = (value - low) / (high - low) if high > low else 1.0
+        return "#" + "".join(f"{round(float(np.interp(share, at, stops[:, c]))):02x}" for c in range(3))
+
+    return [colour(value) for value in values], (low, high, ", ".join(SCALES[attribute]))
+
+
+def _points(xy: F64) -> str:
+    return " ".join(f"{x:.1f},{y:.1f}" for x, y in xy)
+
+
+def _thinned(xy: F64) -> F64:
+    """Places a pixel or more after the one before: a drive has a million of them."""
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))])
+    _, first = np.unique(np.floor(along), return_index=True)
+    return xy[first]
+
+
+def _prefix(names: Sequence[str]) -> str:
+    """What all names begin with, so that it needn't be on the map; something is left of each."""
+    alike = itertools.takewhile(lambda pair: pair[0] == pair[1], zip(min(names), max(names), strict=False))
+    return min(names)[: min(len(list(alike)), min(map(len, names)) - 1)]
+
+
+def _bar(scale: float) -> dict[str, Any]:
+    """A scale bar of a round length, a sixth of the map's width or less."""
+    longest = WIDTH / 6 / scale
+    power = 10.0 ** np.floor(np.log10(longest))
+    metres = next(float(f * power) for f in (5, 2, 1) if f * power <= longest)
+    return {"pixels": round(metres * scale, 1), "text": f"{metres / 1000:g} km" if metres >= 1000 else f"{metres:g} m"}
+
+
+def _thumbnail(path: Path) -> str | None:
+    """A picture's small copy as a data URI; None where it can't be read."""
+    try:
+        return _small(path, path.stat().st_mtime_ns)
+    except OSError:
+        return None
+
+
+@functools.lru_cache(maxsize=4096)  # a page is written again whenever a tile is done
+def _small(path: Path, changed: int) -> str | None:
+    import cv2
+
+    picture = cv2.imread(str(path), cv2.IMREAD_REDUCED_COLOR_4)
+    if picture is None:
+        return None
+    height = max(1, round(picture.shape[0] * THUMBNAIL / picture.shape[1]))
+    small = cv2.resize(picture, (THUMBNAIL, height), interpolation=cv2.INTER_AREA)
+    data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 70])[1].tobytes()
+    return f"data:image/jpeg;base64,{base64.b64encode(data).decode()}"

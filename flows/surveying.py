@@ -1,0 +1,201 @@
+"""`scan2sim survey`: all tiles of a survey to worlds that meet, one world and one report, without Prefect."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from rich.markup import escape
+
+from flows.display import console, progress
+from flows.execute import Executor, limit_cores, locked, versions
+from flows.finish import Made, finish
+from flows.memory import parse
+from flows.planning import Planned, plan
+from flows.prepare import TilesEntry, survey_of
+from flows.recipe import survey_recipe
+from flows.run import STORE, Log, default_jobs, execute_shown
+from flows.settings import Settings
+from pipeline.errors import ScanError, SettingError, SpaceError, StepError
+from pipeline.io.remote import Remote, is_remote, likeness
+from pipeline.io.survey import Survey, read_survey
+from pipeline.io.tile import read_tile
+from pipeline.store import Digests, Manifest, Store
+from pipeline.types import Tile
+
+
+def run_source(
+    source: str, target: str, settings: Settings, *, length: float, buffer: float, jobs: int, memory: str | None,
+    runner: str, address: str | None, cores: int | None,
+) -> None:  # fmt: skip
+    """`scan2sim survey`: in processes of this machine, or through Prefect on a runner that is named.
+
+    Args:
+        source: a drive, a corridor or a survey (`flows.prepare`).
+        target: folder for all that is made; both may be in object storage.
+        length, buffer: metres, of tiles that are cut here.
+        jobs: steps at a time; 0: as the cores allow.
+        memory: what steps may need together, "20GB".
+        runner: "processes", or Prefect's "threads", "dask", "ray".
+        address: of a Dask scheduler or a Ray cluster.
+        cores: that a step may use.
+
+    Raises:
+        StepError: tiles failed; all others are finished.
+        ScanError: see `pipeline.errors`; earlier results stay.
+    """
+    jobs, gigabytes = jobs or default_jobs(), parse(memory)
+    if runner != "processes":
+        from flows.survey import survey
+        from flows.tile import check_server
+
+        check_server()
+        survey(source, target, length, buffer, settings.values, runner, jobs, memory, cores, address)
+        return
+    limit_cores(cores)
+    with progress("survey") as report:
+        path = survey_of(source, target, tiles=TilesEntry(length=length, buffer=buffer), say=warn, report=report)
+    log = Log(likeness(target) / "run.log")
+
+    def run(planned: list[Planned], store: Store, failures: dict[str, ScanError]) -> dict[str, Manifest]:
+        return execute_shown(planned, store, log, jobs, failures, gigabytes)
+
+    make_survey(path, target, settings, run)
+
+
+def make_survey(place: str | Path, target: str | Path, settings: Settings, run: Executor) -> Path:
+    """Make all worlds of the survey at `place` in the folder `target`; returns the report's path.
+
+    Both may be in object storage (`pipeline.io.remote`); the report's path is that of its likeness here then.
+
+    The folder gets `survey.html`, `survey.json`, `world/` (all tiles in one), `stac/`, `tiles/NAME/` (as `scan2sim run`
+    writes it) and `steps/` (kept results). A tile that fails is reported; its neighbours are made as if it
+    weren't there, and anew once it is.
+
+    Raises:
+        StepError: tiles failed; all others are finished.
+        ScanError: see `pipeline.errors`; earlier results stay.
+    """
+    began = time.perf_counter()
+    sources, results = _remote(place), _remote(target)
+    survey = read_survey(sources.pull_all() if sources else Path(place))
+    out = likeness(target)
+    log = Log(out / "run.log")
+    with locked(out), log.errors(out):
+        log.write(f"survey {survey.path}, settings {json.dumps(settings.values)}, versions {json.dumps(versions())}")
+        store = _store(place, target)
+        digests = Digests(store.root / "digests.json")
+        made = _make(survey, settings, store, run, digests)
+        report = finish(survey, made, store, out, settings, digests)
+        digests.save()
+        failed = [one for one in made if one.error is not None]
+        for one in failed:
+            log.write(f"{one.name}: failed: {one.error}")
+        if results:
+            files = (path.relative_to(out) for path in sorted(out.rglob("*")) if path.is_file())
+            results.push_all(file.as_posix() for file in files if file.parts[0] not in (STORE, ".lock"))
+    kept = all(one.kept for one in made)
+    console.print(f"Report: {report}", highlight=False, soft_wrap=True, markup=False)
+    if kept and not failed:
+        console.print(f"[dim]nothing to do: all is as the survey says ({time.perf_counter() - began:.1f} s)")
+    if failed:
+        first = failed[0].error
+        raise StepError(
+            report,
+            f"{len(failed)} of {len(made)} tiles failed: {', '.join(one.name for one in failed)} ({first})",
+            "Mend what the report names and run again: what is finished is kept",
+        )
+    return report
+
+
+def warn(text: str) -> None:
+    """Show a warning."""
+    console.print(f"[yellow]warning:[/] {escape(text)}", highlight=False, soft_wrap=True)
+
+
+def read_tiles(survey: Survey) -> tuple[dict[str, Tile], dict[str, ScanError]]:
+    """The survey's tiles by name, and why others can't be read."""
+    tiles: dict[str, Tile] = {}
+    failed: dict[str, ScanError] = {}
+    for path in survey.tiles:
+        try:
+            tiles[path.parent.name] = read_tile(path)
+        except ScanError as error:
+            failed[path.parent.name] = error
+    return tiles, failed
+
+
+def plan_survey(
+    tiles: Mapping[str, Tile], store: Store, settings: Settings, digest: Callable[[Path], str]
+) -> list[Planned]:
+    """What would run of all tiles, and why."""
+    return plan(survey_recipe(list(tiles.values()), settings), store, digest=digest)
+
+
+def _make(survey: Survey, settings: Settings, store: Store, run: Executor, digests: Digests) -> list[Made]:
+    """Run all tiles; without those that fail, until none does."""
+    tiles, failed = read_tiles(survey)
+    unread = set(failed)
+    while True:
+        planned = plan_survey(tiles, store, settings, digests)
+        failures: dict[str, ScanError] = {}
+        done = run(planned, store, failures)
+        for error in failures.values():
+            if isinstance(error, (SpaceError, SettingError)):  # no tile's fault
+                raise error
+        if not failures:
+            break
+        for label, error in failures.items():
+            name = label.split("/")[0]
+            failed.setdefault(name, error)
+            tiles.pop(name, None)
+    names = [path.parent.name for path in survey.tiles]
+    return [
+        Made(name, None if name in unread else read_tile(survey.tiles[i]), error=failed[name])
+        if name in failed
+        else Made(name, tiles[name], *_of_tile(name, planned, done))
+        for i, name in enumerate(names)
+    ]
+
+
+def _of_tile(
+    name: str, planned: Sequence[Planned], done: Mapping[str, Manifest]
+) -> tuple[tuple[Planned, ...], dict[str, Manifest]]:
+    """A tile's own nodes and results, without its name before their labels."""
+    own = [item for item in planned if item.node.label.startswith(f"{name}/")]
+
+    def bare(label: str) -> str:
+        return label.removeprefix(f"{name}/")
+
+    return (
+        tuple(replace(item, node=replace(item.node, label=bare(item.node.label))) for item in own),
+        {bare(item.node.label): done[item.node.label] for item in own},
+    )
+
+
+def changes(place: str | Path, target: str | Path, settings: Settings) -> dict[str, str]:
+    """Why each tile of a survey would run, by name; empty where all is as it was.
+
+    Raises:
+        ScanError: see `pipeline.errors`.
+    """
+    sources, store = _remote(place), _store(place, target)
+    digests = Digests(store.root / "digests.json")
+    tiles, failed = read_tiles(read_survey(sources.pull_all() if sources else Path(place)))
+    found = {name: str(error) for name, error in failed.items()}
+    for item in plan_survey(tiles, store, settings, digests):
+        if item.reason is not None:
+            found.setdefault(item.node.label.split("/")[0], f"{item.node.step.name}: {item.reason}")
+    return found
+
+
+def _remote(place: str | Path) -> Remote | None:
+    return Remote.of(str(place)) if is_remote(place) else None
+
+
+def _store(place: str | Path, target: str | Path) -> Store:
+    results = _remote(target)
+    return Store(likeness(target) / STORE, results and results.below(STORE), _remote(place))

@@ -1,0 +1,134 @@
+"""The survey: `survey.toml` names the tiles that a corridor was cut into.
+
+```toml
+name = "my_town"
+crs = "EPSG:32633"          # of all tiles
+units = "m"                 # "ft", "us-ft"; only for local coordinates
+length = 100.0              # metres of the path a tile
+buffer = 5.0                # metres that tiles' clouds reach beyond their borders
+tiles = ["my_town_0000", "my_town_0001"]     # folders beside this file, in order along the path
+```
+What of the plane is a tile's own stands in its `tile.toml` under `[cell]`.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from pipeline.errors import InputError
+
+
+class SurveyFile(BaseModel):
+    """All of `survey.toml`."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: str = Field(pattern=r"^[A-Za-z0-9_]+$")
+    crs: str
+    units: Literal["m", "ft", "us-ft"] | None = None
+    length: float = Field(gt=0)
+    buffer: float = Field(ge=0)
+    tiles: tuple[str, ...] = Field(min_length=1)
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What `survey.toml` names, checked.
+
+    Attributes:
+        path: the `survey.toml`.
+        name: of the survey.
+        tiles: the `tile.toml` of every tile, in order along the path; their folders have the tiles' names.
+        length: metres of the path a tile.
+        buffer: metres that tiles' clouds reach beyond their borders.
+    """
+
+    path: Path
+    name: str
+    tiles: tuple[Path, ...]
+    length: float
+    buffer: float
+
+
+def read_survey(path: Path) -> Survey:
+    """Read and check a survey: a `survey.toml`, or a folder that holds one.
+
+    A tile that can't be read is left to the reader of tiles: it is no reason to refuse the others.
+
+    Raises:
+        InputError: naming the file, the field and what was expected; a tile is missing or named twice; two CRS.
+    """
+    path = path / "survey.toml" if path.is_dir() else path
+    spec = _parse(path)
+    tiles = tuple(path.parent / name / "tile.toml" for name in spec.tiles)
+    for tile in tiles:
+        if not tile.is_file():
+            raise InputError(tile, f"is missing (named in {path.name})", "Put it back, or take it out of `tiles`")
+    names = [tile.parent.name for tile in tiles]
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise InputError(path, f"names two tiles {twice}", "Take one of them out of `tiles`")
+    _check_crs(path, tiles)
+    return Survey(path, spec.name, tiles, spec.length, spec.buffer)
+
+
+def write_survey(
+    folder: Path, *, name: str, crs: str, length: float, buffer: float, tiles: Sequence[str], units: str | None = None
+) -> Path:
+    """Write `folder/survey.toml` and return its path; arguments are as in the file."""
+    import tomli_w
+
+    body: dict[str, Any] = {"name": name, "crs": crs}
+    if units:
+        body["units"] = units
+    body |= {"length": length, "buffer": buffer, "tiles": list(tiles)}
+    SurveyFile.model_validate(body)
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "survey.toml"
+    path.write_text(tomli_w.dumps(body), encoding="utf-8")
+    return path
+
+
+def _parse(path: Path) -> SurveyFile:
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(
+            path, "there is no survey here", "Name a survey.toml or its folder; `scan2sim tile` cuts one from a tile"
+        ) from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(path, f"is not valid TOML ({error})", "Mend the line that the message names") from None
+    try:
+        return SurveyFile.model_validate(data)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise InputError(
+            path, f"field `{where}`: {first['msg']}", "docs/formats.md lists the fields of a survey"
+        ) from None
+
+
+def _check_crs(path: Path, tiles: Sequence[Path]) -> None:
+    """Look at what the tiles say of their CRS; their clouds are not opened."""
+    known: dict[Path, str] = {}
+    for tile in tiles:
+        try:
+            crs = tomllib.loads(tile.read_text(encoding="utf-8")).get("crs")
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError):
+            continue
+        if isinstance(crs, str):
+            known[tile] = crs
+    for tile, crs in known.items():
+        first, other = next(iter(known.items()))
+        if crs != other:
+            raise InputError(
+                path,
+                f"has tiles from two CRS: {tile.parent.name} is in {crs[:60]}, {first.parent.name} in {other[:60]}",
+                "Cut all of it from one corridor, in one CRS",
+            )

@@ -1,0 +1,48 @@
+"""Clip: the mesh cut to the tile's own cell, where tiles of a survey meet."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pydantic import Field
+
+from pipeline.step import Done, Inputs, Params, Report, Step
+
+if TYPE_CHECKING:
+    from pipeline.cells import Cell
+
+
+class CellParams(Params):
+    """What of the survey is the tile's own, set by the recipe.
+
+    Attributes:
+        seed: (x, y) world metres (CRS coordinates times metres per unit).
+        neighbours: the names of tiles whose cells touch to their seeds, world metres.
+    """
+
+    seed: tuple[float, float]
+    neighbours: dict[str, tuple[float, float]] = Field(default_factory=dict)
+
+    @property
+    def cell(self) -> Cell:
+        """The tile's cell."""
+        from pipeline.cells import Cell
+
+        return Cell(self.seed, self.neighbours)
+
+
+def clip(inputs: Inputs, params: CellParams, out: Path, report: Report) -> Done:
+    """Cut `mesh` to the tile's own cell, and tell which vertices lie on which border (`on`)."""
+    from pipeline import border
+    from pipeline.types import Mesh
+
+    mesh = Mesh.load(inputs["mesh"])
+    clipped = border.clip(mesh, params.cell)
+    clipped.save(out / "mesh.npz", out / "on.npz")
+    on = {name: int(flags.sum()) for name, flags in clipped.on.items()}
+    facts = {"faces_in": len(mesh), "faces": len(clipped.mesh), "on_border": on}
+    return Done({"mesh": out / "mesh.npz", "on": out / "on.npz"}, facts)
+
+
+CLIP = Step("clip", 1, clip, CellParams)

@@ -1,0 +1,83 @@
+"""Overlap: what two tiles both know of their border's surroundings, made the same for both."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pydantic import Field
+
+from pipeline.step import Done, Inputs, Report, Step
+from pipeline.steps.clip import CellParams
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from pipeline.cells import Seed
+    from pipeline.types import F64
+
+
+class OverlapParams(CellParams):
+    """Which points of its neighbours a tile takes.
+
+    Attributes:
+        name: of the tile; set by the recipe, as the cell is.
+        buffer: metres beyond its cell from which a tile takes points; set by the recipe.
+    """
+
+    name: str
+    buffer: float = Field(5.0, ge=0)
+
+
+def overlap(inputs: Inputs, params: OverlapParams, out: Path, report: Report) -> Done:
+    """Take what is beyond the borders of `cloud` from the neighbours' clouds, `cloud.NAME`, where given.
+
+    A point belongs to the tile with the nearest seed (of several as near, to the one whose name sorts first), and
+    is taken from there with what that tile knows of it, its class above all. So tiles see the same points around
+    their border. Where the nearest tile's cloud is not given, the tile's own points stand in. Coordinates are
+    rounded to `pipeline.border.GRID`: the same in every tile.
+    """
+    from dataclasses import replace
+
+    import numpy as np
+
+    from pipeline.border import on_grid
+    from pipeline.types import PointCloud
+
+    seeds = dict(sorted({params.name: params.seed, **params.neighbours}.items()))
+    given = [name for name in seeds if name == params.name or f"cloud.{name}" in inputs]
+    own = PointCloud.load(inputs["cloud"])
+    parts = []
+    for i, name in enumerate(given):  # by name in every tile: of the points of a voxel the same one comes first
+        report(i / len(given), name)
+        cloud = own if name == params.name else PointCloud.load(inputs[f"cloud.{name}"])
+        world = on_grid(cloud.xyz + np.asarray(cloud.frame.origin))
+        owner = np.array(list(seeds))[nearest(world[:, :2], list(seeds.values()))]
+        if name == params.name:
+            taken = (owner == name) | ~np.isin(owner, given)
+        else:
+            taken = (owner == name) & (params.cell.outside(world[:, :2]) <= params.buffer)
+        index = np.flatnonzero(taken)
+        local = (world[index] - np.asarray(own.frame.origin)).astype(np.float32)
+        parts.append(replace(cloud.take(index), frame=own.frame, xyz=local))
+    cloud = PointCloud.join(parts)
+    cloud.save(out / "cloud.npz")
+    points = {name: len(part) for name, part in zip(given, parts, strict=True)}
+    missing = [name for name in seeds if name not in given]
+    return Done({"cloud": out / "cloud.npz"}, {"points_in": len(own), "points": points, "missing": missing})
+
+
+def nearest(xy: F64, seeds: list[Seed]) -> npt.NDArray[np.int64]:
+    """(N,) index of the nearest seed to each world place (N, 2), the first of several as near."""
+    import numpy as np
+
+    index, least = np.zeros(len(xy), np.int64), np.full(len(xy), np.inf)
+    for i, seed in enumerate(seeds):
+        square = ((xy - seed) ** 2).sum(axis=1)
+        nearer = square < least
+        index[nearer], least[nearer] = i, square[nearer]
+    return index
+
+
+OVERLAP = Step("overlap", 1, overlap, OverlapParams)

@@ -1,0 +1,90 @@
+"""Memory is shared out: what doesn't fit waits, what a killed process held is free."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from flows.execute import execute
+from flows.memory import parse, share
+from flows.planning import plan
+from pipeline.errors import SettingError
+from pipeline.store import Store
+from tests.conftest import ROOT
+from tests.flows.toy import chain
+
+
+@pytest.fixture(autouse=True)
+def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+
+
+def test_amounts() -> None:
+    assert parse("20GB") == 20 and parse("800 MB") == 0.8 and parse("1.5") == 1.5 and parse(None) is None
+    for wrong in ("lots", "0GB", "-3"):
+        with pytest.raises(SettingError, match="no amount"):
+            parse(wrong)
+
+
+def test_what_does_not_fit_waits() -> None:
+    inside, most = [], []
+
+    def work() -> None:
+        with share(4.0, 1.5):
+            inside.append(1)
+            most.append(len(inside))
+            time.sleep(0.2)
+            inside.pop()
+
+    threads = [threading.Thread(target=work) for _ in range(5)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert max(most) == 2 and len(most) == 5
+
+
+def test_more_than_there_is_runs_alone() -> None:
+    with share(1.0, 50.0):
+        waited = threading.Event()
+        thread = threading.Thread(target=lambda: [share(1.0, 0.25).__enter__(), waited.set()])
+        thread.start()
+        assert not waited.wait(0.5)
+    assert waited.wait(5)
+    thread.join()
+
+
+def test_a_killed_process_gives_its_share_back(tmp_path: Path) -> None:
+    script = (
+        f"import tempfile, time; tempfile.tempdir = {str(tmp_path)!r}\n"
+        "from flows.memory import share\nwith share(1.0, 1.0): print('held', flush=True); time.sleep(60)"
+    )
+    child = subprocess.Popen([sys.executable, "-c", script], cwd=ROOT, stdout=subprocess.PIPE)
+    assert child.stdout and child.stdout.readline()
+    child.send_signal(signal.SIGKILL)
+    child.wait()
+    with share(1.0, 1.0):
+        pass
+
+
+def test_steps_that_do_not_fit_together_run_one_after_the_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("flows.execute.need", lambda *_: 3.0)
+    (tmp_path / "source.txt").write_text("1")
+    running, most = set(), []
+
+    def watch(node: object, event: str, *_: object) -> None:
+        (running.add if event == "start" else running.discard)(id(node))
+        most.append(len(running))
+
+    store = Store(tmp_path / "store")
+    planned = plan(chain(tmp_path / "source.txt", tmp_path / "log"), store)
+    done = execute(planned, store, jobs=4, watch=watch, memory=5.0)
+    assert set(done) == set("abcd") and max(most) == 1

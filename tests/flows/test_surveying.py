@@ -1,0 +1,98 @@
+"""A survey from the command: tiles that meet, one world, reruns, tiles that fail."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flows.cut import Options, cut_survey
+from tests.flows.test_cli import SMALL, bad, good, scan2sim
+from tests.gazebo.checker import check_world
+
+
+@pytest.fixture(scope="module")
+def survey(small_street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The small street in two tiles, with photos of its own."""
+    folder = tmp_path_factory.mktemp("survey")
+    shutil.copytree(small_street, folder / "corridor")
+    cut_survey(folder / "corridor", folder / "tiles", Options(length=6.0, buffer=2.0))
+    return folder / "tiles"
+
+
+@pytest.fixture(scope="module")
+def made(survey: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What the command makes of it."""
+    out = tmp_path_factory.mktemp("made") / "out"
+    good(scan2sim("survey", survey, "--out", out, *SMALL))
+    return out
+
+
+def told(out: Path) -> dict[str, Any]:
+    return json.loads((out / "survey.json").read_text())
+
+
+def test_tiles_share_their_borders(made: Path) -> None:
+    (border,) = told(made)["borders"]
+    assert border["length_m"] > 10
+    assert border["gap_m"] == 0 and border["overlap_m"] < 1e-3
+    assert border["shared"] > 0.95
+    assert border["one_sided_m"] < 0.03 * border["length_m"]
+    assert border["colour_step"] < 1.5
+
+
+def test_gazebo_loads_all_tiles_as_one_world(made: Path) -> None:
+    (world,) = (made / "world").glob("*.sdf")
+    tiles = json.loads((made / "world" / "metadata.json").read_text())["tiles"]
+    assert len(tiles) == 2
+    seen = check_world(world, (0, 0, 2))
+    assert abs(seen["rest"][2]) < 5 and seen["speed"] < 0.1
+
+
+def test_an_unchanged_survey_is_left_as_it_is(survey: Path, made: Path) -> None:
+    before = {path: path.stat().st_mtime_ns for path in (made / "steps").rglob("manifest.json")}
+    assert "nothing to do" in good(scan2sim("survey", survey, "--out", made, *SMALL))
+    assert {path: path.stat().st_mtime_ns for path in (made / "steps").rglob("manifest.json")} == before
+    assert {tile["state"] for tile in told(made)["tiles"].values()} == {"kept"}
+
+
+def test_a_tile_that_fails_is_told_and_the_others_are_made(survey: Path, made: Path, tmp_path: Path) -> None:
+    broken = tmp_path / "tiles"
+    shutil.copytree(survey, broken)
+    for tile in broken.glob("*/tile.toml"):
+        tile.write_text(tile.read_text().replace('"../../corridor', f'"{survey.parent}/corridor'))
+    cloud = sorted(broken.glob("*/cloud.laz"))[1]
+    cloud.write_bytes(cloud.read_bytes()[: cloud.stat().st_size // 2])
+    out = tmp_path / "out"
+    bad(scan2sim("survey", broken, "--out", out, *SMALL), 5, "1 of 2 tiles failed", "truncated or damaged")
+    first, second = told(out)["tiles"].values()
+    assert first["state"] == "done" and second["state"] == "failed"
+    assert "truncated or damaged" in second["reason"] and cloud.name in second["reason"]
+    shutil.copyfile(sorted(survey.glob("*/cloud.laz"))[1], cloud)
+    good(scan2sim("survey", broken, "--out", out, *SMALL))
+    assert told(out)["borders"][0]["gap_m"] == 0
+    assert contents(out) == contents(made)
+
+
+def contents(out: Path) -> dict[str, str]:
+    """Digests of all results, by tile and step."""
+    manifests = [json.loads(path.read_text()) for path in (out / "steps").glob("*/*/*/manifest.json")]
+    return {manifest["label"]: manifest["content"] for manifest in manifests}
+
+
+def test_two_runs_do_not_share_a_store(survey: Path, made: Path) -> None:
+    from flows.execute import locked
+
+    with locked(made):
+        bad(scan2sim("survey", survey, "--out", made, *SMALL), 8, "another run")
+
+
+def test_what_is_no_survey_is_told(tmp_path: Path) -> None:
+    bad(scan2sim("survey", tmp_path, "--out", tmp_path / "out"), 3, "there is no survey here", "survey.toml")
+
+
+def test_an_unknown_amount_of_memory_is_told(survey: Path, tmp_path: Path) -> None:
+    bad(scan2sim("survey", survey, "--out", tmp_path, "--memory", "lots"), 2, "--memory", "Write 20GB")

@@ -1,0 +1,96 @@
+"""Results and sources in object storage: a real S3 server, and machines that share nothing else."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from multiprocessing import forkserver
+from pathlib import Path
+
+import pytest
+
+from flows.execute import execute
+from flows.planning import plan
+from pipeline.errors import InputError, UnavailableError
+from pipeline.io.remote import CACHE, Remote, is_remote, likeness
+from pipeline.store import Store
+from tests.flows.toy import chain
+
+
+@pytest.fixture(scope="module")
+def s3() -> Iterator[str]:
+    """The URL of an empty bucket."""
+    server = pytest.importorskip("moto.server").ThreadedMotoServer(port=0)
+    pytest.importorskip("s3fs")
+    server.start()
+    host, port = server.get_host_and_port()
+    told = {"AWS_ENDPOINT_URL": f"http://{host}:{port}", "AWS_ACCESS_KEY_ID": "x", "AWS_SECRET_ACCESS_KEY": "x"}
+    told |= {"AWS_DEFAULT_REGION": "us-east-1"}
+    before = dict(os.environ)
+    os.environ.update(told)
+    forkserver._forkserver._stop()  # type: ignore[attr-defined]  # nodes have the environment that it was started with
+    import s3fs
+
+    s3fs.S3FileSystem(endpoint_url=told["AWS_ENDPOINT_URL"]).mkdir("survey", create_parents=True)
+    yield "s3://survey"
+    os.environ.clear()
+    os.environ.update(before)
+    server.stop()
+
+
+def test_a_place_is_itself_or_has_a_likeness(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv(CACHE, str(tmp_path))
+    assert not is_remote(tmp_path) and likeness(tmp_path) == tmp_path
+    assert is_remote("s3://a/b") and likeness("s3://a/b/").parent == tmp_path
+    assert likeness("s3://a/b") == likeness("s3://a/b/") != likeness("s3://c/b")
+
+
+def test_another_machine_goes_on_where_the_first_one_stopped(s3: str, tmp_path: Path) -> None:
+    (tmp_path / "source.txt").write_text("1")
+    log = tmp_path / "log"
+
+    def machine(name: str, **changes: dict[str, object]) -> dict[str, object]:
+        store = Store(tmp_path / name, Remote(f"{s3}/steps", tmp_path / name))
+        nodes, failures = chain(tmp_path / "source.txt", log, **changes), {}
+        done = execute(plan(nodes, store), store, jobs=1, watch=lambda *_: None, failures=failures)
+        return {label: manifest.facts["total"] for label, manifest in done.items()}
+
+    assert set(machine("first", c={"does": "fail"})) == {"a", "b"}
+    assert sorted(log.read_text().split()) == ["a", "b", "c"]
+    assert machine("second") == {"a": 1, "b": 1, "c": 1, "d": 2}
+    assert sorted(log.read_text().split()) == ["a", "b", "c", "c", "d"]
+    assert machine("third") == {"a": 1, "b": 1, "c": 1, "d": 2}  # no file but manifests is fetched
+    assert not list((tmp_path / "third").rglob("number.txt"))
+
+
+def test_a_likeness_follows_what_it_is_like(s3: str, tmp_path: Path) -> None:
+    here, there = Remote(f"{s3}/tiles", tmp_path / "here"), Remote(f"{s3}/tiles", tmp_path / "there")
+    (here.local / "a").mkdir(parents=True)
+    (here.local / "a" / "one.txt").write_text("1")
+    (here.local / "two.txt").write_text("2")
+    here.push_all(["a/one.txt", "two.txt"])
+    assert there.pull_all() == tmp_path / "there"
+    assert (there.local / "a" / "one.txt").read_text() == "1" and (there.local / "two.txt").read_text() == "2"
+    untouched = (there.local / "two.txt").stat().st_mtime_ns
+    (here.local / "a" / "one.txt").write_text("11")
+    here.push_all(["a/one.txt", "two.txt"])
+    there.pull_all()
+    assert (there.local / "a" / "one.txt").read_text() == "11"
+    assert (there.local / "two.txt").stat().st_mtime_ns == untouched
+
+
+def test_a_source_that_is_not_here_is_fetched(s3: str, tmp_path: Path) -> None:
+    first, second = Remote(f"{s3}/src", tmp_path / "a"), Remote(f"{s3}/src", tmp_path / "b")
+    first.local.mkdir()
+    (first.local / "cloud.laz").write_text("points")
+    first.push(["cloud.laz"])
+    store = Store(tmp_path / "steps", sources=second)
+    assert store.source(second.local / "cloud.laz").read_text() == "points"
+
+
+def test_what_is_not_there_or_can_not_be_read_is_told(s3: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="there is nothing"):
+        Remote(f"{s3}/nothing", tmp_path).pull_all()
+    with pytest.raises(UnavailableError, match="fsspec"):
+        Remote("nosuch://bucket/x", tmp_path).pull_all()
+    assert not Remote(f"{s3}/nothing", tmp_path).pull(["manifest.json"])

@@ -1,0 +1,50 @@
+"""Borders: how well a tile meets its neighbours, walked along every border of every class."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pipeline.classes import GROUPS
+from pipeline.step import Done, Inputs, Report, Step
+from pipeline.steps.clip import CellParams
+
+if TYPE_CHECKING:
+    from pipeline.cells import Cell
+    from pipeline.io.textured import Textured
+
+
+def borders(inputs: Inputs, params: CellParams, out: Path, report: Report) -> Done:
+    """Measure the borders of `textured.GROUP` with those of the neighbours, `textured.GROUP.NAME`.
+
+    Facts, by neighbour and class: `length_m` of border; `gap_m`, the farthest that a place of one mesh's border is
+    from the other's, where it has one within 30 cm; `one_sided_m`, where it has none; `shared`, of 1, the border edges
+    that are the very same in both; `overlap_m` beyond the border; `colour_step` and its 95th percentile, grey levels.
+    """
+    from pipeline.io import textured
+
+    names = sorted({name.split(".", 2)[2] for name in inputs if name.count(".") == 2})
+    found: dict[str, dict[str, dict[str, float]]] = {}
+    for i, name in enumerate(names):
+        report(i / len(names), name)
+        for group in GROUPS:
+            if f"textured.{group}.{name}" in inputs:
+                own, other = (textured.read(inputs[key]) for key in (f"textured.{group}", f"textured.{group}.{name}"))
+                if own is not None and other is not None:
+                    found.setdefault(name, {})[group] = _measured(own, other, params.cell, name)
+    return Done({}, {"neighbours": found})
+
+
+def _measured(own: Textured, other: Textured, cell: Cell, name: str) -> dict[str, float]:
+    from pipeline.border import gap
+    from texturing.border_colours import border_step
+
+    between, (step, p95, _) = gap(own.mesh, other.mesh, cell, name), border_step(own, other)
+    values = {
+        "length_m": between.length_m, "gap_m": between.max_m, "one_sided_m": between.one_sided_m,
+        "shared": between.shared, "overlap_m": between.overlap_m, "colour_step": step, "colour_step_p95": p95,
+    }  # fmt: skip
+    return {key: round(float(value), 6 if key == "gap_m" else 4) for key, value in values.items()}
+
+
+BORDERS = Step("borders", 1, borders, CellParams)

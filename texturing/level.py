@@ -1,0 +1,148 @@
+"""Level: the colours of neighbouring tiles, textured apart, meet at their border.
+
+Where tiles share vertices, the target of each is the mean of what all of them show there, so all compute the same.
+The change that takes a tile to its target is carried inwards as its mean over the border, weighted by 1 / distance^4.
+Along a straight border that is the biharmonic surface: a wave of length l fades as (1 + k d) exp(-k d) with the
+distance d, k = 2 pi / l, and without a crease. So fine differences end close to the border and wide ones far from it,
+as in multi-band blending (Burt and Adelson 1983), and where the nearest border changes there is no step. What is the
+same all along the border is faded out over `reach`. Levelled seams: Lempitsky and Ivanov 2007; colours carried
+inwards as weighted means: Farbman et al. 2009.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pydantic import Field
+
+from pipeline.step import Done, Inputs, Params, Report, Step
+
+if TYPE_CHECKING:
+    from pipeline.io.textured import Textured
+    from pipeline.types import F32
+    from texturing.border_colours import Border
+
+NEIGHBOUR = "neighbour."
+
+
+class LevelParams(Params):
+    """How colours are levelled.
+
+    Attributes:
+        reach: metres from the border over which a step between tiles is faded out.
+    """
+
+    reach: float = Field(4.0, gt=0)
+
+
+def level(inputs: Inputs, params: LevelParams, out: Path, report: Report) -> Done:
+    """Take a tile's colours at its border to the mean of the tiles that meet there, fading inwards.
+
+    Inputs: `textured` (of the step `texture`) and `neighbour.*`, the same of the tiles around, before they are
+    levelled themselves.
+    File: `textured`, the same layout; what is not changed, masks included, is the same bytes.
+
+    Raises:
+        InputError: a page can't be read.
+    """
+    import numpy as np
+
+    from pipeline.io import textured
+    from texturing import border_colours as at_border
+
+    folder = out / "textured"
+    folder.mkdir()
+    own = textured.read(inputs["textured"])
+    given = {name.removeprefix(NEIGHBOUR): path for name, path in sorted(inputs.items()) if name.startswith(NEIGHBOUR)}
+    others = {name: tile for name, path in given.items() if (tile := textured.read(path)) is not None}
+    facts: dict[str, Any] = {"border_m": 0.0, "step_before": 0.0, "step_after": 0.0, "step_p95_after": 0.0}
+    if own is not None and others:
+        tiles = (own, *others.values())
+        border = at_border.meet([at_border.rim(tile.mesh) for tile in tiles])
+        if len(border.looks[0].place):
+            looked = zip(border.looks, tiles, strict=True)
+            shown = np.stack([at_border.colours(looks, tile.pages, len(border)) for looks, tile in looked])
+            target = at_border.targets(border.xyz, shown, params.reach)
+            after = _level_pages(own, border, shown[0], target, params.reach, folder, report)
+            facts = _facts(border, list(others), shown, target, after)
+    _link_others(inputs["textured"], folder)
+    return Done({"textured": folder}, facts)
+
+
+def _level_pages(
+    own: Textured, border: Border, shown: F32, target: F32, reach: float, folder: Path, report: Report
+) -> F32:
+    """Write the pages that change; returns (P, 3) what the levelled mesh shows at the border's places.
+
+    Args:
+        shown, target: (P, 3) grey levels of the places, as they are and as they are to be.
+    """
+    import numpy as np
+
+    from pipeline.io import image
+    from texturing import blend
+    from texturing import border_colours as at_border
+
+    mesh, looks = own.mesh, border.looks[0]
+    assert mesh.uv is not None and mesh.page is not None
+    mine = np.isfinite(shown[:, 0])
+    places = border.xyz[mine] - np.asarray(mesh.frame.origin)
+    corners, tree = mesh.corners, at_border.changes(places, border.metres[mine], (target - shown)[mine])
+    near = at_border.within(tree, corners, reach)
+    after = np.empty((len(looks.place), 3), np.float32)
+    pages = np.unique(mesh.page[near]).tolist()
+    for i, k in enumerate(pages):
+        report(i / len(pages), f"page {i + 1} of {len(pages)}")
+        faces = np.flatnonzero(mesh.page == k)
+        here = looks.page == k
+        before = at_border.read_page(own.pages[k])
+        page, (height, width) = before.copy(), before.shape[:2]
+        flat = blend.texels(mesh.uv[faces], width, height)
+        owner = blend.owners(flat, width, height)
+        source = at_border.sources(owner)
+        at_border.fade(page, owner, flat, corners[faces], near[faces], tree, reach)
+        at_border.settle(page, source, looks.uv[here], target[looks.place[here]])
+        at_border.follow(before, page, owner, source)
+        after[here] = at_border.looked_up(page, looks.uv[here])
+        image.write(folder / f"page_{k}.png", page)
+    return at_border.by_place(looks.place, after, len(border))
+
+
+def _facts(border: Border, names: Sequence[str], shown: F32, target: F32, after: F32) -> dict[str, Any]:
+    """Metres of border and the colour step there, grey levels, before and after (both tiles being levelled)."""
+    import numpy as np
+
+    before, left = np.abs(shown[1:] - shown[0]), 2 * np.abs(after - target)
+    neighbours = {
+        name: {
+            "border_m": round(length, 2),
+            "step_before": round(float(np.nanmean(step)), 2) if np.isfinite(step).any() else 0.0,
+        }
+        for name, length, step in zip(names, border.length, before, strict=True)
+    }
+    return {
+        "border_m": round(sum(border.length), 2),
+        "step_before": round(float(np.nanmean(before)), 2),
+        "step_after": round(float(np.nanmean(left)), 2),
+        "step_p95_after": round(float(np.nanpercentile(left, 95)), 2),
+        "neighbours": neighbours,
+    }
+
+
+def _link_others(source: Path, folder: Path) -> None:
+    """Put the files of `source` that `folder` has no own version of into it, as hard links where possible."""
+    for path in sorted(source.iterdir()):
+        place = folder / path.name
+        if place.exists():
+            continue
+        try:
+            os.link(path, place)
+        except OSError:
+            shutil.copyfile(path, place)
+
+
+LEVEL = Step("level", 1, level, LevelParams)
