@@ -126,7 +126,7 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
         add(VOXEL, {"cloud": at("split", part)} | scanner, part)
     for group in groups:
         cloud, size = at(f"voxel.{group}", "cloud"), settings.params(VOXEL, group).size
-        add(POISSON, {"cloud": cloud}, group, voxel=size)
+        add(POISSON, {"cloud": cloud}, group, voxel=size, aligned=bool(cell))
         add(TRIM, {"mesh": at(f"poisson.{group}", "mesh"), "cloud": cloud}, group, voxel=size)
         add(ISLANDS, {"mesh": at(f"trim.{group}", "mesh")}, group)
         surface = at(f"islands.{group}", "mesh")

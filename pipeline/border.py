@@ -644,7 +644,7 @@ class Gap:
 
     Attributes:
         length_m: of the border, the mean of both meshes'.
-        one_sided_m: of both, length without any counterpart within 0.3 m.
+        one_sided_m: of both, length without any counterpart within 0.3 m, or beyond the end of the other's border.
         shared: share of both meshes' border edges that both have, vertex for vertex and bit for bit.
         max_m, p99_m, mean_m: distance to the other's border, of what has a counterpart.
         crack_m2: area between the two, of what has a counterpart.
@@ -695,7 +695,8 @@ def gap(a: Mesh, b: Mesh, cell: Cell, neighbour: str) -> Gap:
 def _apart(side: F64, other: F64, known: set[frozenset[Any]]) -> F64:
     """(2, N) of places every centimetre along edges `side` (E, 2, 3): distance to edges `other`, length stood for.
 
-    Edges among the `known` ones of the other are at no distance at all.
+    Edges among the `known` ones of the other are at no distance at all. Where the other's border ends, what goes on
+    has no counterpart: its distance is infinite.
     """
     from scipy.spatial import cKDTree
 
@@ -713,7 +714,12 @@ def _apart(side: F64, other: F64, known: set[frozenset[Any]]) -> F64:
         way = q - p
         square = np.maximum(np.einsum("ijk,ijk->ij", way, way), 1e-30)
         along = np.clip(np.einsum("ijk,ijk->ij", places[apart, None] - p, way) / square, 0, 1)
-        distance[apart] = np.linalg.norm(places[apart, None] - p - along[..., None] * way, axis=2).min(axis=1)
+        away = np.linalg.norm(places[apart, None] - p - along[..., None] * way, axis=2)
+        best = np.arange(len(apart)), away.argmin(axis=1)
+        _, node, degree = np.unique(other.reshape(-1, 3), axis=0, return_inverse=True, return_counts=True)
+        ends = (degree == 1)[node.reshape(-1, 2)[there_edge[nearest.reshape(-1, k)]]][best]  # (N, 2) of that edge
+        past = (ends[:, 0] & (along[best] == 0)) | (ends[:, 1] & (along[best] == 1))
+        distance[apart] = np.where(past, np.inf, away[best])
     return np.stack([distance, length])
 
 

@@ -151,4 +151,4 @@ def _from_photos(
     return code_of_index()[best], np.round(255 * sure).astype(np.uint8), seen.astype(np.uint8), told
 
 
-SEGMENT = Step("segment", 3, segment, SegmentParams)
+SEGMENT = Step("segment", 4, segment, SegmentParams)

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 MIN_POINTS = 50
 MARGIN = 1.02  # the octree's cube must be a little larger than the cloud
 MAX_DEPTH = 16
+BLOCK = 128  # finest cells: octrees that begin at multiples of so many agree where tiles overlap
 
 
 class PoissonParams(Params):
@@ -29,6 +30,8 @@ class PoissonParams(Params):
         point_weight: how strongly the surface is drawn to the points; 0 is the unscreened method.
         threads: 1 gives the same surface at every run; 0, all cores, is up to 1.4 times faster and doesn't.
         timeout: seconds, after which the reconstruction is given up.
+        aligned: begin the octree at a multiple of its cells in the world, so that neighbouring tiles' surfaces agree
+            where they overlap; set by the recipe where tiles meet.
     """
 
     depth: int | None = Field(None, ge=4, le=MAX_DEPTH)
@@ -36,6 +39,7 @@ class PoissonParams(Params):
     point_weight: float = Field(4.0, ge=0)
     threads: int = Field(1, ge=0)
     timeout: float = Field(3600, gt=0)
+    aligned: bool = False
 
 
 def poisson(inputs: Inputs, params: PoissonParams, out: Path, report: Report) -> Done:
@@ -56,7 +60,11 @@ def poisson(inputs: Inputs, params: PoissonParams, out: Path, report: Report) ->
         warnings = [f"only {len(cloud)} points: no surface"] if len(cloud) else []
         return Done({"mesh": out / "mesh.npz"}, {"points": len(cloud), "faces": 0}, warnings)
 
-    length = float((cloud.xyz.max(axis=0) - cloud.xyz.min(axis=0)).max())
+    xyz, normal = cloud.xyz, cloud.normal
+    if params.aligned:  # two points in far corners make the cube: what they leave of surface is trimmed
+        xyz = np.concatenate([xyz, bounds(xyz, cloud.frame.origin, BLOCK * params.voxel / 2)])
+        normal = np.concatenate([normal, np.tile(np.float32([0, 0, 1]), (2, 1))])
+    length = float((xyz.max(axis=0) - xyz.min(axis=0)).max())
     depth, scale = octree(length, params.voxel / 2) if params.depth is None else (params.depth, 1.1)
     cell = scale * length / 2**depth
     told = f"{length:.0f} m at a voxel of {params.voxel * 100:.0f} cm: depth {depth}, cell {cell * 100:.1f} cm"
@@ -67,7 +75,7 @@ def poisson(inputs: Inputs, params: PoissonParams, out: Path, report: Report) ->
         try:
             vertices, faces, density = isolate.call(
                 "pipeline.steps.poisson:reconstruct",
-                *(cloud.xyz, cloud.normal, depth - coarser, scale, params.point_weight, threads),
+                *(xyz, normal, depth - coarser, scale, params.point_weight, threads),
                 timeout=params.timeout,
             )
             break
@@ -78,6 +86,16 @@ def poisson(inputs: Inputs, params: PoissonParams, out: Path, report: Report) ->
     Mesh(cloud.frame, vertices, faces, density).save(out / "mesh.npz")
     facts = {"points": len(cloud), "faces": len(faces), "depth": depth - coarser, "cell_m": round(cell * 2**coarser, 4)}
     return Done({"mesh": out / "mesh.npz"}, facts | {"told": told}, warnings)
+
+
+def bounds(xyz: F32, origin: tuple[float, float, float], block: float) -> F32:
+    """(2, 3) opposite corners of a cube around the points, its middle at a multiple of `block` in the world."""
+    import numpy as np
+
+    low, high = xyz.min(axis=0) + np.asarray(origin), xyz.max(axis=0) + np.asarray(origin)
+    middle = np.rint((low + high) / 2 / block) * block
+    half = np.maximum(high - middle, middle - low).max()
+    return np.array([middle - half - origin, middle + half - origin], np.float32)
 
 
 def octree(length: float, cell: float) -> tuple[int, float]:

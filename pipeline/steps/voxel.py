@@ -81,8 +81,9 @@ def sample(cloud: PointCloud, size: float) -> PointCloud:
 def voxel_groups(xyz: F32, size: float) -> tuple[np.ndarray, np.ndarray]:  # type: ignore[name-defined]  # noqa: F821
     """Points sorted by voxel, and where each voxel starts in that order.
 
-    Voxels lie around whole multiples of `size` (so that a level floor at a round height isn't split in two), and
-    tiles, whose origins are whole metres, have the same ones wherever a metre is a whole number of voxels.
+    Voxels begin at whole multiples of `size`, in height half a voxel beside them (a level floor at a round height
+    isn't split in two). Tiles, whose origins are whole metres, have the same ones wherever a metre is a whole number
+    of voxels.
 
     Returns:
         order (N,) int64 into `xyz`, stable within a voxel; starts (V,) int64 into `order`.
@@ -90,9 +91,9 @@ def voxel_groups(xyz: F32, size: float) -> tuple[np.ndarray, np.ndarray]:  # typ
     import numpy as np
 
     code = np.zeros(len(xyz), np.int64)
-    for column in (xyz[:, 2], xyz[:, 1], xyz[:, 0]):
-        # a little more than half: a place on the face of two voxels is in the same one, whatever the origin
-        cell = np.floor(column.astype(np.float64) / size + 0.5 + 1e-6).astype(np.int64)
+    for axis, shift in ((2, 0.5), (1, 0.0), (0, 0.0)):
+        # the guard: a place on the face of two voxels is in the same one, whatever the origin
+        cell = np.floor(xyz[:, axis].astype(np.float64) / size + shift + 1e-6).astype(np.int64)
         cell -= cell.min()
         code = code * (cell.max() + 1) + cell
     order = np.argsort(code, kind="stable")

@@ -99,7 +99,7 @@ def test_voxel_matches_a_plain_implementation() -> None:
     cloud = bumpy(3000)
     thin = sample(cloud, 0.5)
     cells: dict[tuple[int, ...], list[int]] = {}
-    for i, key in enumerate(np.floor(cloud.xyz / 0.5 + 0.5).astype(int).tolist()):
+    for i, key in enumerate(np.floor(cloud.xyz / 0.5 + (0, 0, 0.5)).astype(int).tolist()):
         cells.setdefault(tuple(key[::-1]), []).append(i)
     expected = np.array([cloud.xyz[members].mean(axis=0) for _, members in sorted(cells.items())])
     assert len(thin) == len(cells)
