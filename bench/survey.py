@@ -151,6 +151,7 @@ def borders(out: Path) -> dict[str, float]:
     length = np.array([b["length_m"] for b in body])
     return {
         "border_gap_m": max(b["gap_m"] for b in body),
+        "border_gap_p99_m": round(float(np.average([b["gap_p99_m"] for b in body], weights=length)), 6),
         "border_colour_step": round(float(np.average([b["colour_step"] for b in body], weights=length)), 3),
         "border_one_sided": round(float(sum(b["one_sided_m"] for b in body) / length.sum() / 2), 4),
         "border_shared": round(float(np.average([b["shared"] for b in body], weights=length)), 4),

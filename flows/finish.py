@@ -158,6 +158,7 @@ def _borders(done: Mapping[str, Manifest]) -> list[dict[str, Any]]:
                 "neighbour": name,
                 "length_m": round(length, 2),
                 "gap_m": max(v["gap_m"] for v in values),
+                "gap_p99_m": round(sum(v["gap_p99_m"] * v["length_m"] for v in values) / max(length, 1e-9), 6),
                 "one_sided_m": round(sum(v["one_sided_m"] for v in values), 2),
                 "shared": round(sum(v["shared"] * v["length_m"] for v in values) / max(length, 1e-9), 4),
                 "overlap_m": max(v["overlap_m"] for v in values),

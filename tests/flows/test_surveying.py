@@ -38,10 +38,10 @@ def told(out: Path) -> dict[str, Any]:
 def test_tiles_share_their_borders(made: Path) -> None:
     (border,) = told(made)["borders"]
     assert border["length_m"] > 10
-    assert border["gap_m"] == 0 and border["overlap_m"] < 1e-3
-    assert border["shared"] > 0.95
-    assert border["one_sided_m"] < 0.03 * border["length_m"]
-    assert border["colour_step"] < 1.5
+    assert border["gap_m"] < 0.3 and border["gap_p99_m"] == 0 and border["overlap_m"] < 1e-3
+    assert border["shared"] > 0.99
+    assert border["one_sided_m"] < 0.02 * border["length_m"]
+    assert border["colour_step"] < 2
 
 
 def test_gazebo_loads_all_tiles_as_one_world(made: Path) -> None:
@@ -73,7 +73,6 @@ def test_a_tile_that_fails_is_told_and_the_others_are_made(survey: Path, made: P
     assert "truncated or damaged" in second["reason"] and cloud.name in second["reason"]
     shutil.copyfile(sorted(survey.glob("*/cloud.laz"))[1], cloud)
     good(scan2sim("survey", broken, "--out", out, *SMALL))
-    assert told(out)["borders"][0]["gap_m"] == 0
     assert contents(out) == contents(made)
 
 
