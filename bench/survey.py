@@ -1,9 +1,10 @@
 """A kilometre in ten tiles: workers, rerun, borders, and what Prefect costs.
 
-`python -m bench.survey [--out bench-out/survey] [--parts one two ray plain rerun photo]`. The synthetic street is
-generated and cut once; every part runs the same survey into a folder of its own, each step on one core, so that two
-workers are two cores and one is one. Parts that aren't asked for are read from their last run's notes. Ends with
-`RESULT {json}`.
+`python -m bench.survey [--out bench-out/survey] [--parts plain one two ray rerun photo] [--fine]`. The synthetic street
+is generated and cut once; every part runs the same survey into a folder of its own, each step on one core, so that two
+workers are two cores and one is one. Settings are coarser than the defaults (`COARSE`), so that five runs of a
+kilometre take an hour and not three; `--fine` leaves them out. What Prefect costs weighs the more. Parts that aren't
+asked for are read from their last run's notes. Ends with `RESULT {json}`.
 """
 
 from __future__ import annotations
@@ -28,12 +29,13 @@ from flows.cut import Options, cut_survey
 ROOT = Path(__file__).resolve().parent.parent
 PARTS = ("plain", "one", "two", "ray", "rerun", "photo")
 LENGTH, POINTS, PHOTOS, WIDTH, SEED = 1000.0, 1.0e7, 200, 800, 3
-RUNS = {  # part: options of `scan2sim survey`
+RUNS: dict[str, tuple[str, ...]] = {  # part: options of `scan2sim survey`
     "plain": ("--runner", "processes", "--jobs", "1"),
     "one": ("--runner", "dask", "--jobs", "1"),
     "two": ("--runner", "dask", "--jobs", "2"),
     "ray": ("--runner", "ray", "--jobs", "2"),
 }
+COARSE = ("voxel.size=0.2", "unwrap.texel=0.04", "visibility.pixels=500000", "pictures.width=640")
 EMPTY = """
 import flows.prefect_settings
 from prefect import flow
@@ -47,7 +49,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=ROOT / "bench-out" / "survey")
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--fine", action="store_true", help="the defaults' settings: three hours")
     arguments = parser.parse_args()
+    if not arguments.fine:
+        for name, options in RUNS.items():
+            RUNS[name] = (*options, *(part for value in COARSE for part in ("--set", value)))
     out: Path = arguments.out
     survey = street(out)
     notes = out / "notes.json"

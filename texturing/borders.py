@@ -19,8 +19,8 @@ def borders(inputs: Inputs, params: CellParams, out: Path, report: Report) -> Do
 
     Facts, by neighbour and class: `length_m` of border; `gap_m`, the farthest that a place of one mesh's border is
     from the other's, where that goes on alongside (`gap_p99_m`: 99 of 100 places are nearer); `one_sided_m`, where it
-    doesn't; `shared`, of 1, the border edges
-    that are the very same in both; `overlap_m` beyond the border; `colour_step` and its 95th percentile, grey levels.
+    doesn't; `shared`, of 1, the border edges that are the very same in both; `overlap_m` beyond the border;
+    `colour_step` and its 95th percentile, grey levels.
     """
     from pipeline.io import textured
 
@@ -42,7 +42,8 @@ def _measured(own: Textured, other: Textured, cell: Cell, name: str) -> dict[str
 
     between, (step, p95, _) = gap(own.mesh, other.mesh, cell, name), border_step(own, other)
     values = {
-        "length_m": between.length_m, "gap_m": between.max_m, "gap_p99_m": between.p99_m, "one_sided_m": between.one_sided_m,
+        "length_m": between.length_m, "gap_m": between.max_m, "gap_p99_m": between.p99_m,
+        "one_sided_m": between.one_sided_m,
         "shared": between.shared, "overlap_m": between.overlap_m, "colour_step": step, "colour_step_p95": p95,
     }  # fmt: skip
     return {key: round(float(value), 6 if key.startswith("gap") else 4) for key, value in values.items()}
