@@ -25,9 +25,11 @@ from bench.measure import measure
 from data_samples.photos import Effects
 from data_samples.street import generate
 from flows.cut import Options, cut_survey
+from pipeline.io.tile import read_tile
 
 ROOT = Path(__file__).resolve().parent.parent
-PARTS = ("plain", "one", "two", "ray", "rerun", "photo")
+PARTS = ("plain", "one", "two", "ray", "rerun", "photo", "tile")
+MIDDLE = "street_0004"
 LENGTH, POINTS, PHOTOS, WIDTH, SEED = 1000.0, 1.0e7, 200, 800, 3
 RUNS: dict[str, tuple[str, ...]] = {  # part: options of `scan2sim survey`
     "plain": ("--runner", "processes", "--jobs", "1"),
@@ -63,8 +65,10 @@ def main() -> None:
             known[part] = whole(survey, out / part, RUNS[part])
         elif part == "rerun":
             known[part] = rerun(survey, out / "two")
-        else:
+        elif part == "photo":
             known[part] = photo(survey, out)
+        else:
+            known[part] = one_tile(survey / MIDDLE, out / "tile")
         print(part, json.dumps(known[part]), flush=True)
         notes.write_text(json.dumps(known, indent=1))
     told(known, out)
@@ -115,6 +119,26 @@ def rerun(survey: Path, out: Path) -> dict[str, Any]:
     empty = measure([sys.executable, "-c", EMPTY])
     again = measure(command(survey, out, RUNS["two"]))
     return {"seconds": round(again.seconds, 1), "empty_flow_seconds": round(empty.seconds, 1)}
+
+
+def one_tile(tile: Path, out: Path) -> dict[str, Any]:
+    """Run one tile with the defaults' settings, a core a step: what kilometres are projected from."""
+    shutil.rmtree(out, ignore_errors=True)
+    for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
+        os.environ[name] = "1"
+    measure([str(Path(sys.executable).parent / "scan2sim"), "run", str(tile), "--out", str(out), "--jobs", "1"])
+    body = json.loads((out / "report.json").read_text())
+    manifests = [json.loads(path.read_text()) for path in (out / "steps").glob("*/*/manifest.json")]
+    sources = read_tile(tile)
+    read = sum(path.stat().st_size for path in (*sources.clouds, *(view.photo for view in sources.views)))
+    return {
+        "step_seconds": body["seconds"],
+        "largest_step_gb": round(body["peak_mb"] / 1000, 2),
+        "gb_read": round(read / 1e9, 3),
+        "gb_written": round(sum(sum(m["sizes"].values()) for m in manifests) / 1e9, 2),
+        "gb_world": round(body["world"]["bytes"] / 1e9, 2),
+        "points": body["steps"]["ingest"]["facts"]["points"],
+    }
 
 
 def photo(survey: Path, out: Path) -> dict[str, Any]:
@@ -177,10 +201,16 @@ def told(known: dict[str, dict[str, Any]], out: Path) -> None:
         result["same_bytes_ray"] = known["one"]["contents"] == known["ray"]["contents"]
     if "rerun" in known:
         result["rerun_seconds"] = round(known["rerun"]["seconds"] - known["rerun"]["empty_flow_seconds"], 1)
-    if "two" in known:
-        result |= borders(out / "two")
+    for part in RUNS:
+        if part in known:
+            result |= borders(out / part)
+            break
     if {"one", "plain"} <= known.keys():
         result["prefect_overhead"] = round(known["one"]["seconds"] / known["plain"]["seconds"] - 1, 3)
+    if "tile" in known:
+        cost = {name: round(1000 * known["tile"][name], 1) for name in ("gb_written", "gb_world")}
+        cost["cpu_hours"] = round(1000 * known["tile"]["step_seconds"] / 3600, 1)
+        print("100 km, a thousand such tiles:", json.dumps(cost))
     print("RESULT " + json.dumps(result))
 
 

@@ -140,8 +140,8 @@ def survey(
     out: Annotated[
         str, typer.Option("--out", "-o", help="Folder for worlds, reports and kept results, or its s3:// URL.")
     ],
-    length: Annotated[float, typer.Option(help="Metres of road a tile, where it is cut here.")] = 100.0,
-    buffer: Annotated[float, typer.Option(help="Metres of overlap, where it is cut here.")] = 5.0,
+    length: Annotated[float | None, typer.Option(help="Metres of road a tile, where it is cut here.")] = None,
+    buffer: Annotated[float | None, typer.Option(help="Metres of overlap, where it is cut here.")] = None,
     set_: Sets = None,
     config: Config = None,
     hold_out: HoldOut = None,

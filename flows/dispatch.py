@@ -58,7 +58,10 @@ def dispatch(
         if running:
             label = ended.get()
             item, future = running.pop(label)
-            outcome = future.result(raise_on_failure=False)
+            try:
+                outcome = future.result(raise_on_failure=False)
+            except Exception as error:  # the runner has given the step up: it took several workers with it
+                outcome = error
             manifest = None if isinstance(outcome, BaseException) else store.find(label, item.key)
             if manifest is not None:
                 front.done[label] = manifest

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -22,7 +23,7 @@ from pipeline.io.survey import Survey
 from pipeline.store import Digests, Manifest, Store
 from pipeline.types import Tile
 
-TILES = "tiles"
+TILES, PICTURE = "tiles", "picture.jpg"
 SHOWN = {"export", "exposure", "pictures", "score"}
 """Steps whose files, not just figures, are shown."""
 
@@ -60,7 +61,7 @@ def finish(survey: Survey, made: Sequence[Made], store: Store, out: Path, settin
         _finish_tile(one, store.within(one.name), out / TILES / one.name, settings)
     if whole:
         _together(survey, whole, out, digests)
-    return write_survey_report(out, survey.name, [_state(one) for one in made])
+    return write_survey_report(out, survey.name, [_state(one, out) for one in made])
 
 
 def _finish_tile(one: Made, store: Store, out: Path, settings: Settings) -> None:
@@ -74,6 +75,9 @@ def _finish_tile(one: Made, store: Store, out: Path, settings: Settings) -> None
             store.read(label, keys[label])
         publish(store, planned, done, out, one.tile, settings)
         seconds = sum(done[item.node.label].seconds for item in planned if item.reason is not None)
+        shown = store.folder("pictures", keys["pictures"]) / done["pictures"].files["pictures"] / "driver.jpg"
+        if shown.is_file():
+            shutil.copyfile(shown, out / PICTURE)
         write_report(one.tile, planned, done, store, out, seconds=seconds)
     store.sweep(keys)
 
@@ -93,7 +97,7 @@ def _together(survey: Survey, whole: Sequence[Made], out: Path, digests: Digests
                 one.name, one.tile.frame, sources, scanned,
                 None if times is None or not np.isfinite(times).all() else (float(times[0]), float(times[-1])),
                 _there(place / "world" / f"{one.name}.sdf"), _there(place / "world" / f"{one.name}.glb"),
-                _there(place / "report.html"),
+                _there(place / "report.html"), _there(place / PICTURE),
             )
         )  # fmt: skip
     worlds.assemble(out, survey.name, tiles)
@@ -105,7 +109,7 @@ def _there(path: Path) -> Path | None:
     return path if path.is_file() else None
 
 
-def _state(one: Made) -> TileState:
+def _state(one: Made, out: Path) -> TileState:
     """What the survey's page tells of a tile."""
     cell = one.tile.cell if one.tile else None
     ring = np.zeros((0, 2)) if one.tile is None or cell is None else outline(cell, *_bounds(one.tile))
@@ -117,6 +121,7 @@ def _state(one: Made) -> TileState:
         reason=str(one.error) if one.error else None,
         figures=_figures(one.tile, done) if one.tile and done else {},
         report=f"{TILES}/{one.name}/report.html" if done else None,
+        thumbnail=_there(out / TILES / one.name / PICTURE),
         warnings=[f"{label}: {text}" for label, manifest in done.items() for text in manifest.warnings],
         borders=_borders(done),
     )

@@ -93,7 +93,8 @@ def survey_of(
     place: str | Path,
     target: str | Path,
     *,
-    tiles: TilesEntry | None = None,
+    length: float | None = None,
+    buffer: float | None = None,
     say: Say = print,
     report: Report = silent,
 ) -> str:
@@ -104,7 +105,7 @@ def survey_of(
     Args:
         place: a file, or a folder that holds one; in object storage a survey's folder.
         target: gets `prepared/` with `slam/`, `corridor/` and `survey/`, as needed.
-        tiles: how it is cut, if not as the drive says.
+        length, buffer: metres, how it is cut, if not as the drive says or as usual.
         say: told what was warned of.
 
     Raises:
@@ -124,12 +125,14 @@ def survey_of(
     with locked(out / PREPARED):
         digests = Digests(out / PREPARED / "digests.json")
         once = _Once(digests)
-        corridor = source
+        corridor, entry = source, TilesEntry.model_validate({})
         if source.name == "drive.toml":
             drive = read_drive(source)
-            tiles = tiles or drive.tiles
+            entry = drive.tiles
             corridor = _corridor(drive, source, out / PREPARED, once, say, report)
-        survey = _cut(corridor, out / PREPARED / "survey", tiles or TilesEntry.model_validate({}), once, say, report)
+        given = {"length": length, "buffer": buffer}
+        entry = entry.model_copy(update={name: value for name, value in given.items() if value is not None})
+        survey = _cut(corridor, out / PREPARED / "survey", entry, once, say, report)
         digests.save()
     return str(survey)
 

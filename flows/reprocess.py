@@ -16,9 +16,9 @@ from pipeline.errors import BusyError
 
 @flow(name="reprocess")
 def reprocess(
-    source: str, out: str, length: float = 100.0, buffer: float = 5.0, settings: dict[str, Any] | None = None,
-    runner: str = "threads", workers: int = 2, memory: str | None = None, cores: int | None = None,
-    address: str | None = None,
+    source: str, out: str, length: float | None = None, buffer: float | None = None,
+    settings: dict[str, Any] | None = None, runner: str = "threads", workers: int = 2,
+    memory: str | None = None, cores: int | None = None, address: str | None = None,
 ) -> State[Any]:  # fmt: skip
     """Redo what depends on new or changed clouds, photos, poses, settings or steps; arguments as `survey`'s.
 

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import base64
 from pathlib import Path
 from typing import Any
 
 import flows.prefect_settings  # noqa: F401  # isort: skip  # before prefect
 from prefect import flow, get_run_logger, task
-from prefect.artifacts import create_markdown_artifact, create_table_artifact
+from prefect.artifacts import create_image_artifact, create_markdown_artifact, create_table_artifact
 from prefect.cache_policies import NO_CACHE
 from prefect.task_runners import TaskRunner, ThreadPoolTaskRunner
 
-from flows.prepare import TilesEntry, survey_of
+from flows.prepare import survey_of
 from flows.settings import Settings
 from flows.survey_report import overview, rows
 from flows.surveying import make_survey
@@ -36,14 +37,16 @@ def task_runner(name: str, workers: int, address: str | None = None) -> TaskRunn
     if name == "ray":
         from prefect_ray import RayTaskRunner
 
-        return RayTaskRunner(address=address, init_kwargs={} if address else {"num_cpus": workers})
+        return RayTaskRunner(
+            address=address, init_kwargs={} if address else {"num_cpus": workers, "include_dashboard": False}
+        )
     raise SettingError("runner", f"there is no `{name}`", "Choose threads, dask or ray")
 
 
 @task(name="prepare", task_run_name="import and cut", cache_policy=NO_CACHE)
-def prepare(source: str, out: str, length: float, buffer: float) -> str:
+def prepare(source: str, out: str, length: float | None, buffer: float | None) -> str:
     """SLAM, import and cut, where they are needed; returns the path of the `survey.toml`."""
-    return str(survey_of(source, out, tiles=TilesEntry(length=length, buffer=buffer), say=get_run_logger().warning))
+    return str(survey_of(source, out, length=length, buffer=buffer, say=get_run_logger().warning))
 
 
 @flow(name="tiles")
@@ -58,23 +61,26 @@ def tiles(
 
 
 def publish(out: Path) -> None:
-    """Show the survey's map and tables as artifacts of the flow run."""
+    """Show how the tiles fare, their figures and a picture as artifacts of the flow run."""
     create_markdown_artifact(overview(out), key=artifact_key("survey", out.name), description="tiles by state")
     create_table_artifact(rows(out), key=artifact_key("tiles", out.name), description="figures of all tiles")
+    for picture in sorted(out.glob("tiles/*/picture.jpg"))[:1]:
+        pixels = base64.b64encode(picture.read_bytes()).decode()
+        create_image_artifact(f"data:image/jpeg;base64,{pixels}", key=artifact_key("picture", out.name))
 
 
 @flow(name="survey")
 def survey(
-    source: str, out: str, length: float = 100.0, buffer: float = 5.0, settings: dict[str, Any] | None = None,
-    runner: str = "threads", workers: int = 2, memory: str | None = None, cores: int | None = None,
-    address: str | None = None,
+    source: str, out: str, length: float | None = None, buffer: float | None = None,
+    settings: dict[str, Any] | None = None, runner: str = "threads", workers: int = 2,
+    memory: str | None = None, cores: int | None = None, address: str | None = None,
 ) -> str:  # fmt: skip
     """Make a survey's worlds on the runner that is named; what an earlier run has finished is kept.
 
     Args:
         source: a drive, a corridor or a survey (`flows.prepare`).
         out: folder for the worlds, the reports and kept results.
-        length, buffer: metres, of tiles that are cut here.
+        length, buffer: metres, of tiles that are cut here; default: as the drive says, or 100 and 5.
         settings: by step, as in a settings file.
         runner: "threads", "dask" or "ray".
         workers: steps at a time.

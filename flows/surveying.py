@@ -15,7 +15,7 @@ from flows.execute import Executor, limit_cores, locked, versions
 from flows.finish import Made, finish
 from flows.memory import parse
 from flows.planning import Planned, plan
-from flows.prepare import TilesEntry, survey_of
+from flows.prepare import survey_of
 from flows.recipe import survey_recipe
 from flows.run import STORE, Log, default_jobs, execute_shown
 from flows.settings import Settings
@@ -28,15 +28,15 @@ from pipeline.types import Tile
 
 
 def run_source(
-    source: str, target: str, settings: Settings, *, length: float, buffer: float, jobs: int, memory: str | None,
-    runner: str, address: str | None, cores: int | None,
+    source: str, target: str, settings: Settings, *, length: float | None, buffer: float | None, jobs: int,
+    memory: str | None, runner: str, address: str | None, cores: int | None,
 ) -> None:  # fmt: skip
     """`scan2sim survey`: in processes of this machine, or through Prefect on a runner that is named.
 
     Args:
         source: a drive, a corridor or a survey (`flows.prepare`).
         target: folder for all that is made; both may be in object storage.
-        length, buffer: metres, of tiles that are cut here.
+        length, buffer: metres, of tiles that are cut here; default: as the drive says, or 100 and 5.
         jobs: steps at a time; 0: as the cores allow.
         memory: what steps may need together, "20GB".
         runner: "processes", or Prefect's "threads", "dask", "ray".
@@ -57,7 +57,7 @@ def run_source(
         return
     limit_cores(cores)
     with progress("survey") as report:
-        path = survey_of(source, target, tiles=TilesEntry(length=length, buffer=buffer), say=warn, report=report)
+        path = survey_of(source, target, length=length, buffer=buffer, say=warn, report=report)
     log = Log(likeness(target) / "run.log")
 
     def run(planned: list[Planned], store: Store, failures: dict[str, ScanError]) -> dict[str, Manifest]:

@@ -63,7 +63,7 @@ def poisson(inputs: Inputs, params: PoissonParams, out: Path, report: Report) ->
     xyz, normal = cloud.xyz, cloud.normal
     if params.aligned:  # two points in far corners make the cube: what they leave of surface is trimmed
         xyz = np.concatenate([xyz, bounds(xyz, cloud.frame.origin, BLOCK * params.voxel / 2)])
-        normal = np.concatenate([normal, np.tile(np.float32([0, 0, 1]), (2, 1))])
+        normal = np.concatenate([normal, np.tile(np.array([0, 0, 1], np.float32), (2, 1))])
     length = float((xyz.max(axis=0) - xyz.min(axis=0)).max())
     depth, scale = octree(length, params.voxel / 2) if params.depth is None else (params.depth, 1.1)
     cell = scale * length / 2**depth

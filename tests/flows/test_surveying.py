@@ -7,9 +7,15 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from flows.cut import Options, cut_survey
+from pipeline.classes import GROUPS, group_of
+from pipeline.io import las
+from pipeline.io.tile import read_tile
+from pipeline.types import Mesh
 from tests.flows.test_cli import SMALL, bad, good, scan2sim
 from tests.gazebo.checker import check_world
 
@@ -42,6 +48,32 @@ def test_tiles_share_their_borders(made: Path) -> None:
     assert border["shared"] > 0.99
     assert border["one_sided_m"] < 0.02 * border["length_m"]
     assert border["colour_step"] < 2
+
+
+def test_where_classes_meet_there_is_no_hole(made: Path, survey: Path) -> None:
+    """Between a point of the ground and one of a wall's foot right beside it: rays from above hit something."""
+    import open3d as o3d
+
+    for path in survey.glob("*/tile.toml"):
+        tile = read_tile(path)
+        assert tile.cell is not None
+        cloud = las.read(tile.clouds[0], tile.frame)
+        group = group_of()[cloud.label]
+        xyz = cloud.xyz[tile.cell.outside(cloud.xyz[:, :2] + np.asarray(tile.frame.origin)[:2]) < -0.2]
+        group = group[tile.cell.outside(cloud.xyz[:, :2] + np.asarray(tile.frame.origin)[:2]) < -0.2]
+        ground, wall = xyz[group == GROUPS.index("terrain")], xyz[group == GROUPS.index("building")]
+        distance, nearest = cKDTree(wall).query(ground, distance_upper_bound=0.15)
+        beside = np.isfinite(distance)
+        assert beside.sum() > 100
+        middle = (ground[beside] + wall[nearest[beside]]) / 2
+        scene = o3d.t.geometry.RaycastingScene()
+        for file in made.glob(f"steps/{path.parent.name}/decimate.*/*/mesh.npz"):
+            mesh = Mesh.load(file)
+            scene.add_triangles(mesh.vertices, mesh.faces.astype(np.uint32))
+        down = np.tile(np.float32([0, 0, -1]), (len(middle), 1))
+        rays = np.concatenate([middle + np.float32([0, 0, 0.4]), down], axis=1)
+        deep = scene.cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy()
+        assert (deep < 0.8).mean() > 0.995
 
 
 def test_gazebo_loads_all_tiles_as_one_world(made: Path) -> None:

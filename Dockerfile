@@ -1,0 +1,40 @@
+# syntax=docker/dockerfile:1
+# docker build --target cpu -t scan2sim:cpu .     (or --target gpu -t scan2sim:gpu)
+FROM python:3.11-slim AS system
+COPY packages.txt /tmp/
+RUN apt-get update \
+    && xargs -a /tmp/packages.txt apt-get install -y --no-install-recommends \
+    && rm -rf /var/lib/apt/lists/* \
+    && useradd --create-home --uid 1000 scan2sim \
+    && install -d -o scan2sim -g scan2sim /data
+ENV PATH=/opt/venv/bin:$PATH PYTHONUNBUFFERED=1 DO_NOT_TRACK=1
+WORKDIR /app
+
+FROM system AS code
+RUN python -m venv /opt/venv
+COPY . .
+
+# torch for CPUs comes without gigabytes of CUDA; what it depends on comes with the rest
+FROM code AS cpu-environment
+RUN --mount=type=cache,target=/root/.cache/pip \
+    pip install --no-deps -c constraints.txt --index-url https://download.pytorch.org/whl/cpu torch \
+    && pip install -c constraints.txt -e '.[segmentation,slam,ray,s3]'
+
+FROM code AS gpu-environment
+RUN --mount=type=cache,target=/root/.cache/pip \
+    pip install -c constraints.txt -e '.[segmentation,slam,ray,s3]'
+
+FROM system AS gpu
+ENV NVIDIA_VISIBLE_DEVICES=all NVIDIA_DRIVER_CAPABILITIES=compute,utility
+COPY --from=gpu-environment /opt/venv /opt/venv
+COPY --from=gpu-environment /app /app
+USER scan2sim
+ENTRYPOINT ["/app/deploy/entrypoint"]
+CMD ["--help"]
+
+FROM system AS cpu
+COPY --from=cpu-environment /opt/venv /opt/venv
+COPY --from=cpu-environment /app /app
+USER scan2sim
+ENTRYPOINT ["/app/deploy/entrypoint"]
+CMD ["--help"]
