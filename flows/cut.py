@@ -259,7 +259,7 @@ class _Writer:
         photos = self._photos(index, cell)
         self.given.update(photos)
         used = {spec.photos[i].camera: tile.views[i].camera for i in photos}
-        truth = {"mesh": tile.truth_mesh, "points": tile.truth_points}
+        truth = {} if self._options.copy else {"mesh": tile.truth_mesh, "points": tile.truth_points}
         write_tile(
             folder,
             name=name,

@@ -10,6 +10,7 @@ import flows.prefect_settings  # noqa: F401  # isort: skip  # before prefect
 from prefect import flow, get_run_logger, task
 from prefect.artifacts import create_image_artifact, create_markdown_artifact, create_table_artifact
 from prefect.cache_policies import NO_CACHE
+from prefect.client.orchestration import get_client
 from prefect.task_runners import TaskRunner, ThreadPoolTaskRunner
 
 from flows.prepare import survey_of
@@ -32,14 +33,17 @@ def task_runner(name: str, workers: int, address: str | None = None) -> TaskRunn
     if name == "dask":
         from prefect_dask import DaskTaskRunner
 
-        here = {"n_workers": workers, "threads_per_worker": 1, "memory_limit": 0, "dashboard_address": None}
+        with get_client(sync_client=True) as client:  # workers told of this run's server start none of their own
+            env = {"PREFECT_API_URL": str(client.api_url)}
+        with get_client(sync_client=True) as client:  # workers told of this run's server start none of their own
+            env = {"PREFECT_API_URL": str(client.api_url)}
+        here = {"n_workers": workers, "threads_per_worker": 1, "memory_limit": 0, "dashboard_address": ":0", "env": env}
         return DaskTaskRunner(address=address) if address else DaskTaskRunner(cluster_kwargs=here)
     if name == "ray":
         from prefect_ray import RayTaskRunner
 
-        return RayTaskRunner(
-            address=address, init_kwargs={} if address else {"num_cpus": workers, "include_dashboard": False}
-        )
+        own = {"address": "local", "num_cpus": workers, "include_dashboard": False}
+        return RayTaskRunner(address=address, init_kwargs={} if address else own)
     raise SettingError("runner", f"there is no `{name}`", "Choose threads, dask or ray")
 
 

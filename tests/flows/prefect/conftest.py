@@ -1,0 +1,274 @@
+"""Prefect as it is deployed: servers, databases and workers, each a real process, stopped when the tests are done."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.conftest import ROOT
+
+pytest.importorskip("prefect")
+
+QUIET = {
+    "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
+    "PREFECT_SERVER_UI_ENABLED": "false",
+    "PREFECT_CLI_PROMPT": "false",
+    "PREFECT_CLI_COLORS": "false",
+    "PREFECT_CLI_WRAP_LINES": "false",
+    "DO_NOT_TRACK": "1",
+    "RAY_USAGE_STATS_ENABLED": "0",
+}
+ENDED = ("COMPLETED", "FAILED", "CRASHED", "CANCELLED")
+
+
+def free_port() -> int:
+    """A port that nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def wait_for(what: str, found: Callable[[], Any], seconds: float = 60.0) -> Any:
+    """Ask until the answer isn't false."""
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        if answer := found():
+            return answer
+        time.sleep(0.1)
+    raise TimeoutError(f"{what}: not within {seconds:.0f} s")
+
+
+def kill(process: subprocess.Popen[Any]) -> None:
+    """Kill a process that was started in a session of its own, and all that it started there."""
+    try:
+        os.killpg(process.pid, signal.SIGKILL)
+    except ProcessLookupError:
+        pass
+    process.wait()
+
+
+def processes(name: str, value: str) -> list[int]:
+    """Processes that have this in their environment: ours, by whatever they were started."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/environ"):
+        try:
+            if f"{name}={value}" in path.read_bytes().decode(errors="replace").split("\0"):
+                found.append(int(path.parent.name))
+        except OSError:
+            continue  # it has ended
+    return found
+
+
+class Server:
+    """Prefect's server on a port of its own.
+
+    Args:
+        home: for its settings, logs, and its SQLite database.
+        database: URL of another database.
+    """
+
+    def __init__(self, home: Path, database: str | None = None) -> None:
+        self.home, self.port = home, free_port()
+        self.url = f"http://127.0.0.1:{self.port}/api"
+        self.env = {k: v for k, v in os.environ.items() if not k.startswith("PREFECT_")}
+        self.env |= {**QUIET, "PREFECT_HOME": str(home), "PREFECT_API_URL": self.url}
+        self.env["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+        if database:
+            self.env["PREFECT_SERVER_DATABASE_CONNECTION_URL"] = database
+        self._process: subprocess.Popen[Any] | None = None
+
+    def start(self) -> None:
+        """Start it, or start it again."""
+        with open(self.home / "server.log", "a") as log:
+            command = [sys.executable, "-m", "prefect", "server", "start", "--port", str(self.port)]
+            self._process = subprocess.Popen(
+                command, env=self.env, cwd=self.home, stdout=log, stderr=log, start_new_session=True
+            )
+        try:
+            wait_for("server", self._healthy, 120)
+        except TimeoutError:
+            self.kill()
+            raise RuntimeError((self.home / "server.log").read_text()[-3000:]) from None
+
+    def kill(self) -> None:
+        """As a power cut does."""
+        if self._process:
+            kill(self._process)
+
+    def close(self) -> None:
+        """End it, and all that was started with its address."""
+        self.kill()
+        for process in processes("PREFECT_HOME", str(self.home)):
+            try:
+                os.kill(process, signal.SIGKILL)
+            except ProcessLookupError:
+                continue
+
+    def _healthy(self) -> bool:
+        try:
+            return bool(self.api("GET", "/health"))
+        except OSError:
+            return False
+
+    def api(self, method: str, path: str, body: Any = None) -> Any:
+        """Call Prefect's REST API."""
+        data = None if body is None else json.dumps(body).encode()
+        request = urllib.request.Request(self.url + path, data, {"Content-Type": "application/json"}, method=method)
+        for _ in range(10):
+            try:
+                with urllib.request.urlopen(request, timeout=30) as answer:
+                    text = answer.read()
+                return json.loads(text) if text else None
+            except urllib.error.HTTPError as error:
+                if error.code != 503:
+                    raise
+                time.sleep(1)  # SQLite is busy
+        raise TimeoutError(f"{path}: the database is busy for good")
+
+    def cli(self, *args: str, **env: str) -> subprocess.CompletedProcess[str]:
+        """Run `prefect ARGS` in the repository."""
+        return self.script(sys.executable, "-m", "prefect", *args, **env)
+
+    def script(self, *command: str, **env: str) -> subprocess.CompletedProcess[str]:
+        """Run a command in the repository."""
+        return subprocess.run(
+            command, env=self.env | env, cwd=ROOT, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+            timeout=180,
+        )  # fmt: skip
+
+    def spawn(self, *args: str, log: Path, **env: str) -> subprocess.Popen[Any]:
+        """Start `python ARGS` in the repository, in a session of its own."""
+        with open(log, "w") as file:
+            return subprocess.Popen(
+                [sys.executable, *args], env=self.env | env, cwd=ROOT, stdout=file, stderr=file, start_new_session=True
+            )
+
+    @contextmanager
+    def worker(self, pool: str) -> Iterator[subprocess.Popen[Any]]:
+        """A worker that polls a process pool."""
+        process = self.spawn(
+            "-m", "prefect", "worker", "start", "--pool", pool, "--no-create-pool-if-not-found",
+            log=self.home / f"{pool}.log", PREFECT_WORKER_QUERY_SECONDS="1",
+        )  # fmt: skip
+        try:
+            yield process
+        finally:
+            kill(process)
+
+    def deployment(self, flow: str, name: str) -> dict[str, Any]:
+        """A deployment as the server knows it."""
+        return self.api("GET", f"/deployments/name/{flow}/{name}")
+
+    def run(self, deployment: dict[str, Any], **parameters: Any) -> str:
+        """Have a deployment run now; returns the run's id."""
+        made = self.api("POST", f"/deployments/{deployment['id']}/create_flow_run", {"parameters": parameters})
+        return made["id"]
+
+    def runs(self, deployment: dict[str, Any], state: str) -> list[dict[str, Any]]:
+        """All runs of a deployment that are in this state."""
+        runs = self.api("POST", "/flow_runs/filter", {"deployments": {"id": {"any_": [deployment["id"]]}}})
+        return [run for run in runs if run["state_type"] == state]
+
+    @contextmanager
+    def scheduled(self, deployment: dict[str, Any], parameters: dict[str, Any], **when: Any) -> Iterator[None]:
+        """A schedule of a deployment, as long as it is held."""
+        path = f"/deployments/{deployment['id']}/schedules"
+        made = self.api(
+            "POST", path, [{"schedule": when, "active": True, "max_scheduled_runs": 5, "parameters": parameters}]
+        )
+        try:
+            yield
+        finally:
+            self.api("DELETE", f"{path}/{made[0]['id']}")
+
+    def ended(self, run: str, seconds: float = 90.0) -> dict[str, Any]:
+        """Wait for the end of a run; returns its state."""
+
+        def state() -> dict[str, Any] | None:
+            now = self.api("GET", f"/flow_runs/{run}")["state"]
+            return now if now["type"] in ENDED else None
+
+        return wait_for(f"run {run}", state, seconds)
+
+
+@contextmanager
+def postgres() -> Iterator[str]:
+    """A PostgreSQL of our own; yields its URL as Prefect wants it."""
+    debian = sorted(map(str, Path("/usr/lib/postgresql").glob("*/bin")), reverse=True)  # not on the PATH there
+    path = os.pathsep.join([*debian, os.environ.get("PATH", "")])
+    initdb, serve = shutil.which("initdb", path=path), shutil.which("postgres", path=path)
+    if not initdb or not serve:
+        pytest.skip("PostgreSQL isn't installed (tests/flows/prefect/packages.txt)")
+    # it refuses to run as root
+    drop = ["setpriv", "--reuid", "nobody", "--regid", "nogroup", "--clear-groups"] if os.getuid() == 0 else []
+    data = Path(tempfile.mkdtemp(prefix="scan2sim-postgres-"))
+    try:
+        if drop:
+            shutil.chown(data, "nobody", "nogroup")
+        subprocess.run(
+            [*drop, initdb, "-D", data / "db", "-U", "prefect", "-A", "trust", "--no-sync"],
+            check=True, stdout=subprocess.DEVNULL, cwd=data,
+        )  # fmt: skip
+        port = free_port()
+        with open(data.with_suffix(".log"), "w") as log:
+            process = subprocess.Popen(
+                [*drop, serve, "-D", data / "db", "-k", data, "-h", "127.0.0.1", "-p", str(port), "-F"],
+                stdout=log, stderr=log, cwd=data, start_new_session=True,
+            )  # fmt: skip
+        try:
+            wait_for("PostgreSQL", lambda: _listens(port))
+            yield f"postgresql+asyncpg://prefect@127.0.0.1:{port}/postgres"
+        finally:
+            kill(process)
+    finally:
+        shutil.rmtree(data, ignore_errors=True)
+        data.with_suffix(".log").unlink(missing_ok=True)
+
+
+def _listens(port: int) -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+@contextmanager
+def serving(database: str, home: Path) -> Iterator[Server]:
+    """A running server with the database of that name."""
+    with ExitStack() as stack:
+        server = Server(home, stack.enter_context(postgres()) if database == "postgres" else None)
+        stack.callback(server.close)
+        server.start()
+        yield server
+
+
+@pytest.fixture(scope="session")
+def server(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    """A running server; tests say with which database (`on`). One at a time: pytest sorts tests by it."""
+    with serving(request.param, tmp_path_factory.mktemp(request.param)) as server:
+        yield server
+
+
+def on(*databases: str) -> pytest.MarkDecorator:
+    """Run a test with these databases."""
+    return pytest.mark.parametrize("server", databases, indirect=True, scope="session")
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """For a toy survey."""
+    (tmp_path / "source.txt").write_text("1")
+    return tmp_path

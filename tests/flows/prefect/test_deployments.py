@@ -1,0 +1,145 @@
+"""Deployments on a real server, a real worker and a real schedule; what users are told when something's missing."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from datetime import datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+from flows.execute import check_version, versions
+from pipeline.errors import UnavailableError, exit_code
+from tests.conftest import ROOT
+from tests.flows.prefect.conftest import Server, free_port, kill, on, processes, serving, wait_for
+from tests.flows.prefect.toy_steps import planned
+
+DEPLOYED = ["reprocess", "survey", "tile"]
+
+
+@pytest.fixture(scope="session")
+def toys(server: Server) -> Iterator[Server]:
+    """A server that has the toy deployments, and a worker for them."""
+    assert server.cli("work-pool", "create", "toys", "--type", "process").returncode == 0
+    deployed = server.cli("deploy", "--prefect-file", "tests/flows/prefect/toy.yaml", "--all")
+    assert deployed.returncode == 0, deployed.stdout
+    with server.worker("toys"):
+        yield server
+
+
+@on("sqlite")
+def test_what_is_missing_is_named(server: Server) -> None:
+    """Here first: there is no pool yet."""
+    deployed = server.cli("deploy", "-n", "tile")
+    assert deployed.returncode != 0
+    assert "work pool 'scan2sim-process' which does not exist" in deployed.stdout
+    with server.worker("scan2sim-process"):
+        log = server.home / "scan2sim-process.log"
+        wait_for("a warning", lambda: "Work pool 'scan2sim-process' not found!" in log.read_text())
+
+
+@on("sqlite")
+def test_all_deployments_and_automations_are_taken(server: Server) -> None:
+    pools = {kind: f"scan2sim-{kind}" for kind in ("process", "docker", "kubernetes")}
+    template = ["--base-job-template", "deploy/kubernetes.json"]
+    for command in (
+        server.script("deploy/setup", SCAN2SIM_SOURCE="/data/drive", SCAN2SIM_OUT="/data/worlds"),
+        server.cli("work-pool", "create", pools["docker"], "--type", "docker"),
+        server.cli("work-pool", "create", pools["kubernetes"], "--type", "kubernetes", *template),
+        server.cli("deploy", "-n", "*-docker", "-n", "*-kubernetes"),
+    ):
+        assert command.returncode == 0, command.stdout
+
+    for kind, pool in pools.items():
+        known = server.api("GET", f"/work_pools/{pool}")["base_job_template"]["variables"]["properties"]
+        for name in DEPLOYED:
+            made = server.deployment(name, name if kind == "process" else f"{name}-{kind}")
+            assert made["work_pool_name"] == pool
+            assert set(made["job_variables"]) <= set(known)
+            assert made["job_variables"]["env"]["PREFECT_FLOWS_HEARTBEAT_FREQUENCY"] == "30"
+            assert made["entrypoint"] == f"flows.{name}.{name}" and not made["pull_steps"]
+            assert not set(made["parameters"]) - set(made["parameter_openapi_schema"]["properties"])
+    nightly = server.deployment("reprocess", "reprocess")
+    assert nightly["parameters"]["source"] == "/data/drive" and nightly["parameters"]["out"] == "/data/worlds"
+    assert nightly["global_concurrency_limit"]["limit"] == 1
+    assert nightly["concurrency_options"]["collision_strategy"] == "CANCEL_NEW"
+    due = wait_for("a run that is scheduled", lambda: server.runs(nightly, "SCHEDULED"), 30)
+    assert {datetime.fromisoformat(run["expected_start_time"]).strftime("%H:%M %z") for run in due} == {"02:00 +0000"}
+    assert len(server.api("POST", "/automations/filter", {})) == 2
+
+
+@on("sqlite", "postgres")
+def test_a_schedule_fires_a_worker_runs_it_and_nothing_disturbs_it(toys: Server, folder: Path) -> None:
+    """What comes due meanwhile is cancelled; what is started past the limit finds the folder taken, and is skipped."""
+    nightly, other = toys.deployment("toy", "one-at-a-time"), toys.deployment("toy", "any")
+    parameters = {"folder": str(folder), "gate": str(folder / "gate")}
+    with toys.scheduled(nightly, parameters, interval=5.0):
+        wait_for("its first step", (folder / "started").exists)
+        (first,) = toys.runs(nightly, "RUNNING")
+        state = toys.ended(toys.run(other, **parameters))
+        assert state["name"] == "Skipped" and "another run is writing here" in state["message"]
+        wait_for("a cancelled run", lambda: toys.runs(nightly, "CANCELLED"))
+    (folder / "gate").touch()
+    state = toys.ended(first["id"])
+    assert (state["type"], state["message"]) == ("COMPLETED", "total 4")
+    assert first["auto_scheduled"]
+    assert len((folder / "log").read_text().split()) == 3
+
+    with toys.scheduled(nightly, parameters, cron="0 2 * * *", timezone="Etc/UTC"):
+        # with SQLAlchemy 2.1, PostgreSQL never got there
+        wait_for("a run at two", lambda: toys.runs(nightly, "SCHEDULED"))
+
+
+def test_a_server_that_is_away_is_named(tmp_path: Path) -> None:
+    url = f"http://127.0.0.1:{free_port()}/api"
+    command = ["survey", "data_samples/tile", "--out", str(tmp_path / "out"), "--runner", "dask"]
+    run = subprocess.run(
+        [sys.executable, "-m", "flows.cli", *command],
+        env=os.environ | {"PREFECT_API_URL": url, "PREFECT_HOME": str(tmp_path)},
+        cwd=ROOT, capture_output=True, text=True,
+    )  # fmt: skip
+    assert run.returncode == exit_code(UnavailableError("", "", "")), run.stderr
+    assert f"{url}: Prefect's server doesn't answer" in run.stderr and "prefect server start" in run.stderr
+
+
+def test_other_versions_are_refused(folder: Path) -> None:
+    item = planned(folder, 1)[0]
+    check_version(item, versions())
+    with pytest.raises(UnavailableError, match=r"this worker has scan2sim \S+ instead of 9\.9.*same version on all"):
+        check_version(item, versions() | {"scan2sim": "9.9"})
+
+
+@on("sqlite")
+def test_a_worker_of_another_version_says_so(toys: Server, folder: Path) -> None:
+    state = toys.ended(toys.run(toys.deployment("toy", "any"), folder=str(folder), pretend="9.9"))
+    assert state["type"] == "FAILED" and "instead of 9.9" in state["message"]
+    assert not (folder / "log").exists()
+
+
+@pytest.mark.slow
+def test_a_run_whose_worker_died_too_is_found_out_and_run_again(tmp_path: Path, folder: Path) -> None:
+    text = (ROOT / "deploy" / "automations.yaml").read_text().replace("name: reprocess", "name: toy")
+    (tmp_path / "automations.yaml").write_text(text)
+    with serving("sqlite", tmp_path) as server:
+        server.env |= {"PREFECT_FLOWS_HEARTBEAT_FREQUENCY": "30", "TOY_FOLDER": str(folder)}
+        assert server.cli("work-pool", "create", "toys", "--type", "process").returncode == 0
+        assert server.cli("deploy", "--prefect-file", "tests/flows/prefect/toy.yaml", "--all").returncode == 0
+        assert server.cli("automation", "create", "--from-file", str(tmp_path / "automations.yaml")).returncode == 0
+        deployment = server.deployment("toy", "one-at-a-time")
+        with server.worker("toys") as worker:
+            run = server.run(deployment, folder=str(folder), gate=str(folder / "gate"))
+            wait_for("its first step", (folder / "started").exists)
+            time.sleep(3)  # its first heartbeat is on its way
+            kill(worker)
+        for pid in processes("PREFECT__FLOW_RUN_ID", run):
+            os.kill(pid, signal.SIGKILL)
+        assert server.api("GET", f"/flow_runs/{run}")["state"]["type"] == "RUNNING"
+        assert server.ended(run, 180)["type"] == "CRASHED"
+        (again,) = wait_for("a run in ten minutes", lambda: server.runs(deployment, "SCHEDULED"), 30)
+        ahead = datetime.fromisoformat(again["expected_start_time"]) - datetime.now().astimezone()
+        assert timedelta(minutes=8) < ahead < timedelta(minutes=11)

@@ -1,0 +1,159 @@
+"""A survey on a cluster whose workers, flow or server are killed: it is finished, and nothing is done twice."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flows.dispatch import dispatch
+from flows.execute import run_apart
+from flows.planning import Planned
+from pipeline.store import Store
+from tests.flows.prefect.conftest import Server, on, processes, wait_for
+from tests.flows.prefect.toy_steps import STEPS, planned
+
+SCRIPT = "from tests.flows.prefect.toy_flow import main; main()"
+TILES = 6
+ALL = {f"{tile}-{step}" for tile in range(TILES) for step in STEPS}
+
+
+class Survey:
+    """The toy survey of `toy_flow.main`, run as a script."""
+
+    def __init__(self, server: Server, folder: Path, runner: str) -> None:
+        self.folder, self._server, self._runner = folder, server, runner
+        self._outputs: list[Path] = []
+
+    def start(self) -> subprocess.Popen[bytes]:
+        """Start it, or start it again; alone in its process group."""
+        self._outputs.append(self.folder / f"output{len(self._outputs)}")
+        arguments = ("-c", SCRIPT, str(self.folder), self._runner)
+        return self._server.spawn(*arguments, log=self._outputs[-1], SURVEY=str(self.folder))
+
+    def processes(self) -> list[int]:
+        """All that were started by it, or by what it started."""
+        return processes("SURVEY", str(self.folder))
+
+    def under_way(self) -> dict[str, int]:
+        """Wait until some steps are done, and others are going on; returns those."""
+        try:
+            wait_for("some steps", lambda: len(self.done()) >= 4, 120)
+            return wait_for("one more", self.going_on, 30)
+        except TimeoutError as error:
+            raise AssertionError(f"{error}; {len(self.done())} are done\n{self.output()}") from None
+
+    def done(self) -> dict[str, int]:
+        """When each step that is kept was finished."""
+        store = Store(self.folder / "steps")
+        kept = [p for p in planned(self.folder, TILES) if store.find(p.node.label, p.key)]
+        return {p.node.label: (store.folder(p.node.label, p.key) / "manifest.json").stat().st_mtime_ns for p in kept}
+
+    def going_on(self) -> dict[str, int]:
+        """Steps that have begun and not ended, and the worker that runs each."""
+        if not (self.folder / "started").exists():
+            return {}
+        begun = dict(line.split()[::2] for line in (self.folder / "started").read_text().splitlines())
+        ended = {label.replace("/", "-") for label in self.done()}
+        return {name: int(worker) for name, worker in begun.items() if name not in ended}
+
+    def runs(self) -> Counter[str]:
+        """How often each step came to its end."""
+        return Counter((self.folder / "log").read_text().split())
+
+    def finish(self, process: subprocess.Popen[bytes]) -> str:
+        """Wait for the end; returns what was printed."""
+        process.wait(150)
+        return self.output()
+
+    def output(self) -> str:
+        """What was printed since it was last started."""
+        return self._outputs[-1].read_text()
+
+
+@pytest.fixture
+def survey(request: pytest.FixtureRequest, server: Server, folder: Path) -> Survey:
+    """On Dask, if the test doesn't say otherwise."""
+    return Survey(server, folder, getattr(request, "param", "dask"))
+
+
+@on("sqlite")
+@pytest.mark.parametrize("survey", ["dask", pytest.param("ray", marks=pytest.mark.slow)], indirect=True)
+def test_a_killed_worker_is_made_up_for(survey: Survey) -> None:
+    process = survey.start()
+    lost = survey.under_way()
+    os.kill(next(iter(lost.values())), signal.SIGKILL)
+    output = survey.finish(process)
+    assert f"total {TILES * 4}" in output, output[-3000:]
+    assert set(survey.runs()) == ALL
+    assert {name for name, count in survey.runs().items() if count > 1} <= set(lost)
+
+
+@on("sqlite")
+@pytest.mark.parametrize("survey", ["dask", pytest.param("ray", marks=pytest.mark.slow)], indirect=True)
+def test_a_killed_flow_goes_on_where_it_was(survey: Survey) -> None:
+    process = survey.start()
+    survey.under_way()
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    wait_for("the end of all that it started", lambda: not survey.processes(), 30)
+    before, lost = survey.done(), set(survey.going_on())
+    assert 4 <= len(before) < len(ALL)
+
+    output = survey.finish(survey.start())
+    assert f"total {TILES * 4}" in output, output[-3000:]
+    assert before.items() <= survey.done().items()
+    assert set(survey.runs()) == ALL
+    assert {name for name, count in survey.runs().items() if count > 1} <= lost
+    assert all(item.reason is None for item in planned(survey.folder, TILES))
+
+
+@on("sqlite")
+def test_a_killed_server_is_started_again_and_so_is_the_survey(survey: Survey, server: Server) -> None:
+    process = survey.start()
+    survey.under_way()
+    server.kill()
+    before = survey.done()
+    server.start()
+    survey.finish(process)  # whether it got over it or not
+    output = survey.finish(survey.start())
+    assert f"total {TILES * 4}" in output, output[-3000:]
+    assert before.items() <= survey.done().items()
+    assert survey.runs() == Counter(ALL)
+
+
+class GivenUp:
+    """A future as runners give it that have lost too many workers to a step (Dask: `KilledWorker`)."""
+
+    def add_done_callback(self, fn: Callable[[Any], None]) -> None:
+        fn(self)
+
+    def result(self, *, raise_on_failure: bool) -> Any:
+        raise RuntimeError("three workers died of it")
+
+
+class Finished(GivenUp):
+    """A future of a step that was run at once."""
+
+    def __init__(self, item: Planned, store: Store) -> None:
+        run_apart(item, store, lambda *_: None)
+
+    def result(self, *, raise_on_failure: bool) -> Any:
+        return "its manifest's path"
+
+
+def test_a_step_that_takes_its_workers_along_fails_alone(folder: Path) -> None:
+    store, failures = Store(folder / "steps"), {}
+
+    def submit(item: Planned) -> GivenUp:
+        return GivenUp() if item.node.label == "0/second" else Finished(item, store)
+
+    done = dispatch(planned(folder, 2), store, failures, submit, 2, lambda *_: None)
+    assert set(done) == {"0/first", *(f"1/{step}" for step in STEPS)}
+    assert "three workers died of it" in str(failures.pop("0/second")) and not failures

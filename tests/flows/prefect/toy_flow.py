@@ -1,0 +1,48 @@
+"""The toy survey as a flow, through the same tasks as a real one; the kill tests run `main` as a script."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from unittest.mock import patch
+
+import flows.prefect_settings  # noqa: F401  # isort: skip
+from prefect import flow
+from prefect.states import Completed, State
+
+from flows.execute import locked, versions
+from flows.survey import task_runner
+from flows.tile import by_tasks
+from pipeline.errors import BusyError
+from pipeline.store import Store
+from tests.flows.prefect.toy_steps import STEPS, planned
+
+
+@flow(name="toy tiles")
+def toy_tiles(folder: str, tiles: int, gate: str | None, pretend: str | None) -> int:
+    """All tiles; returns the sum of what came out."""
+    failures: dict = {}
+    with patch("flows.tile.versions", lambda: versions() | ({"scan2sim": pretend} if pretend else {})):
+        run = by_tasks(2)
+    done = run(planned(Path(folder), tiles, gate and Path(gate)), Store(Path(folder) / "steps"), failures)
+    for error in failures.values():
+        raise error
+    return sum(done[f"{tile}/{STEPS[-1]}"].facts["total"] for tile in range(tiles))
+
+
+@flow(name="toy")
+def toy_survey(
+    folder: str, tiles: int = 1, gate: str | None = None, runner: str = "threads", pretend: str | None = None
+) -> State:  # fmt: skip
+    """One run at a time, as `reprocess`; of a version of the project that it pretends to have."""
+    try:
+        with locked(Path(folder)):
+            total = toy_tiles.with_options(task_runner=task_runner(runner, 2))(folder, tiles, gate, pretend)
+    except BusyError as error:
+        return Completed(message=f"Skipped: {error}", name="Skipped")
+    return Completed(message=f"total {total}", data=total)
+
+
+def main() -> None:
+    """FOLDER RUNNER: six tiles."""
+    print("total", toy_survey(sys.argv[1], tiles=6, runner=sys.argv[2]))
