@@ -16,13 +16,11 @@ COPY . .
 
 # torch for CPUs comes without gigabytes of CUDA; what it depends on comes with the rest
 FROM code AS cpu-environment
-RUN --mount=type=cache,target=/root/.cache/pip \
-    pip install --no-deps -c constraints.txt --index-url https://download.pytorch.org/whl/cpu torch \
-    && pip install -c constraints.txt -e '.[segmentation,slam,ray,s3]'
+RUN pip install --no-cache-dir --no-deps -c constraints.txt --index-url https://download.pytorch.org/whl/cpu torch \
+    && pip install --no-cache-dir -c constraints.txt -e '.[segmentation,slam,ray,s3]'
 
 FROM code AS gpu-environment
-RUN --mount=type=cache,target=/root/.cache/pip \
-    pip install -c constraints.txt -e '.[segmentation,slam,ray,s3]'
+RUN pip install --no-cache-dir -c constraints.txt -e '.[segmentation,slam,ray,s3]'
 
 FROM system AS gpu
 ENV NVIDIA_VISIBLE_DEVICES=all NVIDIA_DRIVER_CAPABILITIES=compute,utility

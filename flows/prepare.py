@@ -22,15 +22,15 @@ from __future__ import annotations
 
 import hashlib
 import json
-import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from flows.execute import locked
 from pipeline.errors import InputError, from_os_error
+from pipeline.io import toml
 from pipeline.io.remote import is_remote, likeness
 from pipeline.step import Report, silent
 from pipeline.store import Digests
@@ -143,14 +143,8 @@ def read_drive(path: Path) -> Drive:
     Raises:
         InputError: naming the field.
     """
-    try:
-        drive = Drive.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InputError(path, f"can't be read as TOML ({error})", "Mend the line that the message names") from None
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise InputError(path, f"field `{where}`: {first['msg']}", "docs/scale.md lists the fields") from None
+    absent = ("there is no drive here", "Name a drive.toml")
+    drive = toml.read(path, Drive, absent=absent, fields="docs/scale.md lists the fields")
     if (drive.corridor is None) == (drive.sweeps is None):
         raise InputError(path, "says neither or both of `corridor` and `[sweeps]`", "Give one: what is to be cut")
     if drive.sweeps and not (drive.sweeps.poses or drive.slam):

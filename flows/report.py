@@ -28,7 +28,7 @@ def write_report(
 ) -> Path:
     """Write both reports into `out`; returns the page's path."""
     body = figures(tile, done) | {"seconds_this_run": round(seconds, 2)}
-    _replace(out / "report.json", json.dumps(body, indent=1))
+    write_whole(out / "report.json", json.dumps(body, indent=1))
     keys = {p.node.label: p.key for p in planned}
     pictures: list[Picture] = []
     for label, name in (("pictures", "pictures"), ("score", "error")):
@@ -38,7 +38,7 @@ def write_report(
             shown = telling(entries, done[label].facts["photos"]) if name == "error" else entries
             pictures += [_with_pixels(entry, folder) for entry in shown]
     page = out / "report.html"
-    _replace(page, _render(body, pictures))
+    write_whole(page, _render(body, pictures))
     return page
 
 
@@ -102,7 +102,7 @@ def _embedded(path: Path) -> str:
     return f"data:{kind};base64,{base64.b64encode(path.read_bytes()).decode()}"
 
 
-def _replace(path: Path, text: str) -> None:
+def write_whole(path: Path, text: str) -> None:
     """Write a file whole or not at all."""
     fresh = path.with_name(f".{path.name}")
     fresh.write_text(text, encoding="utf-8")

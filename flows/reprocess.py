@@ -31,7 +31,7 @@ def reprocess(
             get_run_logger().info(f"{tile}: {reasons}")
         if not found:
             return Completed(message="Nothing has changed")
-        report = survey(source, out, length, buffer, settings, runner, workers, memory, cores, address)
+        report = survey(path, out, None, None, settings, runner, workers, memory, cores, address)
     except BusyError as error:
         return Completed(message=f"Skipped: {error}", name="Skipped")
     return Completed(message=f"{len(found)} tiles made anew: {report}", data=report)

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flows.execute import versions
-from flows.report import _replace
+from flows.report import write_whole
 from pipeline.classes import GROUPS
 from pipeline.errors import from_os_error
 
@@ -82,8 +82,8 @@ def write_survey_report(out: Path, name: str, tiles: Sequence[TileState], *, pat
     body = summary(name, tiles, drive)
     try:
         out.mkdir(parents=True, exist_ok=True)
-        _replace(out / DATA, json.dumps(body, indent=1))
-        _replace(out / PAGE, _render(body, tiles, drive))
+        write_whole(out / DATA, json.dumps(body, indent=1))
+        write_whole(out / PAGE, _render(body, tiles, drive))
     except OSError as error:
         raise from_os_error(error, out) from None
     return out / PAGE

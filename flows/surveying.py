@@ -139,8 +139,11 @@ def _make(survey: Survey, settings: Settings, store: Store, run: Executor, diges
     """Run all tiles; without those that fail, until none does."""
     tiles, failed = read_tiles(survey)
     unread = set(failed)
+    ran: dict[tuple[str, str], str] = {}  # why, of what an earlier round of this run has made
     while True:
         planned = plan_survey(tiles, store, settings, digests)
+        planned = [replace(item, reason=item.reason or ran.get((item.node.label, item.key))) for item in planned]
+        ran |= {(item.node.label, item.key): item.reason for item in planned if item.reason is not None}
         failures: dict[str, ScanError] = {}
         done = run(planned, store, failures)
         for error in failures.values():

@@ -19,9 +19,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from pipeline.errors import InputError
+from pipeline.io import toml
 
 
 class SurveyFile(BaseModel):
@@ -96,22 +97,8 @@ def write_survey(
 
 
 def _parse(path: Path) -> SurveyFile:
-    try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(
-            path, "there is no survey here", "Name a survey.toml or its folder; `scan2sim tile` cuts one from a tile"
-        ) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(path, f"is not valid TOML ({error})", "Mend the line that the message names") from None
-    try:
-        return SurveyFile.model_validate(data)
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise InputError(
-            path, f"field `{where}`: {first['msg']}", "docs/formats.md lists the fields of a survey"
-        ) from None
+    absent = ("there is no survey here", "Name a survey.toml or its folder; `scan2sim tile` cuts one from a tile")
+    return toml.read(path, SurveyFile, absent=absent, fields="docs/formats.md lists the fields of a survey")
 
 
 def _check_crs(path: Path, tiles: Sequence[Path]) -> None:

@@ -32,18 +32,18 @@ A generated tile also names its ground truth:
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from pipeline.cells import Cell
 from pipeline.errors import InputError
 from pipeline.io import clouds as cloud_io
 from pipeline.io import crs as crs_io
+from pipeline.io import toml
 from pipeline.io import trajectory as trajectory_io
 from pipeline.types import Camera, CameraModel, Frame, Tile, Trajectory, View
 
@@ -198,22 +198,8 @@ def tile_name(text: str) -> str:
 
 
 def _parse(path: Path) -> TileFile:
-    try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(
-            path, "there is no tile here", "Name a tile.toml or its folder; `scan2sim import` makes one from your files"
-        ) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(path, f"is not valid TOML ({error})", "Mend the line that the message names") from None
-    try:
-        return TileFile.model_validate(data)
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise InputError(
-            path, f"field `{where}`: {first['msg']}", "docs/formats.md lists the fields of a tile"
-        ) from None
+    absent = ("there is no tile here", "Name a tile.toml or its folder; `scan2sim import` makes one from your files")
+    return toml.read(path, TileFile, absent=absent, fields="docs/formats.md lists the fields of a tile")
 
 
 def _existing(tile: Path, name: str, field: str) -> Path:

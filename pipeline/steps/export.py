@@ -179,15 +179,7 @@ def _metadata(
         "unit_m": frame.unit,
         "to_crs": "crs = (local + origin_m) / unit_m; OBJ and Collada are local, z-up; GLB is local, y-up (x, z, -y)",
         "world_origin_m": list(params.world_origin or frame.origin),
-        "wgs84": None
-        if place is None
-        else {
-            "latitude_deg": place.latitude,
-            "longitude_deg": place.longitude,
-            "height_m": place.elevation,
-            "height_system": "as in the CRS",
-            "heading_deg": place.heading,
-        },
+        "wgs84": place and place.facts(),
         "groups": {
             group: {
                 "triangles": len(surface),
