@@ -31,7 +31,7 @@ ROOT = Path(__file__).resolve().parent.parent
 PARTS = ("plain", "one", "two", "ray", "rerun", "photo", "tile")
 MIDDLE = "street_0004"
 LENGTH, POINTS, PHOTOS, WIDTH, SEED = 1000.0, 1.0e7, 200, 800, 3
-RUNS: dict[str, tuple[str, ...]] = {  # part: options of `scan2sim survey`
+RUNS = {  # part: options of `scan2sim survey`
     "plain": ("--runner", "processes", "--jobs", "1"),
     "one": ("--runner", "dask", "--jobs", "1"),
     "two": ("--runner", "dask", "--jobs", "2"),
@@ -41,8 +41,7 @@ COARSE = ("voxel.size=0.2", "unwrap.texel=0.04", "visibility.pixels=500000", "pi
 EMPTY = """
 import flows.prefect_settings
 from prefect import flow
-from flows.survey import task_runner
-flow(lambda: None, name="empty", task_runner=task_runner("dask", 2))()
+flow(lambda: None, name="empty")()
 """
 
 
@@ -53,20 +52,18 @@ def main() -> None:
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
     parser.add_argument("--fine", action="store_true", help="the defaults' settings: three hours")
     arguments = parser.parse_args()
-    if not arguments.fine:
-        for name, options in RUNS.items():
-            RUNS[name] = (*options, *(part for value in COARSE for part in ("--set", value)))
+    settings = () if arguments.fine else tuple(part for value in COARSE for part in ("--set", value))
     out: Path = arguments.out
     survey = street(out)
     notes = out / "notes.json"
     known: dict[str, dict[str, Any]] = json.loads(notes.read_text()) if notes.is_file() else {}
     for part in (name for name in PARTS if name in arguments.parts):
         if part in RUNS:
-            known[part] = whole(survey, out / part, RUNS[part])
+            known[part] = whole(survey, out / part, (*RUNS[part], *settings))
         elif part == "rerun":
-            known[part] = rerun(survey, out / "two")
+            known[part] = rerun(survey, out / "two", (*RUNS["two"], *settings))
         elif part == "photo":
-            known[part] = photo(survey, out)
+            known[part] = photo(survey, out, (*RUNS["two"], *settings))
         else:
             known[part] = one_tile(survey / MIDDLE, out / "tile")
         print(part, json.dumps(known[part]), flush=True)
@@ -114,10 +111,10 @@ def whole(survey: Path, out: Path, options: tuple[str, ...]) -> dict[str, Any]:
     }
 
 
-def rerun(survey: Path, out: Path) -> dict[str, Any]:
+def rerun(survey: Path, out: Path, options: tuple[str, ...]) -> dict[str, Any]:
     """Run an unchanged survey again, and a flow that does nothing."""
     empty = measure([sys.executable, "-c", EMPTY])
-    again = measure(command(survey, out, RUNS["two"]))
+    again = measure(command(survey, out, options))
     return {"seconds": round(again.seconds, 1), "empty_flow_seconds": round(empty.seconds, 1)}
 
 
@@ -141,7 +138,7 @@ def one_tile(tile: Path, out: Path) -> dict[str, Any]:
     }
 
 
-def photo(survey: Path, out: Path) -> dict[str, Any]:
+def photo(survey: Path, out: Path, options: tuple[str, ...]) -> dict[str, Any]:
     """Change one photo in the middle of the street, and see what is made anew."""
     place = out / "street" / "photos"
     changed = sorted(place.glob("*.jpg"))[len(list(place.glob("*.jpg"))) // 2]
@@ -153,7 +150,7 @@ def photo(survey: Path, out: Path) -> dict[str, Any]:
         picture = cv2.imread(str(changed))
         picture[: picture.shape[0] // 3] //= 2
         cv2.imwrite(str(changed), picture)
-        ran = measure(command(survey, out / "two", RUNS["two"]))
+        ran = measure(command(survey, out / "two", options))
         after = contents(out / "two")
     finally:
         changed.write_bytes(original)

@@ -9,6 +9,8 @@ from typing import Annotated, Any, Literal
 import typer
 from typer.core import TyperGroup
 
+from pipeline.errors import INTERRUPTED, ScanError, exit_code, from_os_error
+
 app = typer.Typer(
     name="scan2sim",
     help="Street scans (lidar clouds and posed photos) to textured worlds for robot simulators.",
@@ -41,7 +43,6 @@ slams = typer.Typer(
 )
 app.add_typer(slams, name="slam")
 
-INTERRUPTED = 130  # as typer turns Ctrl-C into
 
 TilePath = Annotated[Path, typer.Argument(metavar="TILE", help="A tile.toml, or the folder that holds one.")]
 OutDir = Annotated[Path, typer.Option("--out", "-o", help="Folder for the world, the report and kept results.")]
@@ -462,12 +463,10 @@ def main() -> None:
     try:
         app()
     except SystemExit as ended:
-        if ended.code == INTERRUPTED:
-            typer.echo("Interrupted; what was finished is kept, the same command goes on from there.", err=True)
+        if ended.code == exit_code(KeyboardInterrupt()):  # as typer turns Ctrl-C into
+            typer.echo(INTERRUPTED, err=True)
         raise
     except Exception as error:
-        from pipeline.errors import ScanError, exit_code, from_os_error
-
         if isinstance(error, OSError):
             error = from_os_error(error, error.filename or "a file")
 

@@ -20,7 +20,7 @@ from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import Any, Literal
 
-from flows.memory import need
+from flows.memory import need, share
 from flows.planning import Planned
 from flows.recipe import Node
 from pipeline.errors import BusyError, ScanError, StepError, UnavailableError, from_os_error
@@ -181,6 +181,27 @@ def run_apart(item: Planned, store: Store, watch: Watch) -> Manifest:
                 return manifest
     finally:
         _stop(process)
+
+
+def run_on_worker(
+    item: Planned, store: Store, memory: float | None, cores: int | None, wanted: Mapping[str, str]
+) -> Manifest:
+    """Run one node as a worker that serves a flow elsewhere.
+
+    Args:
+        memory: GB that steps on one machine may need together (`flows.memory`).
+        cores: that the step may use.
+        wanted: the flow's `versions()`.
+
+    Raises:
+        UnavailableError: this worker has other versions.
+        ScanError: as `run_node`.
+    """
+    check_version(item, wanted)
+    limit_cores(cores)
+    os.environ.pop("MALLOC_TRIM_THRESHOLD_", None)  # Dask's, for processes that live on: it slows steps down
+    with share(memory, need(item, store)):
+        return run_apart(item, store, lambda *_: None)
 
 
 def run_node(item: Planned, store: Store, inputs: dict[str, Path], report: Report = silent) -> Manifest:

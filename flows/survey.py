@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import base64
+import os
+import signal
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,57 +14,48 @@ from prefect import flow, get_run_logger, task
 from prefect.artifacts import create_image_artifact, create_markdown_artifact, create_table_artifact
 from prefect.cache_policies import NO_CACHE
 from prefect.client.orchestration import get_client
-from prefect.task_runners import TaskRunner, ThreadPoolTaskRunner
+from prefect.settings import PREFECT_API_URL
 
 from flows.prepare import survey_of
 from flows.settings import Settings
 from flows.survey_report import overview, rows
 from flows.surveying import make_survey
 from flows.tile import artifact_key, by_tasks
-from pipeline.errors import SettingError
+from pipeline.errors import INTERRUPTED, StepError, UnavailableError, exit_code
 from pipeline.io.remote import likeness
 
 
-def task_runner(name: str, workers: int, address: str | None = None) -> TaskRunner[Any]:
-    """A task runner by name: "threads", "dask" or "ray", here or at a cluster's address.
+def meet_server() -> None:
+    """Find out early whether the server that is named answers; without one the run starts its own.
+
+    Ctrl-C interrupts that one, too, and Prefect would try for minutes to tell it: the process ends at once instead.
 
     Raises:
-        SettingError: there is no such runner.
+        UnavailableError: it doesn't answer.
     """
-    if name == "threads":
-        return ThreadPoolTaskRunner(max_workers=workers)
-    if name == "dask":
-        from prefect_dask import DaskTaskRunner
+    url = PREFECT_API_URL.value()
+    if url is None:
+        signal.signal(signal.SIGINT, _end)
+        return
+    with get_client(sync_client=True) as client:
+        problem = client.api_healthcheck()
+    if problem is not None:
+        remedy = "Start it (`prefect server start`), or unset PREFECT_API_URL to run without one"
+        raise UnavailableError(url, f"Prefect's server doesn't answer ({problem})", remedy)
 
-        with get_client(sync_client=True) as client:  # workers told of this run's server start none of their own
-            env = {"PREFECT_API_URL": str(client.api_url)}
-        with get_client(sync_client=True) as client:  # workers told of this run's server start none of their own
-            env = {"PREFECT_API_URL": str(client.api_url)}
-        here = {"n_workers": workers, "threads_per_worker": 1, "memory_limit": 0, "dashboard_address": ":0", "env": env}
-        return DaskTaskRunner(address=address) if address else DaskTaskRunner(cluster_kwargs=here)
-    if name == "ray":
-        from prefect_ray import RayTaskRunner
 
-        own = {"address": "local", "num_cpus": workers, "include_dashboard": False}
-        return RayTaskRunner(address=address, init_kwargs={} if address else own)
-    raise SettingError("runner", f"there is no `{name}`", "Choose threads, dask or ray")
+def _end(*_: object) -> None:
+    from prefect.server.api.server import SubprocessASGIServer  # slow, and loaded by now where there is one
+
+    SubprocessASGIServer().stop()
+    print(INTERRUPTED, file=sys.stderr, flush=True)
+    os._exit(exit_code(KeyboardInterrupt()))
 
 
 @task(name="prepare", task_run_name="import and cut", cache_policy=NO_CACHE)
 def prepare(source: str, out: str, length: float | None, buffer: float | None) -> str:
     """SLAM, import and cut, where they are needed; returns the path of the `survey.toml`."""
     return str(survey_of(source, out, length=length, buffer=buffer, say=get_run_logger().warning))
-
-
-@flow(name="tiles")
-def tiles(
-    path: str, out: str, settings: dict[str, Any] | None, workers: int, memory: str | None, cores: int | None
-) -> str:
-    """All tiles of a survey and their world: a task per tile and step; returns the report's path."""
-    try:
-        return str(make_survey(path, out, Settings(settings), by_tasks(workers, memory, cores)))
-    finally:
-        publish(likeness(out))
 
 
 def publish(out: Path) -> None:
@@ -79,19 +73,25 @@ def survey(
     settings: dict[str, Any] | None = None, runner: str = "threads", workers: int = 2,
     memory: str | None = None, cores: int | None = None, address: str | None = None,
 ) -> str:  # fmt: skip
-    """Make a survey's worlds on the runner that is named; what an earlier run has finished is kept.
+    """Make a survey's worlds, a task per tile and step; what an earlier run has finished is kept.
 
     Args:
         source: a drive, a corridor or a survey (`flows.prepare`).
         out: folder for the worlds, the reports and kept results.
         length, buffer: metres, of tiles that are cut here; default: as the drive says, or 100 and 5.
         settings: by step, as in a settings file.
-        runner: "threads", "dask" or "ray".
+        runner: "threads", "dask" or "ray": where steps run (`flows.workers`).
         workers: steps at a time.
         memory: what steps on one machine may need together, "20GB".
         cores: that a step may use; default: all.
         address: of a Dask scheduler or a Ray cluster; default: started here.
     """
-    chosen = task_runner(runner, workers, address)
+    run = by_tasks(runner, workers, address, memory, cores)
     path = prepare(source, out, length, buffer)
-    return tiles.with_options(task_runner=chosen)(path, out, settings, workers, memory, cores)
+    try:
+        report = make_survey(path, out, Settings(settings), run)
+    except StepError:  # tiles failed, the others are there
+        publish(likeness(out))
+        raise
+    publish(likeness(out))
+    return str(report)

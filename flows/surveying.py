@@ -19,7 +19,7 @@ from flows.prepare import survey_of
 from flows.recipe import survey_recipe
 from flows.run import STORE, Log, default_jobs, execute_shown
 from flows.settings import Settings
-from pipeline.errors import ScanError, SettingError, SpaceError, StepError
+from pipeline.errors import ScanError, SettingError, SpaceError, StepError, UnavailableError
 from pipeline.io.remote import Remote, is_remote, likeness
 from pipeline.io.survey import Survey, read_survey
 from pipeline.io.tile import read_tile
@@ -49,10 +49,13 @@ def run_source(
     """
     jobs, gigabytes = jobs or default_jobs(), parse(memory)
     if runner != "processes":
-        from flows.survey import survey
-        from flows.tile import check_server
+        try:
+            from flows.survey import meet_server, survey
+        except ModuleNotFoundError as error:
+            remedy = "pip install -c constraints.txt -e '.[flows]'"
+            raise UnavailableError(error.name or "prefect", "isn't installed", remedy) from None
 
-        check_server()
+        meet_server()
         survey(source, target, length, buffer, settings.values, runner, jobs, memory, cores, address)
         return
     limit_cores(cores)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,49 +11,58 @@ import flows.prefect_settings  # noqa: F401  # isort: skip  # before prefect
 from prefect import flow, get_run_logger, task
 from prefect.artifacts import create_progress_artifact, update_progress_artifact
 from prefect.cache_policies import NO_CACHE
-from prefect.client.orchestration import get_client
-from prefect.settings import PREFECT_API_URL
 
 from flows.dispatch import dispatch
-from flows.execute import Executor, check_version, limit_cores, run_apart, versions
-from flows.memory import need, parse, share
+from flows.execute import Executor, run_on_worker, versions
+from flows.memory import parse
 from flows.planning import Planned
 from flows.run import run_tile
 from flows.settings import Settings
-from pipeline.errors import ScanError, UnavailableError
+from flows.workers import workers
+from pipeline.errors import ScanError
 from pipeline.store import Manifest, Store
 
 
 @task(name="step", task_run_name="{label}", cache_policy=NO_CACHE)
-def run_step(label: str, item: Planned, store: Store, limits: dict[str, Any], version: dict[str, str]) -> str:
-    """Run a step where the task runner has put it, in a process of its own; returns its manifest's path."""
-    check_version(item, version)
-    log = get_run_logger()
-    limit_cores(limits["cores"])
-    with share(limits["memory"], need(item, store)):
-        manifest = run_apart(item, store, lambda *_: None)
-    for line in [manifest.facts["told"]] if "told" in manifest.facts else []:
+def run_step(label: str, work: Callable[[], Manifest], manifest: str) -> str:
+    """Have a worker run a step, and wait for it; returns its manifest's path."""
+    log, done = get_run_logger(), work()
+    for line in [done.facts["told"]] if "told" in done.facts else []:
         log.info(line)
-    for line in manifest.warnings:
+    for line in done.warnings:
         log.warning(line)
-    return str(store.folder(label, item.key) / "manifest.json")
+    return manifest
 
 
-def by_tasks(workers: int = 2, memory: str | None = None, cores: int | None = None) -> Executor:
+def by_tasks(
+    runner: str = "threads", count: int = 2, address: str | None = None,
+    memory: str | None = None, cores: int | None = None,
+) -> Executor:  # fmt: skip
     """Runs plans as tasks of the flow that it is called in.
 
     Args:
-        workers: how many steps the task runner can run at a time; twice as many are submitted.
+        runner, count, address: of the workers (`flows.workers`), which are there while there is work.
         memory: what steps on one machine may need together, "20GB".
         cores: that a step may use.
+
+    Raises:
+        ScanError: there are no such workers.
     """
-    limits, version = {"memory": parse(memory), "cores": cores}, versions()
+    limits, version = (parse(memory), cores), versions()
+    workers(runner, count, address)
 
     def run(planned: list[Planned], store: Store, failures: dict[str, ScanError]) -> dict[str, Manifest]:
-        def submit(item: Planned) -> Any:
-            return run_step.submit(item.node.label, item, store, limits, version)
+        missing = any(item.reason is not None for item in planned)
+        with workers(runner if missing else "threads", count, address) as call:
 
-        return dispatch(planned, store, failures, submit, 2 * workers, _progress())
+            def submit(item: Planned) -> Any:
+                manifest = store.folder(item.node.label, item.key) / "manifest.json"
+                work = partial(call, run_on_worker, item, store, *limits, version)
+                return run_step.submit(item.node.label, work, str(manifest))
+
+            # those of a cluster find their next step waiting
+            at_once = count if runner == "threads" else 2 * count
+            return dispatch(planned, store, failures, submit, at_once, _progress())
 
     return run
 
@@ -73,21 +83,6 @@ def _progress() -> Callable[[str, float], None]:
 def artifact_key(*parts: str) -> str:
     """A key as Prefect allows it: lower-case letters, digits, dashes."""
     return "-".join(parts).lower().replace("_", "-")
-
-
-def check_server() -> None:
-    """Find out early whether the server that is named answers.
-
-    Raises:
-        UnavailableError: it doesn't.
-    """
-    url = PREFECT_API_URL.value()
-    if url is not None:  # else a server of its own is started
-        with get_client(sync_client=True) as client:
-            problem = client.api_healthcheck()
-        if problem is not None:
-            remedy = "Start it (`prefect server start`), or unset PREFECT_API_URL to run without one"
-            raise UnavailableError(url, f"Prefect's server doesn't answer ({problem})", remedy)
 
 
 @flow(name="tile")

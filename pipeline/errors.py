@@ -69,6 +69,8 @@ EXIT_CODES: dict[type[BaseException], tuple[int, int, str]] = {
     KeyboardInterrupt: (130, 499, "interrupted; what was finished is kept"),
 }
 
+INTERRUPTED = "Interrupted; what was finished is kept, the same command goes on from there."
+
 
 def exit_code(error: BaseException) -> int:
     """The command's exit code for an error; 1 for one that the table doesn't know."""

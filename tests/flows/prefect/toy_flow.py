@@ -11,19 +11,17 @@ from prefect import flow
 from prefect.states import Completed, State
 
 from flows.execute import locked, versions
-from flows.survey import task_runner
 from flows.tile import by_tasks
 from pipeline.errors import BusyError
 from pipeline.store import Store
 from tests.flows.prefect.toy_steps import STEPS, planned
 
 
-@flow(name="toy tiles")
-def toy_tiles(folder: str, tiles: int, gate: str | None, pretend: str | None) -> int:
+def toy_tiles(folder: str, tiles: int, gate: str | None, runner: str, pretend: str | None) -> int:
     """All tiles; returns the sum of what came out."""
     failures: dict = {}
     with patch("flows.tile.versions", lambda: versions() | ({"scan2sim": pretend} if pretend else {})):
-        run = by_tasks(2)
+        run = by_tasks(runner, 2)
     done = run(planned(Path(folder), tiles, gate and Path(gate)), Store(Path(folder) / "steps"), failures)
     for error in failures.values():
         raise error
@@ -37,7 +35,7 @@ def toy_survey(
     """One run at a time, as `reprocess`; of a version of the project that it pretends to have."""
     try:
         with locked(Path(folder)):
-            total = toy_tiles.with_options(task_runner=task_runner(runner, 2))(folder, tiles, gate, pretend)
+            total = toy_tiles(folder, tiles, gate, runner, pretend)
     except BusyError as error:
         return Completed(message=f"Skipped: {error}", name="Skipped")
     return Completed(message=f"total {total}", data=total)
