@@ -15,6 +15,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import cache
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
@@ -262,7 +263,8 @@ def locked(folder: Path) -> Iterator[None]:
         yield
 
 
-def versions() -> dict[str, str]:
+@cache
+def versions() -> Mapping[str, str]:
     """Versions of Python, the project and what it computes with, for the report."""
     names = ("scan2sim", "numpy", "open3d-cpu", "open3d", "xatlas", "pyfqmr", "laspy", "opencv-python-headless")
     found = {"python": sys.version.split()[0]}

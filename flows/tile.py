@@ -49,7 +49,7 @@ def by_tasks(
         ScanError: there are no such workers.
     """
     limits, version = (parse(memory), cores), versions()
-    workers(runner, count, address)
+    workers(runner, count, address)  # tells early of what there isn't
 
     def run(planned: list[Planned], store: Store, failures: dict[str, ScanError]) -> dict[str, Manifest]:
         missing = any(item.reason is not None for item in planned)

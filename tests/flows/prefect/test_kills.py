@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
+import sys
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -16,7 +17,8 @@ from flows.dispatch import dispatch
 from flows.execute import run_apart
 from flows.planning import Planned
 from pipeline.store import Store
-from tests.flows.prefect.conftest import Server, on, processes, wait_for
+from tests.conftest import ROOT
+from tests.flows.prefect.conftest import QUIET, Server, kill, on, processes, wait_for
 from tests.flows.prefect.toy_steps import STEPS, planned
 
 SCRIPT = "from tests.flows.prefect.toy_flow import main; main()"
@@ -126,6 +128,26 @@ def test_a_killed_server_is_started_again_and_so_is_the_survey(survey: Survey, s
     assert f"total {TILES * 4}" in output, output[-3000:]
     assert before.items() <= survey.done().items()
     assert survey.runs() == Counter(ALL)
+
+
+def test_ctrl_c_ends_a_run_and_the_server_that_it_started(tmp_path: Path) -> None:
+    """The terminal interrupts the server as well: Prefect can't be told any more."""
+    out, log = tmp_path / "out", tmp_path / "log"
+    env = {k: v for k, v in os.environ.items() if not k.startswith("PREFECT_")} | QUIET
+    command = [sys.executable, "-m", "flows.cli", "survey", "data_samples/tile", "--out", str(out), "--runner", "dask"]
+    with open(log, "w") as file:
+        process = subprocess.Popen(
+            command, env=env | {"PREFECT_HOME": str(tmp_path)}, cwd=ROOT, stdout=file, stderr=file,
+            start_new_session=True,
+        )  # fmt: skip
+    try:
+        wait_for("a finished step", lambda: list(out.glob("steps/*/*/*/manifest.json")), 150)
+        os.killpg(process.pid, signal.SIGINT)
+        assert process.wait(20) == 130
+        wait_for("the end of all that it started", lambda: not processes("PREFECT_HOME", str(tmp_path)), 30)
+    finally:
+        kill(process)
+    assert "the same command goes on from there" in log.read_text()
 
 
 class GivenUp:
