@@ -35,6 +35,7 @@ class Made:
     Attributes:
         tile: None if it can't be read.
         planned, done: its nodes and results, by their names within the tile.
+        anew: whether any result has come out otherwise than before.
         error: why it failed, or None.
     """
 
@@ -42,11 +43,12 @@ class Made:
     tile: Tile | None
     planned: Sequence[Planned] = ()
     done: Mapping[str, Manifest] | None = None
+    anew: bool = False
     error: ScanError | None = None
 
     @property
     def kept(self) -> bool:
-        """Whether nothing of it had to be run."""
+        """Whether nothing that it depends on has changed."""
         return all(item.reason is None for item in self.planned)
 
 
@@ -117,7 +119,7 @@ def _state(one: Made, out: Path) -> TileState:
     return TileState(
         name=one.name,
         outline=ring,
-        state="failed" if one.error else ("kept" if one.kept else "done"),
+        state="failed" if one.error else ("done" if one.anew else "kept"),
         reason=str(one.error) if one.error else None,
         figures=_figures(one.tile, done) if one.tile and done else {},
         report=f"{TILES}/{one.name}/report.html" if done else None,

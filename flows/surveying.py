@@ -143,10 +143,13 @@ def _make(survey: Survey, settings: Settings, store: Store, run: Executor, diges
     tiles, failed = read_tiles(survey)
     unread = set(failed)
     ran: dict[tuple[str, str], str] = {}  # why, of what an earlier round of this run has made
+    before: dict[str, set[str]] = {}  # what there was, of all that is run
     while True:
         planned = plan_survey(tiles, store, settings, digests)
         planned = [replace(item, reason=item.reason or ran.get((item.node.label, item.key))) for item in planned]
         ran |= {(item.node.label, item.key): item.reason for item in planned if item.reason is not None}
+        for label in {item.node.label for item in planned if item.reason is not None} - before.keys():
+            before[label] = store.contents(label)
         failures: dict[str, ScanError] = {}
         done = run(planned, store, failures)
         for error in failures.values():
@@ -162,15 +165,15 @@ def _make(survey: Survey, settings: Settings, store: Store, run: Executor, diges
     return [
         Made(name, None if name in unread else read_tile(survey.tiles[i]), error=failed[name])
         if name in failed
-        else Made(name, tiles[name], *_of_tile(name, planned, done))
+        else Made(name, tiles[name], *_of_tile(name, planned, done, before))
         for i, name in enumerate(names)
     ]
 
 
 def _of_tile(
-    name: str, planned: Sequence[Planned], done: Mapping[str, Manifest]
-) -> tuple[tuple[Planned, ...], dict[str, Manifest]]:
-    """A tile's own nodes and results, without its name before their labels."""
+    name: str, planned: Sequence[Planned], done: Mapping[str, Manifest], before: Mapping[str, set[str]]
+) -> tuple[tuple[Planned, ...], dict[str, Manifest], bool]:
+    """A tile's own nodes and results, without its name before their labels; whether any isn't as `before`."""
     own = [item for item in planned if item.node.label.startswith(f"{name}/")]
 
     def bare(label: str) -> str:
@@ -179,6 +182,7 @@ def _of_tile(
     return (
         tuple(replace(item, node=replace(item.node, label=bare(item.node.label))) for item in own),
         {bare(item.node.label): done[item.node.label] for item in own},
+        any(done[label].content not in before[label] for label in before.keys() & {item.node.label for item in own}),
     )
 
 

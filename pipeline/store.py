@@ -202,6 +202,11 @@ class Store:
         self._place(manifest, key, folder)
         return manifest
 
+    def contents(self, label: str) -> set[str]:
+        """Digests of the contents of all results of a node, of whatever key."""
+        keys = (path.parent.name for path in (self.root / label).glob("*/manifest.json"))
+        return {manifest.content for manifest in (self.find(label, key) for key in keys) if manifest is not None}
+
     def adopt(self, label: str, key: str, fed: str, inputs: Mapping[str, str]) -> Manifest | None:
         """Take a result over that was made of the same contents by the same step, whatever made those; None: no such.
 
