@@ -48,7 +48,7 @@ def by_tasks(
     Raises:
         ScanError: there are no such workers.
     """
-    limits, version = (parse(memory), cores), versions()
+    gigabytes, version = parse(memory), versions()
     workers(runner, count, address)  # tells early of what there isn't
 
     def run(planned: list[Planned], store: Store, failures: dict[str, ScanError]) -> dict[str, Manifest]:
@@ -57,7 +57,7 @@ def by_tasks(
 
             def submit(item: Planned) -> Any:
                 manifest = store.folder(item.node.label, item.key) / "manifest.json"
-                work = partial(call, run_on_worker, item, store, *limits, version)
+                work = partial(call, run_on_worker, item, store, gigabytes, cores, version)
                 return run_step.submit(item.node.label, work, str(manifest))
 
             # those of a cluster find their next step waiting

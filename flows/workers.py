@@ -54,9 +54,10 @@ def _dask(count: int, address: str | None) -> Iterator[Call]:
 
     # Dask would count a step's memory as its worker's, and kill it
     own: dict[str, Any] = {"n_workers": count, "threads_per_worker": 1, "memory_limit": 0, "dashboard_address": ":0"}
-    dask.config.set({"distributed.worker.profile.enabled": False})  # a hundred looks a second at what a worker does
+    unwatched = {"distributed.worker.profile.enabled": False}  # a hundred looks a second at what a worker does
     try:
-        client = Client(address) if address else Client(**own)
+        with dask.config.set(unwatched):
+            client = Client(address) if address else Client(**own)
     except OSError as error:
         raise _away(address, "scheduler of Dask", error) from error
     with client:

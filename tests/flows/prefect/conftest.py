@@ -36,6 +36,12 @@ QUIET = {
 ENDED = ("COMPLETED", "FAILED", "CRASHED", "CANCELLED")
 
 
+def environment(home: Path) -> dict[str, str]:
+    """Ours, with settings of Prefect's that are the test's alone; no server is named."""
+    ours = {k: v for k, v in os.environ.items() if not k.startswith("PREFECT_")}
+    return ours | QUIET | {"PREFECT_HOME": str(home)}
+
+
 def free_port() -> int:
     """A port that nobody listens on."""
     with socket.socket() as probe:
@@ -85,8 +91,7 @@ class Server:
     def __init__(self, home: Path, database: str | None = None) -> None:
         self.home, self.port = home, free_port()
         self.url = f"http://127.0.0.1:{self.port}/api"
-        self.env = {k: v for k, v in os.environ.items() if not k.startswith("PREFECT_")}
-        self.env |= {**QUIET, "PREFECT_HOME": str(home), "PREFECT_API_URL": self.url}
+        self.env = environment(home) | {"PREFECT_API_URL": self.url}
         self.env["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
         if database:
             self.env["PREFECT_SERVER_DATABASE_CONNECTION_URL"] = database

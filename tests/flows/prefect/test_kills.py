@@ -18,7 +18,7 @@ from flows.execute import run_apart
 from flows.planning import Planned
 from pipeline.store import Store
 from tests.conftest import ROOT
-from tests.flows.prefect.conftest import QUIET, Server, kill, on, processes, wait_for
+from tests.flows.prefect.conftest import Server, environment, kill, on, processes, wait_for
 from tests.flows.prefect.toy_steps import STEPS, planned
 
 SCRIPT = "from tests.flows.prefect.toy_flow import main; main()"
@@ -133,13 +133,11 @@ def test_a_killed_server_is_started_again_and_so_is_the_survey(survey: Survey, s
 def test_ctrl_c_ends_a_run_and_the_server_that_it_started(tmp_path: Path) -> None:
     """The terminal interrupts the server as well: Prefect can't be told any more."""
     out, log = tmp_path / "out", tmp_path / "log"
-    env = {k: v for k, v in os.environ.items() if not k.startswith("PREFECT_")} | QUIET
     command = [sys.executable, "-m", "flows.cli", "survey", "data_samples/tile", "--out", str(out), "--runner", "dask"]
     with open(log, "w") as file:
         process = subprocess.Popen(
-            command, env=env | {"PREFECT_HOME": str(tmp_path)}, cwd=ROOT, stdout=file, stderr=file,
-            start_new_session=True,
-        )  # fmt: skip
+            command, env=environment(tmp_path), cwd=ROOT, stdout=file, stderr=file, start_new_session=True
+        )
     try:
         wait_for("a finished step", lambda: list(out.glob("steps/*/*/*/manifest.json")), 150)
         os.killpg(process.pid, signal.SIGINT)
