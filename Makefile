@@ -24,7 +24,7 @@ bench: .venv/.installed-dev
 	$(BIN)/python -m bench.tile
 
 sample-tile: .venv/.installed
-	$(BIN)/python -m data_samples.make_tile
+	$(BIN)/python -m scan2sim.data_samples.make_tile
 
 .venv/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv

@@ -18,9 +18,9 @@ import numpy as np
 import open3d as o3d
 import xatlas
 
-from pipeline.classes import GROUPS, group_of
-from pipeline.io.tile import read_tile
-from pipeline.types import Mesh, View
+from scan2sim.pipeline.classes import GROUPS, group_of
+from scan2sim.pipeline.io.tile import read_tile
+from scan2sim.pipeline.types import Mesh, View
 
 TARGETS = {"terrain": 100_000, "building": 100_000, "vegetation": 300_000}
 MAX_EDGE = {"terrain": 0.5, "building": 0.25, "vegetation": 0.25}

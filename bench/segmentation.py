@@ -24,8 +24,8 @@ from typing import Any
 import numpy as np
 
 from bench.measure import measure
-from pipeline.classes import CODE
-from segmentation.score import MEAN_OF, Confusion, confusion
+from scan2sim.pipeline.classes import CODE
+from scan2sim.segmentation.score import MEAN_OF, Confusion, confusion
 
 ROOT = Path(__file__).resolve().parent.parent
 DATA = ROOT.parent / "shared" / "data"
@@ -50,9 +50,9 @@ def scan2sim(*arguments: object) -> float:
 
 def street(out: Path, seed: int) -> Path:
     """A held-out street's tile, made if absent."""
-    from data_samples.layout import Style
-    from data_samples.street import generate
-    from data_samples.training import any_style
+    from scan2sim.data_samples.layout import Style
+    from scan2sim.data_samples.street import generate
+    from scan2sim.data_samples.training import any_style
 
     folder = out / f"street_{seed}"
     if not (folder / "tile.toml").is_file():
@@ -63,8 +63,8 @@ def street(out: Path, seed: int) -> Path:
 
 def told(tile: Path, out: Path, *settings: str) -> tuple[Confusion, float]:
     """Run `scan2sim segment` anew on a tile whose cloud has classes; what it told, and seconds."""
-    from pipeline.io import las
-    from pipeline.io.tile import read_tile
+    from scan2sim.pipeline.io import las
+    from scan2sim.pipeline.io.tile import read_tile
 
     shutil.rmtree(out, ignore_errors=True)
     seconds = scan2sim("segment", tile, "--out", out, "--overwrite", *(x for s in settings for x in ("--set", s)))
@@ -105,8 +105,8 @@ def time_of_nine_million(out: Path) -> float:
 
 def mesh(out: Path) -> None:
     """Print metres from the meshes to the truth, by true classes and by those told: of their class, and of any."""
-    from pipeline.steps.geometry import truth_error
-    from pipeline.types import Mesh
+    from scan2sim.pipeline.steps.geometry import truth_error
+    from scan2sim.pipeline.types import Mesh
 
     tile = street(out, STREETS[0])
     truth = Mesh.load(tile / "truth" / "mesh.npz")
@@ -130,8 +130,8 @@ def mesh(out: Path) -> None:
 
 def semkitti() -> Confusion:
     """Shape alone on a labelled sweep."""
-    from pipeline.types import Frame, PointCloud
-    from segmentation.geometric import classify
+    from scan2sim.pipeline.types import Frame, PointCloud
+    from scan2sim.segmentation.geometric import classify
 
     folder = DATA / "semkitti"
     xyz = np.fromfile(folder / "00_000000.bin", np.float32).reshape(-1, 4)[:, :3]
@@ -148,12 +148,12 @@ def kitti(pictures: Path) -> Confusion:
     """The shipped network's pixels on three photos, against polygons; overlays of every fifth photo in `pictures`."""
     import cv2
 
-    from pipeline.classes import colour_of
-    from pipeline.io import image
-    from pipeline.types import Camera
-    from segmentation.backends import load
-    from segmentation.labels import CLASSES, code_of_index
-    from segmentation.photos import Labeller, labels_of
+    from scan2sim.pipeline.classes import colour_of
+    from scan2sim.pipeline.io import image
+    from scan2sim.pipeline.types import Camera
+    from scan2sim.segmentation.backends import load
+    from scan2sim.segmentation.labels import CLASSES, code_of_index
+    from scan2sim.segmentation.photos import Labeller, labels_of
 
     labeller = Labeller(load("street", None), "street")
     truth = json.loads(POLYGONS.read_text(encoding="utf-8"))["photos"]

@@ -27,11 +27,11 @@ from typing import Any
 import numpy as np
 
 from bench.measure import measure
-from pipeline.io import trajectory as trajectory_io
-from pipeline.types import Camera
-from slam.evaluate import Evaluation, evaluate, plot, umeyama
-from slam.odometry import Odometry, OdometryParams
-from slam.video import open_video
+from scan2sim.pipeline.io import trajectory as trajectory_io
+from scan2sim.pipeline.types import Camera
+from scan2sim.slam.evaluate import Evaluation, evaluate, plot, umeyama
+from scan2sim.slam.odometry import Odometry, OdometryParams
+from scan2sim.slam.video import open_video
 
 ROOT = Path(__file__).resolve().parent.parent
 DATA = ROOT.parent / "shared" / "data"
@@ -40,8 +40,8 @@ PARTS = ("drive", "kitti", "pano", "memory")
 
 def drive_of(out: Path, path: str, length: float) -> Path:
     """The rendered drive along a KITTI path, or a made-up one; made if absent."""
-    from data_samples import paths
-    from data_samples.drive import generate_drive
+    from scan2sim.data_samples import paths
+    from scan2sim.data_samples.drive import generate_drive
 
     folder, file = out / f"drive_{path}", DATA / "kitti_gt_poses" / f"{path}.txt"
     if not (folder / "video.mp4").is_file():
@@ -96,7 +96,7 @@ def kitti_camera(folder: Path) -> Camera:
 
 def kitti(out: Path) -> dict[str, float | None]:
     """ATE on 51 real frames, and the time against pycolmap's incremental mapping."""
-    from slam.adjust import adjust
+    from scan2sim.slam.adjust import adjust
 
     folder = DATA / "kitti_odo06_vo51"
     truth = np.loadtxt(folder / "poses.txt").reshape(-1, 3, 4)[:, :, 3]
@@ -171,10 +171,10 @@ def pano() -> None:
     """
     import cv2
 
-    from slam.charts import Charts
-    from slam.geometry import log_so3, relative_pose
-    from slam.relocalise import describe, matches
-    from slam.tracking import Tracker
+    from scan2sim.slam.charts import Charts
+    from scan2sim.slam.geometry import log_so3, relative_pose
+    from scan2sim.slam.relocalise import describe, matches
+    from scan2sim.slam.tracking import Tracker
 
     folder = DATA / "pano360"
     numbers = (folder / "dense_transformation.dat").read_text().splitlines()[1].split()[1:]
@@ -218,9 +218,9 @@ def memory(out: Path, path: str, length: float) -> None:
     code = """
 import sys, resource
 from pathlib import Path
-from pipeline.types import Camera
-from slam.odometry import Odometry, OdometryParams
-from slam.video import open_video
+from scan2sim.pipeline.types import Camera
+from scan2sim.slam.odometry import Odometry, OdometryParams
+from scan2sim.slam.video import open_video
 video = open_video(Path(sys.argv[1]))
 odometry, offset, count = Odometry(Camera("equirectangular", 512, 256), OdometryParams(features=300)), 0.0, 0
 import cv2

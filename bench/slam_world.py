@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 
 from bench.segmentation import scan2sim
-from pipeline.io.tile import read_tile
-from slam.evaluate import umeyama
+from scan2sim.pipeline.io.tile import read_tile
+from scan2sim.slam.evaluate import umeyama
 
 ROOT = Path(__file__).resolve().parent.parent
 DRIVE = ROOT.parent / "shared" / "data" / "kitti_raw0009_f00-24"

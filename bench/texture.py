@@ -32,7 +32,7 @@ from typing import Any
 
 from bench.measure import Measured, measure
 from bench.texture_scenes import KITTI, ROOT, SCENES, WARM, Scene, available, fresh, make, run
-from pipeline.isolate import die_with_parent
+from scan2sim.pipeline.isolate import die_with_parent
 
 METHODS = ("open3d", "nearest", "inverse_square", "ours")
 FIGURES = ("psnr_db", "psnr_gain_db", "ssim", "sharpness", "coverage")
@@ -40,17 +40,17 @@ FIGURES = ("psnr_db", "psnr_gain_db", "ssim", "sharpness", "coverage")
 
 def visibility(scene: Scene, out: Path) -> None:
     """Our depth maps, which all methods but Open3D's ask."""
-    from pipeline.steps.visibility import VISIBILITY
+    from scan2sim.pipeline.steps.visibility import VISIBILITY
 
     run(VISIBILITY, {"mesh.surface": scene.mesh, "views": scene.views} | scene.clouds, out)
 
 
 def unwrap(scene: Scene, out: Path) -> None:
     """Our atlas, which all methods paint; its charts are cut by the photos that ours chooses."""
-    from texturing.agreement import AGREEMENT
-    from texturing.choose import CHOOSE
-    from texturing.exposure import EXPOSURE
-    from texturing.unwrap import UNWRAP
+    from scan2sim.texturing.agreement import AGREEMENT
+    from scan2sim.texturing.choose import CHOOSE
+    from scan2sim.texturing.exposure import EXPOSURE
+    from scan2sim.texturing.unwrap import UNWRAP
 
     files = {"mesh": scene.mesh, "views": scene.views, "depth": scene.depth}
     for step in (EXPOSURE, AGREEMENT, CHOOSE):
@@ -60,7 +60,7 @@ def unwrap(scene: Scene, out: Path) -> None:
 
 def ours(scene: Scene, out: Path) -> None:
     """Our texture by the step that follows those, with its defaults."""
-    from texturing.texture import TEXTURE
+    from scan2sim.texturing.texture import TEXTURE
 
     choice = scene.folder / "choice"
     inputs = {
@@ -175,7 +175,7 @@ class Bench:
         """Compare renderings with the photos that were held out."""
         import numpy as np
 
-        from texturing.evaluate import held_out
+        from scan2sim.texturing.evaluate import held_out
 
         held = scene.photos(held_out=True)
         depths = [scene.depth / f"{i}.npy" for i in held]

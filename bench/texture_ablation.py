@@ -31,11 +31,11 @@ OFF: dict[str, dict[str, dict[str, Any]]] = {
 
 def paint(scene: Scene, given: dict[str, dict[str, Any]], folder: Path) -> Path:
     """Our texture of a scene with some parameters; its folder."""
-    from texturing.agreement import AGREEMENT
-    from texturing.choose import CHOOSE
-    from texturing.exposure import EXPOSURE
-    from texturing.texture import TEXTURE
-    from texturing.unwrap import UNWRAP
+    from scan2sim.texturing.agreement import AGREEMENT
+    from scan2sim.texturing.choose import CHOOSE
+    from scan2sim.texturing.exposure import EXPOSURE
+    from scan2sim.texturing.texture import TEXTURE
+    from scan2sim.texturing.unwrap import UNWRAP
 
     files = {"mesh": scene.mesh, "views": scene.views, "depth": scene.depth} | scene.clouds
     for step in (EXPOSURE, AGREEMENT, CHOOSE, UNWRAP, TEXTURE):
@@ -45,7 +45,7 @@ def paint(scene: Scene, given: dict[str, dict[str, Any]], folder: Path) -> Path:
 
 def figures(scene: Scene, folder: Path, clean: Path | None) -> dict[str, float]:
     """Of a texture: at the held-out photos, and on a street against its truth; ghosts where `clean` is given."""
-    from texturing.evaluate import held_out
+    from scan2sim.texturing.evaluate import held_out
 
     held = scene.photos(held_out=True)
     results = list(held_out([folder], list(held.values()), [scene.depth / f"{i}.npy" for i in held]))

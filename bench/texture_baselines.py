@@ -14,12 +14,12 @@ import numpy as np
 from numba import njit, prange
 
 from bench.texture_scenes import Scene
-from pipeline.cameras import EQUIRECTANGULAR, MODEL_ID, parameters, pixel_angle, project_point
-from pipeline.io import image
-from pipeline.range_image import is_visible
-from pipeline.types import U8, Mesh
-from pipeline.visibility import BIAS, load_depth_map
-from texturing import blend, fill
+from scan2sim.pipeline.cameras import EQUIRECTANGULAR, MODEL_ID, parameters, pixel_angle, project_point
+from scan2sim.pipeline.io import image
+from scan2sim.pipeline.range_image import is_visible
+from scan2sim.pipeline.types import U8, Mesh
+from scan2sim.pipeline.visibility import BIAS, load_depth_map
+from scan2sim.texturing import blend, fill
 
 OPEN3D_SIZE = 4096
 PADDING = 16

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.io import image
-from pipeline.types import U8
+from scan2sim.pipeline.io import image
+from scan2sim.pipeline.types import U8
 
 COLUMN = 640
 """Pixels that a picture is wide in the overview."""

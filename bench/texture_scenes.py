@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from flows.recipe import scanner_path
-from pipeline.classes import GROUPS
-from pipeline.io import views as views_io
-from pipeline.io.tile import read_tile
-from pipeline.step import Step, silent
-from pipeline.types import Frame, Mesh, PointCloud, Tile, View
+from scan2sim.flows.recipe import scanner_path
+from scan2sim.pipeline.classes import GROUPS
+from scan2sim.pipeline.io import views as views_io
+from scan2sim.pipeline.io.tile import read_tile
+from scan2sim.pipeline.step import Step, silent
+from scan2sim.pipeline.types import Frame, Mesh, PointCloud, Tile, View
 
 ROOT = Path(__file__).resolve().parent.parent
 KITTI = ROOT.parent / "shared" / "data" / "kitti_raw0009_f00-24"
@@ -105,13 +105,13 @@ def _scan(name: str, tile: Path) -> None:
     if name == WARM:
         tile.symlink_to(ROOT / "data_samples" / "tile")
     elif name == "kitti":
-        from pipeline.io.kitti import import_kitti_raw
+        from scan2sim.pipeline.io.kitti import import_kitti_raw
 
         import_kitti_raw(KITTI, tile, poses=KITTI / "T_velo0_velo_icp_frames_0-24.txt", link=True)
     else:
-        from data_samples.layout import Style
-        from data_samples.photos import Effects
-        from data_samples.street import generate
+        from scan2sim.data_samples.layout import Style
+        from scan2sim.data_samples.photos import Effects
+        from scan2sim.data_samples.street import generate
 
         hard = name == "street_hard"
         generate(tile, **STREET, style=Style(moving_car=hard), effects=Effects(exposure_ev=1.0 if hard else 0.0))
@@ -119,10 +119,10 @@ def _scan(name: str, tile: Path) -> None:
 
 def _surface(scene: Scene, depth: int | None, faces: int) -> None:
     """Mesh everything that belongs to a surface as one: 10 cm voxels, Poisson, trim, islands, decimate."""
-    from pipeline.steps.decimate import DECIMATE
-    from pipeline.steps.islands import ISLANDS
-    from pipeline.steps.poisson import POISSON
-    from pipeline.steps.trim import TRIM
+    from scan2sim.pipeline.steps.decimate import DECIMATE
+    from scan2sim.pipeline.steps.islands import ISLANDS
+    from scan2sim.pipeline.steps.poisson import POISSON
+    from scan2sim.pipeline.steps.trim import TRIM
 
     tile, steps = read_tile(scene.tile), scene.folder / "steps"
     thin = _thinned(tile, steps)
@@ -155,10 +155,10 @@ def _moved(cloud: PointCloud, frame: Frame) -> PointCloud:
 
 def _thinned(tile: Tile, steps: Path) -> dict[str, Path]:
     """`surface`, and `rest` where the points have classes: one point a voxel, normals towards the scanner."""
-    from pipeline.steps.ingest import INGEST
-    from pipeline.steps.path import PATH
-    from pipeline.steps.split import SPLIT
-    from pipeline.steps.voxel import VOXEL
+    from scan2sim.pipeline.steps.ingest import INGEST
+    from scan2sim.pipeline.steps.path import PATH
+    from scan2sim.pipeline.steps.split import SPLIT
+    from scan2sim.pipeline.steps.voxel import VOXEL
 
     frame = {"crs": tile.frame.crs, "origin": tile.frame.origin, "unit": tile.frame.unit}
     whole = run(INGEST, {f"cloud.{i:04d}": path for i, path in enumerate(tile.clouds)}, steps / "ingest", **frame)
@@ -176,7 +176,7 @@ def _thinned(tile: Tile, steps: Path) -> dict[str, Path]:
 
 
 def _views(scene: Scene, tile: Tile) -> None:
-    from pipeline.steps.views import VIEWS
+    from scan2sim.pipeline.steps.views import VIEWS
 
     photos = {f"photo.{i}": view.photo for i, view in enumerate(tile.views)}
     poses = tuple(views_io.to_json(view, with_paths=False) for view in tile.views)

@@ -11,12 +11,12 @@ import numpy.typing as npt
 
 from bench.texture_baselines import MAX_DISTANCE, MIN_COS
 from bench.texture_scenes import Scene
-from pipeline.classes import CODE
-from pipeline.io import image, las
-from pipeline.io.tile import read_tile
-from pipeline.render import Body, Renderer, textured
-from pipeline.types import F32, U8, Mesh, PointCloud, View
-from pipeline.visibility import load_depth_map, visible
+from scan2sim.pipeline.classes import CODE
+from scan2sim.pipeline.io import image, las
+from scan2sim.pipeline.io.tile import read_tile
+from scan2sim.pipeline.render import Body, Renderer, textured
+from scan2sim.pipeline.types import F32, U8, Mesh, PointCloud, View
+from scan2sim.pipeline.visibility import load_depth_map, visible
 
 NEAR = 15.0
 """Metres: what a photo saw from no farther is held against the truth."""
@@ -64,7 +64,7 @@ def samples(scene: Scene) -> Samples:
     import cv2
     import open3d as o3d
 
-    from pipeline.cameras import project
+    from scan2sim.pipeline.cameras import project
 
     mesh, tile = Mesh.load(scene.mesh), read_tile(scene.tile)
     assert tile.truth_points is not None and tile.truth_mesh is not None
@@ -248,7 +248,7 @@ def _car_pixels(clean: View, hard: View, ev: float) -> Bools:
     """(H, W) where the photo of `hard` shows what that of `clean`, brought to its exposure, does not."""
     import cv2
 
-    from data_samples.scene import srgb
+    from scan2sim.data_samples.scene import srgb
 
     without, photo = image.read_rgb(clean.photo), image.read_rgb(hard.photo)
     assert without is not None and photo is not None
@@ -259,7 +259,7 @@ def _car_pixels(clean: View, hard: View, ev: float) -> Bools:
 
 def _at_pixels(mask: Bools, view: View, places: F32) -> Bools:
     """(N,) the mask's values where a view sees places."""
-    from pipeline.cameras import project
+    from scan2sim.pipeline.cameras import project
 
     T = np.linalg.inv(view.T_world_cam)
     uv, _ = project(view.camera, places @ T[:3, :3].T + T[:3, 3])

@@ -15,10 +15,10 @@ import sys
 from pathlib import Path
 
 from bench.measure import Measured, measure
-from pipeline.classes import GROUPS
-from pipeline.io.tile import read_tile
-from pipeline.steps.geometry import truth_error
-from pipeline.types import Mesh
+from scan2sim.pipeline.classes import GROUPS
+from scan2sim.pipeline.io.tile import read_tile
+from scan2sim.pipeline.steps.geometry import truth_error
+from scan2sim.pipeline.types import Mesh
 
 ROOT = Path(__file__).resolve().parent.parent
 SAMPLES = 200_000

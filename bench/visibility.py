@@ -28,22 +28,22 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.tile import ROOT
-from data_samples.layout import FRAME, lay_out
-from data_samples.scanner import plan_drive
-from data_samples.scene import Scene
-from data_samples.street import generate
-from flows.execute import execute
-from flows.planning import plan
-from flows.recipe import Node, Output, recipe
-from flows.settings import Settings
-from pipeline import visibility
-from pipeline.cameras import inside, project
-from pipeline.classes import CLASSES, GROUPS
-from pipeline.io.tile import read_tile
-from pipeline.steps.visibility import VisibilityParams
-from pipeline.store import Store
-from pipeline.types import F32, F64, U8, Frame, Mesh, PointCloud, Tile, View
-from pipeline.visibility import DepthMap
+from scan2sim.data_samples.layout import FRAME, lay_out
+from scan2sim.data_samples.scanner import plan_drive
+from scan2sim.data_samples.scene import Scene
+from scan2sim.data_samples.street import generate
+from scan2sim.flows.execute import execute
+from scan2sim.flows.planning import plan
+from scan2sim.flows.recipe import Node, Output, recipe
+from scan2sim.flows.settings import Settings
+from scan2sim.pipeline import visibility
+from scan2sim.pipeline.cameras import inside, project
+from scan2sim.pipeline.classes import CLASSES, GROUPS
+from scan2sim.pipeline.io.tile import read_tile
+from scan2sim.pipeline.steps.visibility import VisibilityParams
+from scan2sim.pipeline.store import Store
+from scan2sim.pipeline.types import F32, F64, U8, Frame, Mesh, PointCloud, Tile, View
+from scan2sim.pipeline.visibility import DepthMap
 
 OURS = "mesh + discs (ours)"
 SPLAT = 8

@@ -1,6 +1,6 @@
 """Film a drive through a synthetic town: a 360-degree video with its ground truth and a receiver's fixes.
 
-`python -m data_samples.drive OUT --path town --length 300` writes video.mp4, truth.csv, gps.csv and mask.png.
+`python -m scan2sim.data_samples.drive OUT --path town --length 300` writes video.mp4, truth.csv, gps.csv and mask.png.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
-from data_samples import gps, paths
-from data_samples.panorama import Panorama
-from data_samples.town import build
-from data_samples.traffic import Traffic
-from pipeline.errors import SettingError
-from pipeline.io.video import Encoder
-from pipeline.step import Report, silent
-from pipeline.types import F64, U8, Trajectory
+from scan2sim.data_samples import gps, paths
+from scan2sim.data_samples.panorama import Panorama
+from scan2sim.data_samples.town import build
+from scan2sim.data_samples.traffic import Traffic
+from scan2sim.pipeline.errors import SettingError
+from scan2sim.pipeline.io.video import Encoder
+from scan2sim.pipeline.step import Report, silent
+from scan2sim.pipeline.types import F64, U8, Trajectory
 
 
 def generate_drive(
@@ -168,7 +168,7 @@ def encode(frames: Iterable[U8], file: Path, fps: float, bitrate: float, size: t
 
 def main() -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(prog="python -m data_samples.drive", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m scan2sim.data_samples.drive", description=__doc__)
     parser.add_argument("out", type=Path)
     parser.add_argument("--path", default="town", help="a KITTI pose file, or town, or loop")
     parser.add_argument("--length", type=float, help="metres of the path (town: 600)")

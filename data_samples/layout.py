@@ -8,9 +8,9 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from data_samples.paints import RGB, linear
-from data_samples.shapes import Field, waves
-from pipeline.types import F64, Frame
+from scan2sim.data_samples.paints import RGB, linear
+from scan2sim.data_samples.shapes import Field, waves
+from scan2sim.pipeline.types import F64, Frame
 
 Span = tuple[float, float]
 Side = Literal[1, -1]

@@ -1,12 +1,12 @@
-"""Make the small committed tile again: `python -m data_samples.make_tile [FOLDER]`."""
+"""Make the small committed tile again: `python -m scan2sim.data_samples.make_tile [FOLDER]`."""
 
 from __future__ import annotations
 
 import sys
 from pathlib import Path
 
-from data_samples.photos import Effects
-from data_samples.street import generate
+from scan2sim.data_samples.photos import Effects
+from scan2sim.data_samples.street import generate
 
 TILE = Path(__file__).parent / "tile"
 

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
-from data_samples.paints import Material
+from scan2sim.data_samples.paints import Material
 
 PLAIN, ASPHALT, SETTS, KERB, SLABS = (
     int(m) for m in (Material.PLAIN, Material.ASPHALT, Material.SETTS, Material.KERB, Material.SLABS)

@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from data_samples import rays as tracing
-from data_samples import shader, signs, sky
-from data_samples.ground import CELL, KERB
-from data_samples.scene import srgb
-from data_samples.shapes import Part
-from data_samples.town import Town
-from data_samples.traffic import Traffic
-from pipeline.types import F32, F64, U8
+from scan2sim.data_samples import rays as tracing
+from scan2sim.data_samples import shader, signs, sky
+from scan2sim.data_samples.ground import CELL, KERB
+from scan2sim.data_samples.scene import srgb
+from scan2sim.data_samples.shapes import Part
+from scan2sim.data_samples.town import Town
+from scan2sim.data_samples.traffic import Traffic
+from scan2sim.pipeline.types import F32, F64, U8
 
 RADIUS = 220.0  # metres around the camera in which things have triangles
 STEP = 0.25  # of the radius, driven before they are gathered anew

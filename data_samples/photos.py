@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from data_samples.layout import Layout
-from data_samples.scanner import Drive
-from data_samples.scene import Scene, srgb
-from pipeline.types import F32, F64, U8, Camera
+from scan2sim.data_samples.layout import Layout
+from scan2sim.data_samples.scanner import Drive
+from scan2sim.data_samples.scene import Scene, srgb
+from scan2sim.pipeline.types import F32, F64, U8, Camera
 
 CAMERAS = ("front", "pano", "left", "right")
 STATION = 5.0  # metres of road between stations, at most (where there are photos enough)
@@ -189,7 +189,7 @@ def _see(
     scene: Scene, drive: Drive, camera: Camera, T_world_cam: F64, time: float | None, pixels: F64
 ) -> tuple[F32, U8, F32]:
     """Linear light (N, 3), label (N,) and distance (N,) through pixels (N, 2)."""
-    from data_samples import sky
+    from scan2sim.data_samples import sky
 
     rays = (directions(camera, pixels) @ T_world_cam[:3, :3].T).astype(np.float32)
     origins = np.broadcast_to(T_world_cam[:3, 3].astype(np.float32), rays.shape)

@@ -8,13 +8,13 @@ from functools import partial
 
 import numpy as np
 
-from data_samples import objects
-from data_samples.ground import CELL, HALF, KERB, WALK, Ground
-from data_samples.layout import Boundary, House, Style, Tree
-from data_samples.paints import RGB
-from data_samples.plants import hedge, leafy_tree, shrub
-from data_samples.shapes import Part
-from pipeline.types import F64, U8
+from scan2sim.data_samples import objects
+from scan2sim.data_samples.ground import CELL, HALF, KERB, WALK, Ground
+from scan2sim.data_samples.layout import Boundary, House, Style, Tree
+from scan2sim.data_samples.paints import RGB
+from scan2sim.data_samples.plants import hedge, leafy_tree, shrub
+from scan2sim.data_samples.shapes import Part
+from scan2sim.pipeline.types import F64, U8
 
 PLOT = HALF + WALK  # metres from the centre line to the plots
 

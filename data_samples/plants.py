@@ -8,10 +8,10 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from data_samples import paints
-from data_samples.layout import Tree
-from data_samples.paints import RGB, Material, Paint, linear
-from data_samples.shapes import Part, blob, box, join, tube
+from scan2sim.data_samples import paints
+from scan2sim.data_samples.layout import Tree
+from scan2sim.data_samples.paints import RGB, Material, Paint, linear
+from scan2sim.data_samples.shapes import Part, blob, box, join, tube
 
 SHAPES = 40  # different clumps of leaves
 

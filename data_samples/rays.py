@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
-from data_samples.ground import HALF
+from scan2sim.data_samples.ground import HALF
 
 Array = npt.NDArray[Any]
 

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from data_samples.layout import FRAME, Layout
-from data_samples.paints import Material
-from data_samples.scene import FINE, CarPoses, Scene, srgb
-from pipeline.errors import DataError
-from pipeline.step import Report, silent
-from pipeline.types import F32, F64, PointCloud, Trajectory
+from scan2sim.data_samples.layout import FRAME, Layout
+from scan2sim.data_samples.paints import Material
+from scan2sim.data_samples.scene import FINE, CarPoses, Scene, srgb
+from scan2sim.pipeline.errors import DataError
+from scan2sim.pipeline.step import Report, silent
+from scan2sim.pipeline.types import F32, F64, PointCloud, Trajectory
 
 START = 412_300.0  # GPS time of week, seconds
 SPEED = 10.0

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from data_samples import objects, paints, signs
-from data_samples.layout import FRAME, HALF_WIDTH, Layout
-from data_samples.paints import Material, Paint, linear
-from data_samples.shapes import Part, join, sheet
-from pipeline.types import F32, F64, Mesh
+from scan2sim.data_samples import objects, paints, signs
+from scan2sim.data_samples.layout import FRAME, HALF_WIDTH, Layout
+from scan2sim.data_samples.paints import Material, Paint, linear
+from scan2sim.data_samples.shapes import Part, join, sheet
+from scan2sim.pipeline.types import F32, F64, Mesh
 
 CAR_SPEED = 8.0
 SUN_COLOUR = np.array([1.06, 1.0, 0.88], np.float32)
@@ -243,7 +243,7 @@ class Scene:
 
     def lit(self, xyz: F32, face: Any, bary: F32, heading: F32, footprint: F32, car: CarPoses | None = None) -> F32:
         """Linear light (N, 3) that leaves the surface points `xyz` (the surfaces are matt: in all directions)."""
-        from data_samples import materials
+        from scan2sim.data_samples import materials
 
         p = self.surface
         albedo, normal, sky = materials.surface(

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numba import njit, prange
 
-from data_samples.ground import HALF, WALK
-from data_samples.materials import _asphalt, _colour, noise
-from data_samples.paints import Material
-from data_samples.rays import BLOCK, ROAD, SKY, THING, WALL, Array, from_road, mixed, task
+from scan2sim.data_samples.ground import HALF, WALK
+from scan2sim.data_samples.materials import _asphalt, _colour, noise
+from scan2sim.data_samples.paints import Material
+from scan2sim.data_samples.rays import BLOCK, ROAD, SKY, THING, WALL, Array, from_road, mixed, task
 
 KERBSTONE, SLABS, GRASS, FOLIAGE = (int(Material[m]) for m in ("KERB", "SLABS", "GRASS", "FOLIAGE"))
 STONE, ZEBRA = 0.15, 85.0  # metres: width of a kerbstone, from one crossing to the next

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
-from data_samples.materials import noise
+from scan2sim.data_samples.materials import noise
 
 
 @njit(cache=True, parallel=True)

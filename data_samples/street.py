@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from data_samples.layout import FRAME, Layout, Style, lay_out
-from data_samples.photos import Effects, cameras, develop, plan_shots, render
-from data_samples.scanner import Drive, plan_drive, scan
-from data_samples.scene import FINE, Scene, srgb
-from pipeline.errors import SettingError
-from pipeline.step import Report, silent
-from pipeline.types import F64, Mesh, PointCloud, Trajectory
+from scan2sim.data_samples.layout import FRAME, Layout, Style, lay_out
+from scan2sim.data_samples.photos import Effects, cameras, develop, plan_shots, render
+from scan2sim.data_samples.scanner import Drive, plan_drive, scan
+from scan2sim.data_samples.scene import FINE, Scene, srgb
+from scan2sim.pipeline.errors import SettingError
+from scan2sim.pipeline.step import Report, silent
+from scan2sim.pipeline.types import F64, Mesh, PointCloud, Trajectory
 
 SHORTEST = 8.0
 
@@ -60,8 +60,8 @@ def generate(
     ):
         if not (np.isfinite(value) and value >= least):
             raise SettingError(key, f"{value} is less than {least:g}", f"Give {least:g} or more")
-    from pipeline.io import las
-    from pipeline.io.tile import read_tile, write_tile
+    from scan2sim.pipeline.io import las
+    from scan2sim.pipeline.io.tile import read_tile, write_tile
 
     effects = effects or Effects()
     (out / "photos").mkdir(parents=True, exist_ok=True)
@@ -137,7 +137,7 @@ def _take_photos(
 
 
 def _write_truth(folder: Path, scene: Scene, density: float, scale: float) -> None:
-    from pipeline.io import las
+    from scan2sim.pipeline.io import las
 
     mesh = scene.truth_mesh()
     assert mesh.label is not None

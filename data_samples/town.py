@@ -11,11 +11,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
-from data_samples.ground import Ground, lay_ground
-from data_samples.paints import Material, Paint
-from data_samples.planner import Planner, Thing
-from data_samples.shapes import Part, box, join
-from pipeline.types import F64
+from scan2sim.data_samples.ground import Ground, lay_ground
+from scan2sim.data_samples.paints import Material, Paint
+from scan2sim.data_samples.planner import Planner, Thing
+from scan2sim.data_samples.shapes import Part, box, join
+from scan2sim.pipeline.types import F64
 
 SKY = (0.35, 0.55)  # openness to the sky of what faces down, and how much more of what faces up
 

@@ -1,6 +1,6 @@
 """Labelled photos of many synthetic streets, no two alike, for a segmentation network to learn from.
 
-`python -m data_samples.training OUT [--images 1200] [--seed 1000]`: OUT/images/*.jpg and OUT/labels/*.png (LAS
+`python -m scan2sim.data_samples.training OUT [--images 1200] [--seed 1000]`: OUT/images/*.jpg and OUT/labels/*.png (LAS
 class codes a pixel, 0 sky, 255 not to be learnt). Streets, light, weather, camera and place are drawn anew, far
 beyond what the streets of tests and benchmarks look like; seeds from 1000 on are kept for training, below for
 everything else.
@@ -17,11 +17,11 @@ from pathlib import Path
 
 import numpy as np
 
-from data_samples.layout import RGB, Style, lay_out
-from data_samples.photos import Effects, Rendering, develop, directions, render
-from data_samples.scanner import Drive, plan_drive
-from data_samples.scene import Scene
-from pipeline.types import F64, U8, Camera
+from scan2sim.data_samples.layout import RGB, Style, lay_out
+from scan2sim.data_samples.photos import Effects, Rendering, develop, directions, render
+from scan2sim.data_samples.scanner import Drive, plan_drive
+from scan2sim.data_samples.scene import Scene
+from scan2sim.pipeline.types import F64, U8, Camera
 
 PER_STREET = 20
 LENGTH = 60.0

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import typer
 from typer.core import TyperGroup
 
-from pipeline.errors import INTERRUPTED, ScanError, exit_code, from_os_error
+from scan2sim.pipeline.errors import INTERRUPTED, ScanError, exit_code, from_os_error
 
 app = typer.Typer(
     name="scan2sim",
@@ -87,7 +87,7 @@ def run(
     jobs: Annotated[int, typer.Option(min=0, help="Steps at a time; 0: as the cores allow.")] = 0,
 ) -> None:
     """Make a world of a tile; what an earlier run has finished is kept."""
-    from flows.run import run_tile
+    from scan2sim.flows.run import run_tile
 
     run_tile(tile, out, _settings(set_, config, hold_out), force=force, start=from_, jobs=jobs)
 
@@ -103,7 +103,7 @@ def plan(
     from_: From = None,
 ) -> None:
     """Show what `run` would run, and why."""
-    from flows.run import show_plan
+    from scan2sim.flows.run import show_plan
 
     show_plan(tile, out, _settings(set_, config, hold_out), force=force, start=from_)
 
@@ -121,8 +121,8 @@ def tile(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a survey that is there already.")] = False,
 ) -> None:
     """Cut a long corridor into tiles that overlap: a survey."""
-    from flows.cut import Options, cut_survey
-    from flows.display import progress
+    from scan2sim.flows.cut import Options, cut_survey
+    from scan2sim.flows.display import progress
 
     told: list[str] = []
     options = Options(length, buffer, reach, photo_reach, copy)
@@ -155,7 +155,7 @@ def survey(
     cores: Annotated[int | None, typer.Option(min=1, help="That a step may use; default: all.")] = None,
 ) -> None:
     """Make the worlds of all tiles of a survey, which meet, and one of them all."""
-    from flows.surveying import run_source
+    from scan2sim.flows.surveying import run_source
 
     run_source(
         source, out, _settings(set_, config, hold_out), length=length, buffer=buffer, jobs=jobs, memory=memory,
@@ -166,7 +166,7 @@ def survey(
 @app.command()
 def inspect(path: Annotated[Path, typer.Argument(help="A cloud, a tile, a mesh, or a world.")]) -> None:
     """Show one screen of facts."""
-    from flows.inspect import inspect_path
+    from scan2sim.flows.inspect import inspect_path
 
     inspect_path(path)
 
@@ -180,8 +180,8 @@ def sample(
     seed: Annotated[int, typer.Option(help="Another seed, another street.")] = 0,
 ) -> None:
     """Generate a synthetic street with its ground truth."""
-    from data_samples.street import generate
-    from flows.display import progress
+    from scan2sim.data_samples.street import generate
+    from scan2sim.flows.display import progress
 
     with progress("street") as report:
         path = generate(out, length=length, points=points, photos=photos, seed=seed, report=report)
@@ -197,7 +197,7 @@ def segment_a_tile(
     config: Config = None,
 ) -> None:
     """Classify a tile's points from its photos; write LAZ, label pictures and masks."""
-    from flows.segment import segment_tile
+    from scan2sim.flows.segment import segment_tile
 
     segment_tile(
         tile, out, _settings([*(set_ or []), *(["segment.overwrite=true"] if overwrite else [])], config, None)
@@ -213,7 +213,7 @@ def segment_train(
     seed: Annotated[int, typer.Option(help="Of weights, crops and looks.")] = 0,
 ) -> None:
     """Train the project's own network on labelled photos."""
-    from flows.segment import train_network
+    from scan2sim.flows.segment import train_network
 
     train_network(folder, out, minutes=minutes, steps=steps, seed=seed)
 
@@ -226,7 +226,7 @@ def segment_evaluate(
     config: Config = None,
 ) -> None:
     """Print how classes that are told compare with those that are known."""
-    from flows.segment import evaluate
+    from scan2sim.flows.segment import evaluate
 
     evaluate(path, out, _settings([*(set_ or []), "segment.overwrite=true"], config, None))
 
@@ -262,7 +262,7 @@ def slam_a_video(
     config: Config = None,
 ) -> None:
     """Poses of a video's frames: TUM, KITTI, CSV, GeoJSON."""
-    from flows.slam import Options, slam_video
+    from scan2sim.flows.slam import Options, slam_video
 
     options = Options(
         gps=gps, gps_offset=gps_offset, georeference=not local, mask=mask, camera=camera, focal=focal, centre=centre,
@@ -282,7 +282,7 @@ def slam_evaluate(
     out: Annotated[Path | None, typer.Option("--out", "-o", help="PNG of path and errors.")] = None,
 ) -> None:
     """Print how far a trajectory is from the truth: D3.2's errors, ATE, RPE, drift."""
-    from flows.slam import evaluate_trajectory
+    from scan2sim.flows.slam import evaluate_trajectory
 
     evaluate_trajectory(trajectory, truth, segment=segment, alignment=alignment, out=out)
 
@@ -303,7 +303,7 @@ def slam_study(
     config: Config = None,
 ) -> None:
     """What resolution, bit rate and frame rate of the video cost: D3.2's tables 4 and 5."""
-    from flows.slam import study_compression
+    from scan2sim.flows.slam import study_compression
 
     study_compression(
         source, out, truth=truth, gps=gps, mask=mask, heights=heights, bitrates=bitrates, rates=rates, jobs=jobs,
@@ -324,8 +324,8 @@ def import_kitti(
     overwrite: Overwrite = False,
 ) -> None:
     """KITTI raw: merge sweeps by OXTS or a pose file, colour points from the photos."""
-    from flows.display import progress
-    from pipeline.io.kitti import import_kitti_raw
+    from scan2sim.flows.display import progress
+    from scan2sim.pipeline.io.kitti import import_kitti_raw
 
     with progress("import") as report:
         path = import_kitti_raw(
@@ -349,8 +349,8 @@ def import_colmap_model(
     overwrite: Overwrite = False,
 ) -> None:
     """COLMAP model, text or binary."""
-    from flows.display import progress
-    from pipeline.io.colmap import import_colmap
+    from scan2sim.flows.display import progress
+    from scan2sim.pipeline.io.colmap import import_colmap
 
     up: Literal["photos"] | None = "photos" if upright else None
     with progress("import") as report:
@@ -376,8 +376,8 @@ def import_las_files(
     overwrite: Overwrite = False,
 ) -> None:
     """Plain clouds, with a CSV of photos if there are any."""
-    from flows.display import progress
-    from pipeline.io.las_csv import import_las
+    from scan2sim.flows.display import progress
+    from scan2sim.pipeline.io.las_csv import import_las
 
     with progress("import") as report:
         path = import_las(
@@ -422,9 +422,9 @@ def import_sweeps_and_poses(
     overwrite: Overwrite = False,
 ) -> None:
     """A scanner's sweeps placed by a trajectory, with photos if there are any."""
-    from flows.display import progress
-    from pipeline.errors import SettingError
-    from pipeline.io import sweeps as sweeps_io
+    from scan2sim.flows.display import progress
+    from scan2sim.pipeline.errors import SettingError
+    from scan2sim.pipeline.io import sweeps as sweeps_io
 
     if deskew not in ("none", "kitti"):
         raise SettingError("deskew", f"there is no {deskew!r}", "Use kitti, or none")
@@ -450,7 +450,7 @@ def import_sweeps_and_poses(
 
 
 def _settings(set_: list[str] | None, config: Path | None, hold_out: int | None):  # type: ignore[no-untyped-def]
-    from flows.settings import Settings
+    from scan2sim.flows.settings import Settings
 
     assignments = list(set_ or [])
     if hold_out is not None:
@@ -474,7 +474,7 @@ def main() -> None:
             typer.secho(f"error: {error.where}: {error.cause}", fg="red", err=True)
             typer.echo(f"  {error.remedy}.", err=True)
         else:
-            from flows.display import log_unexpected
+            from scan2sim.flows.display import log_unexpected
 
             typer.secho(f"error: unexpected {type(error).__name__}: {error}", fg="red", err=True)
             typer.echo(f"  The details are in {log_unexpected(error)}; please report them.", err=True)

@@ -16,18 +16,18 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.cells import Cell, Seed, cells
-from pipeline.cutting import dense, members, seeds, sees
-from pipeline.errors import DataError, InputError, SettingError
-from pipeline.io import clouds, las
-from pipeline.io import trajectory as trajectory_io
-from pipeline.io.importing import place, tile_folder
-from pipeline.io.spool import QUANTUM, Spool
-from pipeline.io.survey import read_survey, write_survey
-from pipeline.io.tile import TileFile, read_tile, tile_name, write_tile
-from pipeline.step import Report, silent
-from pipeline.steps.ingest import MIN_POINTS
-from pipeline.types import F64, Tile, Trajectory
+from scan2sim.pipeline.cells import Cell, Seed, cells
+from scan2sim.pipeline.cutting import dense, members, seeds, sees
+from scan2sim.pipeline.errors import DataError, InputError, SettingError
+from scan2sim.pipeline.io import clouds, las
+from scan2sim.pipeline.io import trajectory as trajectory_io
+from scan2sim.pipeline.io.importing import place, tile_folder
+from scan2sim.pipeline.io.spool import QUANTUM, Spool
+from scan2sim.pipeline.io.survey import read_survey, write_survey
+from scan2sim.pipeline.io.tile import TileFile, read_tile, tile_name, write_tile
+from scan2sim.pipeline.step import Report, silent
+from scan2sim.pipeline.steps.ingest import MIN_POINTS
+from scan2sim.pipeline.types import F64, Tile, Trajectory
 
 CHUNK = 500_000
 """Points that are read at a time."""

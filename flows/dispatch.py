@@ -8,10 +8,10 @@ from functools import partial
 from queue import SimpleQueue
 from typing import Any, Protocol
 
-from flows.execute import Frontier
-from flows.planning import Planned
-from pipeline.errors import ScanError, StepError
-from pipeline.store import Manifest, Store
+from scan2sim.flows.execute import Frontier
+from scan2sim.flows.planning import Planned
+from scan2sim.pipeline.errors import ScanError, StepError
+from scan2sim.pipeline.store import Manifest, Store
 
 PERIOD = 1.0  # seconds between two looks; what shows it may cost a tenth of one
 

@@ -13,9 +13,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-from flows.execute import Event
-from flows.recipe import Node
-from pipeline.step import Report
+from scan2sim.flows.execute import Event
+from scan2sim.flows.recipe import Node
+from scan2sim.pipeline.step import Report
 
 console = Console()
 

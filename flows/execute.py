@@ -21,12 +21,12 @@ from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import Any, Literal
 
-from flows.memory import need, share
-from flows.planning import Planned
-from flows.recipe import Node
-from pipeline.errors import BusyError, ScanError, StepError, UnavailableError, from_os_error
-from pipeline.step import Report, silent
-from pipeline.store import Manifest, Store
+from scan2sim.flows.memory import need, share
+from scan2sim.flows.planning import Planned
+from scan2sim.flows.recipe import Node
+from scan2sim.pipeline.errors import BusyError, ScanError, StepError, UnavailableError, from_os_error
+from scan2sim.pipeline.step import Report, silent
+from scan2sim.pipeline.store import Manifest, Store
 
 Event = Literal["start", "progress", "done", "kept", "failed"]
 Watch = Callable[[Node, Event, float, str], None]
@@ -145,7 +145,7 @@ def check_version(item: Planned, wanted: Mapping[str, str]) -> None:
     Raises:
         UnavailableError: this machine has another version of the project, of the step, or of what computes it.
     """
-    from flows.recipe import STEPS
+    from scan2sim.flows.recipe import STEPS
 
     mine, name = versions(), item.node.step.name
     others = [f"{k} {mine.get(k, 'none')} instead of {v}" for k, v in wanted.items() if mine.get(k) != v]
@@ -280,7 +280,7 @@ def _processes() -> Any:
     """Processes forked from a server that has the heavy libraries loaded."""
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # several nodes share the cores: don't spin
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["flows.preload"])
+    context.set_forkserver_preload(["scan2sim.flows.preload"])
     return context
 
 

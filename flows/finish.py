@@ -11,17 +11,17 @@ from typing import Any
 
 import numpy as np
 
-from flows.planning import Planned
-from flows.publish import publish
-from flows.report import figures, write_report
-from flows.settings import Settings
-from flows.survey_report import TileState, write_survey_report
-from pipeline.cells import outline
-from pipeline.errors import ScanError
-from pipeline.io import clouds, stac, worlds
-from pipeline.io.survey import Survey
-from pipeline.store import Digests, Manifest, Store
-from pipeline.types import Tile
+from scan2sim.flows.planning import Planned
+from scan2sim.flows.publish import publish
+from scan2sim.flows.report import figures, write_report
+from scan2sim.flows.settings import Settings
+from scan2sim.flows.survey_report import TileState, write_survey_report
+from scan2sim.pipeline.cells import outline
+from scan2sim.pipeline.errors import ScanError
+from scan2sim.pipeline.io import clouds, stac, worlds
+from scan2sim.pipeline.io.survey import Survey
+from scan2sim.pipeline.store import Digests, Manifest, Store
+from scan2sim.pipeline.types import Tile
 
 TILES, PICTURE = "tiles", "picture.jpg"
 SHOWN = {"export", "exposure", "pictures", "score"}

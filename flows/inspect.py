@@ -10,8 +10,8 @@ from xml.etree import ElementTree
 from rich.markup import escape
 from rich.table import Table
 
-from flows.display import console
-from pipeline.errors import InputError
+from scan2sim.flows.display import console
+from scan2sim.pipeline.errors import InputError
 
 Facts = list[tuple[str, str]]
 
@@ -61,10 +61,10 @@ def _bounds(low: object, high: object) -> str:
 def _cloud(path: Path) -> tuple[str, Facts]:
     import numpy as np
 
-    from pipeline.classes import CLASSES
-    from pipeline.io import clouds
-    from pipeline.io.crs import name as crs_name
-    from pipeline.types import Frame
+    from scan2sim.pipeline.classes import CLASSES
+    from scan2sim.pipeline.io import clouds
+    from scan2sim.pipeline.io.crs import name as crs_name
+    from scan2sim.pipeline.types import Frame
 
     header = clouds.read_header(path)
     low = tuple(np.floor(header.low).tolist())
@@ -93,9 +93,9 @@ def _cloud(path: Path) -> tuple[str, Facts]:
 
 
 def _tile(path: Path) -> tuple[str, Facts]:
-    from pipeline.io import clouds
-    from pipeline.io.crs import name as crs_name
-    from pipeline.io.tile import read_tile
+    from scan2sim.pipeline.io import clouds
+    from scan2sim.pipeline.io.crs import name as crs_name
+    from scan2sim.pipeline.io.tile import read_tile
 
     tile = read_tile(path)
     count = sum(clouds.read_header(p).count for p in tile.clouds)

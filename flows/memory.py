@@ -12,11 +12,11 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipeline.errors import SettingError, from_os_error
+from scan2sim.pipeline.errors import SettingError, from_os_error
 
 if TYPE_CHECKING:
-    from flows.planning import Planned
-    from pipeline.store import Store
+    from scan2sim.flows.planning import Planned
+    from scan2sim.pipeline.store import Store
 
 SLOT = 0.25  # GB; memory is shared out in pieces of it
 PAUSE = 0.2  # seconds between looks for free memory

@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from flows.recipe import Node, Output
-from pipeline.errors import StepError
-from pipeline.store import Manifest, Store, digest, key_of
+from scan2sim.flows.recipe import Node, Output
+from scan2sim.pipeline.errors import StepError
+from scan2sim.pipeline.store import Manifest, Store, digest, key_of
 
 AGAIN = ("forced", "asked", "follows")
 """How reasons begin by which a node runs though its result is there."""

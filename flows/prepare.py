@@ -28,12 +28,12 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from flows.execute import locked
-from pipeline.errors import InputError, from_os_error
-from pipeline.io import toml
-from pipeline.io.remote import is_remote, likeness
-from pipeline.step import Report, silent
-from pipeline.store import Digests
+from scan2sim.flows.execute import locked
+from scan2sim.pipeline.errors import InputError, from_os_error
+from scan2sim.pipeline.io import toml
+from scan2sim.pipeline.io.remote import is_remote, likeness
+from scan2sim.pipeline.step import Report, silent
+from scan2sim.pipeline.store import Digests
 
 Say = Callable[[str], None]
 PREPARED = "prepared"
@@ -186,8 +186,8 @@ def _corridor(drive: Drive, source: Path, out: Path, once: _Once, say: Say, repo
 
 
 def _slam(entry: SlamEntry, here: Path, out: Path, once: _Once) -> Path:
-    from flows.settings import Settings
-    from flows.slam import Options, slam_video
+    from scan2sim.flows.settings import Settings
+    from scan2sim.flows.slam import Options, slam_video
 
     options = Options(
         gps=entry.gps and here / entry.gps, gps_offset=entry.gps_offset, mask=entry.mask and here / entry.mask,
@@ -205,7 +205,7 @@ def _slam(entry: SlamEntry, here: Path, out: Path, once: _Once) -> Path:
 def _sweeps(
     entry: SweepsEntry, here: Path, poses: Path | None, out: Path, once: _Once, say: Say, report: Report
 ) -> Path:
-    from pipeline.io import sweeps as io
+    from scan2sim.pipeline.io import sweeps as io
 
     place = poses or here / (entry.poses or "")
     files = sorted((here / entry.folder).glob("*")) + sorted((here / entry.photos).glob("*") if entry.photos else [])
@@ -232,8 +232,8 @@ def _sweeps(
 
 
 def _cut(corridor: Path, out: Path, entry: TilesEntry, once: _Once, say: Say, report: Report) -> Path:
-    from flows.cut import Options, cut_survey
-    from pipeline.io.tile import sources_of
+    from scan2sim.flows.cut import Options, cut_survey
+    from scan2sim.pipeline.io.tile import sources_of
 
     def make() -> None:
         cut_survey(corridor, out, Options(entry.length, entry.buffer), overwrite=True, report=report, warn=say)

@@ -6,12 +6,12 @@ import json
 import shutil
 from pathlib import Path
 
-from flows.execute import versions
-from flows.planning import Planned
-from flows.settings import Settings
-from pipeline.io.worlds import link, swap
-from pipeline.store import Manifest, Store
-from pipeline.types import Tile
+from scan2sim.flows.execute import versions
+from scan2sim.flows.planning import Planned
+from scan2sim.flows.settings import Settings
+from scan2sim.pipeline.io.worlds import link, swap
+from scan2sim.pipeline.store import Manifest, Store
+from scan2sim.pipeline.types import Tile
 
 BULKY = ("poses", "positions", "times")  # parameters that repeat the tile
 

@@ -7,39 +7,39 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from flows.settings import Settings
-from pipeline.classes import GROUPS
-from pipeline.io import views as views_io
-from pipeline.step import Params, Step
-from pipeline.steps.clip import CLIP
-from pipeline.steps.collision import COLLISION
-from pipeline.steps.decimate import DECIMATE
-from pipeline.steps.export import EXPORT
-from pipeline.steps.geometry import GEOMETRY
-from pipeline.steps.ingest import INGEST
-from pipeline.steps.islands import ISLANDS
-from pipeline.steps.join import JOIN
-from pipeline.steps.overlap import OVERLAP
-from pipeline.steps.path import PATH
-from pipeline.steps.pictures import PICTURES
-from pipeline.steps.plants import PLANTS
-from pipeline.steps.poisson import POISSON
-from pipeline.steps.split import SPLIT
-from pipeline.steps.trim import TRIM
-from pipeline.steps.views import VIEWS
-from pipeline.steps.visibility import VISIBILITY
-from pipeline.steps.voxel import VOXEL
-from pipeline.types import Tile
-from segmentation.label import LABEL
-from segmentation.segment import SEGMENT
-from texturing.agreement import AGREEMENT
-from texturing.borders import BORDERS
-from texturing.choose import CHOOSE
-from texturing.exposure import EXPOSURE
-from texturing.level import LEVEL
-from texturing.score import SCORE
-from texturing.texture import TEXTURE
-from texturing.unwrap import UNWRAP
+from scan2sim.flows.settings import Settings
+from scan2sim.pipeline.classes import GROUPS
+from scan2sim.pipeline.io import views as views_io
+from scan2sim.pipeline.step import Params, Step
+from scan2sim.pipeline.steps.clip import CLIP
+from scan2sim.pipeline.steps.collision import COLLISION
+from scan2sim.pipeline.steps.decimate import DECIMATE
+from scan2sim.pipeline.steps.export import EXPORT
+from scan2sim.pipeline.steps.geometry import GEOMETRY
+from scan2sim.pipeline.steps.ingest import INGEST
+from scan2sim.pipeline.steps.islands import ISLANDS
+from scan2sim.pipeline.steps.join import JOIN
+from scan2sim.pipeline.steps.overlap import OVERLAP
+from scan2sim.pipeline.steps.path import PATH
+from scan2sim.pipeline.steps.pictures import PICTURES
+from scan2sim.pipeline.steps.plants import PLANTS
+from scan2sim.pipeline.steps.poisson import POISSON
+from scan2sim.pipeline.steps.split import SPLIT
+from scan2sim.pipeline.steps.trim import TRIM
+from scan2sim.pipeline.steps.views import VIEWS
+from scan2sim.pipeline.steps.visibility import VISIBILITY
+from scan2sim.pipeline.steps.voxel import VOXEL
+from scan2sim.pipeline.types import Tile
+from scan2sim.segmentation.label import LABEL
+from scan2sim.segmentation.segment import SEGMENT
+from scan2sim.texturing.agreement import AGREEMENT
+from scan2sim.texturing.borders import BORDERS
+from scan2sim.texturing.choose import CHOOSE
+from scan2sim.texturing.exposure import EXPOSURE
+from scan2sim.texturing.level import LEVEL
+from scan2sim.texturing.score import SCORE
+from scan2sim.texturing.texture import TEXTURE
+from scan2sim.texturing.unwrap import UNWRAP
 
 STEPS: tuple[Step, ...] = (
     INGEST, PATH, VIEWS, LABEL, SEGMENT, OVERLAP, SPLIT, VOXEL, POISSON, TRIM, ISLANDS, CLIP, JOIN, DECIMATE, PLANTS,

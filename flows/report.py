@@ -10,12 +10,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from flows.execute import versions
-from flows.planning import Planned
-from pipeline.classes import GROUPS
-from pipeline.io import crs
-from pipeline.store import Manifest, Store
-from pipeline.types import Tile
+from scan2sim.flows.execute import versions
+from scan2sim.flows.planning import Planned
+from scan2sim.pipeline.classes import GROUPS
+from scan2sim.pipeline.io import crs
+from scan2sim.pipeline.store import Manifest, Store
+from scan2sim.pipeline.types import Tile
 
 TEMPLATE = "report.html.j2"
 AREAS = ("area_m2", "seen_m2", "coloured_m2", "filled_m2")

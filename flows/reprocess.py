@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-import flows.prefect_settings  # noqa: F401  # isort: skip  # before prefect
+import scan2sim.flows.prefect_settings  # noqa: F401  # isort: skip  # before prefect
 from prefect import flow, get_run_logger
 from prefect.states import Completed, State
 
-from flows.settings import Settings
-from flows.survey import prepare, survey
-from flows.surveying import changes
-from pipeline.errors import BusyError
+from scan2sim.flows.settings import Settings
+from scan2sim.flows.survey import prepare, survey
+from scan2sim.flows.surveying import changes
+from scan2sim.pipeline.errors import BusyError
 
 
 @flow(name="reprocess")

@@ -12,17 +12,17 @@ from pathlib import Path
 
 from rich.markup import escape
 
-from flows.display import RunDisplay, console
-from flows.execute import Event, Executor, execute, locked, versions
-from flows.planning import Planned, plan
-from flows.publish import publish
-from flows.recipe import Node, recipe
-from flows.report import write_report
-from flows.settings import Settings
-from pipeline.errors import ScanError, SettingError, from_os_error
-from pipeline.io.tile import read_tile
-from pipeline.store import Manifest, Store
-from pipeline.types import Tile
+from scan2sim.flows.display import RunDisplay, console
+from scan2sim.flows.execute import Event, Executor, execute, locked, versions
+from scan2sim.flows.planning import Planned, plan
+from scan2sim.flows.publish import publish
+from scan2sim.flows.recipe import Node, recipe
+from scan2sim.flows.report import write_report
+from scan2sim.flows.settings import Settings
+from scan2sim.pipeline.errors import ScanError, SettingError, from_os_error
+from scan2sim.pipeline.io.tile import read_tile
+from scan2sim.pipeline.store import Manifest, Store
+from scan2sim.pipeline.types import Tile
 
 STORE = "steps"
 

@@ -7,20 +7,20 @@ from pathlib import Path
 
 import numpy as np
 
-from flows.display import console, progress
-from flows.execute import locked
-from flows.planning import plan
-from flows.recipe import Node, Output, recipe
-from flows.run import STORE, Log, execute_shown, show_warnings
-from flows.settings import Settings
-from pipeline.errors import DataError
-from pipeline.io import image, las
-from pipeline.io import views as views_io
-from pipeline.io.las_classes import write_classified
-from pipeline.io.tile import read_tile
-from pipeline.store import Store
-from pipeline.types import PointCloud, Tile
-from segmentation.score import confusion
+from scan2sim.flows.display import console, progress
+from scan2sim.flows.execute import locked
+from scan2sim.flows.planning import plan
+from scan2sim.flows.recipe import Node, Output, recipe
+from scan2sim.flows.run import STORE, Log, execute_shown, show_warnings
+from scan2sim.flows.settings import Settings
+from scan2sim.pipeline.errors import DataError
+from scan2sim.pipeline.io import image, las
+from scan2sim.pipeline.io import views as views_io
+from scan2sim.pipeline.io.las_classes import write_classified
+from scan2sim.pipeline.io.tile import read_tile
+from scan2sim.pipeline.store import Store
+from scan2sim.pipeline.types import PointCloud, Tile
+from scan2sim.segmentation.score import confusion
 
 CLOUDS = (".las", ".laz", ".copc")
 
@@ -85,8 +85,8 @@ def _write_clouds(tile: Tile, out: Path, code: np.ndarray, confidence: np.ndarra
 
 def _write_pictures(views: Path, labels: Path, out: Path) -> None:
     """Codes of every pixel, and masks: 0 on vehicles, people and the sky, 255 elsewhere."""
-    from segmentation.labels import CLASSES, code_of_index
-    from segmentation.photos import labels_of
+    from scan2sim.segmentation.labels import CLASSES, code_of_index
+    from scan2sim.segmentation.photos import labels_of
 
     away = np.isin(np.arange(len(CLASSES)), [CLASSES.index(name) for name in ("vehicle", "person", "sky")])
     for folder in (out / "labels", out / "masks"):
@@ -101,8 +101,8 @@ def _write_pictures(views: Path, labels: Path, out: Path) -> None:
 
 def train_network(folder: Path, weights: Path, *, minutes: float, steps: int, seed: int) -> None:
     """Train the project's own network on a folder of labelled photos, and write its weights."""
-    from segmentation.backends.street import save
-    from segmentation.train import Recipe, train
+    from scan2sim.segmentation.backends.street import save
+    from scan2sim.segmentation.train import Recipe, train
 
     recipe_ = Recipe(steps=steps, minutes=minutes, seed=seed)
     with progress("training") as report:
@@ -122,12 +122,12 @@ def evaluate(path: Path, out: Path, settings: Settings) -> None:
 
 def _pixels(folder: Path, settings: Settings) -> dict[str, float]:
     """Intersection over union of a network's pixels, by class; photos taken as they are."""
-    from pipeline.types import Camera
-    from segmentation.backends import load
-    from segmentation.label import LABEL
-    from segmentation.labels import CLASSES, IGNORED, code_of_index
-    from segmentation.photos import Labeller, labels_of
-    from segmentation.train import pairs, read
+    from scan2sim.pipeline.types import Camera
+    from scan2sim.segmentation.backends import load
+    from scan2sim.segmentation.label import LABEL
+    from scan2sim.segmentation.labels import CLASSES, IGNORED, code_of_index
+    from scan2sim.segmentation.photos import Labeller, labels_of
+    from scan2sim.segmentation.train import pairs, read
 
     given = settings.params(LABEL)
     network = load(given.network, given.weights, given.device)

@@ -14,9 +14,9 @@ from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
-from pipeline.classes import GROUPS
-from pipeline.errors import SettingError
-from pipeline.step import Params, Step
+from scan2sim.pipeline.classes import GROUPS
+from scan2sim.pipeline.errors import SettingError
+from scan2sim.pipeline.step import Params, Step
 
 P = TypeVar("P", bound=Params)
 

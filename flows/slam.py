@@ -13,26 +13,26 @@ from typing import TypeVar, get_args
 import numpy as np
 from pydantic import ValidationError
 
-from flows.display import console, progress
-from flows.execute import locked
-from flows.settings import Settings
-from pipeline.errors import InputError, SettingError
-from pipeline.io import trajectory as trajectory_io
-from pipeline.io.image import read_rgb
-from pipeline.io.tile import read_tile
-from pipeline.types import Camera, Trajectory
-from slam import output
-from slam.adjust import adjust
-from slam.charts import Charts
-from slam.evaluate import AlignmentKind, Evaluation, evaluate, plot
-from slam.gps import GpsTrack, read_gps, smooth
-from slam.loops import Places
-from slam.loops import close as close_loops
-from slam.odometry import Odometry, OdometryParams
-from slam.sparse import sparse_map
-from slam.track import Tracked, camera_of, track
-from slam.tracking import Tracker
-from slam.video import Video, open_video
+from scan2sim.flows.display import console, progress
+from scan2sim.flows.execute import locked
+from scan2sim.flows.settings import Settings
+from scan2sim.pipeline.errors import InputError, SettingError
+from scan2sim.pipeline.io import trajectory as trajectory_io
+from scan2sim.pipeline.io.image import read_rgb
+from scan2sim.pipeline.io.tile import read_tile
+from scan2sim.pipeline.types import Camera, Trajectory
+from scan2sim.slam import output
+from scan2sim.slam.adjust import adjust
+from scan2sim.slam.charts import Charts
+from scan2sim.slam.evaluate import AlignmentKind, Evaluation, evaluate, plot
+from scan2sim.slam.gps import GpsTrack, read_gps, smooth
+from scan2sim.slam.loops import Places
+from scan2sim.slam.loops import close as close_loops
+from scan2sim.slam.odometry import Odometry, OdometryParams
+from scan2sim.slam.sparse import sparse_map
+from scan2sim.slam.track import Tracked, camera_of, track
+from scan2sim.slam.tracking import Tracker
+from scan2sim.slam.video import Video, open_video
 
 T = TypeVar("T", int, float)
 
@@ -101,7 +101,7 @@ def slam_video(path: Path, out: Path, options: Options, settings: Settings) -> T
         state = out / f"state-{hashlib.sha256(asked.encode()).hexdigest()[:12]}"
         watch = None
         if options.view:
-            from slam.view import Recorder
+            from scan2sim.slam.view import Recorder
 
             watch = Recorder(out / "view.mp4", fps=video.fps / options.every)
         places = Places(Charts(camera)) if options.loops else None
@@ -156,8 +156,8 @@ def _tracker(camera: Camera, mask: np.ndarray | None, count: int, options: Optio
     """What follows features: corners by Lucas-Kanade, or descriptors from frame to frame (D3.2)."""
     if options.features == "corners":
         return Tracker(Charts(camera), mask, count)
-    from slam import features, matchers
-    from slam.matching import MatchingTracker
+    from scan2sim.slam import features, matchers
+    from scan2sim.slam.matching import MatchingTracker
 
     detector = features.named(options.features, options.weights)
     matcher = matchers.named(options.matcher, options.matcher_weights)
@@ -237,7 +237,7 @@ def study_compression(
     Raises:
         ScanError: see `pipeline.errors`.
     """
-    from slam.study import study
+    from scan2sim.slam.study import study
 
     def found(given: Path | None, name: str) -> Path | None:
         beside = source / name

@@ -9,20 +9,20 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import flows.prefect_settings  # noqa: F401  # isort: skip  # before prefect
+import scan2sim.flows.prefect_settings  # noqa: F401  # isort: skip  # before prefect
 from prefect import flow, get_run_logger, task
 from prefect.artifacts import create_image_artifact, create_markdown_artifact, create_table_artifact
 from prefect.cache_policies import NO_CACHE
 from prefect.client.orchestration import get_client
 from prefect.settings import PREFECT_API_URL
 
-from flows.prepare import survey_of
-from flows.settings import Settings
-from flows.survey_report import overview, rows
-from flows.surveying import make_survey
-from flows.tile import artifact_key, by_tasks
-from pipeline.errors import INTERRUPTED, StepError, UnavailableError, exit_code
-from pipeline.io.remote import likeness
+from scan2sim.flows.prepare import survey_of
+from scan2sim.flows.settings import Settings
+from scan2sim.flows.survey_report import overview, rows
+from scan2sim.flows.surveying import make_survey
+from scan2sim.flows.tile import artifact_key, by_tasks
+from scan2sim.pipeline.errors import INTERRUPTED, StepError, UnavailableError, exit_code
+from scan2sim.pipeline.io.remote import likeness
 
 
 def meet_server() -> None:

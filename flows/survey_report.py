@@ -16,10 +16,10 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from flows.execute import versions
-from flows.report import write_whole
-from pipeline.classes import GROUPS
-from pipeline.errors import from_os_error
+from scan2sim.flows.execute import versions
+from scan2sim.flows.report import write_whole
+from scan2sim.pipeline.classes import GROUPS
+from scan2sim.pipeline.errors import from_os_error
 
 F64 = npt.NDArray[np.float64]
 State = Literal["done", "kept", "failed", "waiting"]

@@ -10,21 +10,21 @@ from pathlib import Path
 
 from rich.markup import escape
 
-from flows.display import console, progress
-from flows.execute import Executor, limit_cores, locked, versions
-from flows.finish import Made, finish
-from flows.memory import parse
-from flows.planning import Planned, plan
-from flows.prepare import survey_of
-from flows.recipe import survey_recipe
-from flows.run import STORE, Log, default_jobs, execute_shown
-from flows.settings import Settings
-from pipeline.errors import ScanError, SettingError, SpaceError, StepError, UnavailableError
-from pipeline.io.remote import Remote, is_remote, likeness
-from pipeline.io.survey import Survey, read_survey
-from pipeline.io.tile import read_tile
-from pipeline.store import Digests, Manifest, Store
-from pipeline.types import Tile
+from scan2sim.flows.display import console, progress
+from scan2sim.flows.execute import Executor, limit_cores, locked, versions
+from scan2sim.flows.finish import Made, finish
+from scan2sim.flows.memory import parse
+from scan2sim.flows.planning import Planned, plan
+from scan2sim.flows.prepare import survey_of
+from scan2sim.flows.recipe import survey_recipe
+from scan2sim.flows.run import STORE, Log, default_jobs, execute_shown
+from scan2sim.flows.settings import Settings
+from scan2sim.pipeline.errors import ScanError, SettingError, SpaceError, StepError, UnavailableError
+from scan2sim.pipeline.io.remote import Remote, is_remote, likeness
+from scan2sim.pipeline.io.survey import Survey, read_survey
+from scan2sim.pipeline.io.tile import read_tile
+from scan2sim.pipeline.store import Digests, Manifest, Store
+from scan2sim.pipeline.types import Tile
 
 
 def run_source(
@@ -50,7 +50,7 @@ def run_source(
     jobs, gigabytes = jobs or default_jobs(), parse(memory)
     if runner != "processes":
         try:
-            from flows.survey import meet_server, survey
+            from scan2sim.flows.survey import meet_server, survey
         except ModuleNotFoundError as error:
             remedy = "pip install -c constraints.txt -e '.[flows]'"
             raise UnavailableError(error.name or "prefect", "isn't installed", remedy) from None

@@ -7,20 +7,20 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import flows.prefect_settings  # noqa: F401  # isort: skip  # before prefect
+import scan2sim.flows.prefect_settings  # noqa: F401  # isort: skip  # before prefect
 from prefect import flow, get_run_logger, task
 from prefect.artifacts import create_progress_artifact, update_progress_artifact
 from prefect.cache_policies import NO_CACHE
 
-from flows.dispatch import dispatch
-from flows.execute import Executor, run_on_worker, versions
-from flows.memory import parse
-from flows.planning import Planned
-from flows.run import run_tile
-from flows.settings import Settings
-from flows.workers import workers
-from pipeline.errors import ScanError
-from pipeline.store import Manifest, Store
+from scan2sim.flows.dispatch import dispatch
+from scan2sim.flows.execute import Executor, run_on_worker, versions
+from scan2sim.flows.memory import parse
+from scan2sim.flows.planning import Planned
+from scan2sim.flows.run import run_tile
+from scan2sim.flows.settings import Settings
+from scan2sim.flows.workers import workers
+from scan2sim.pipeline.errors import ScanError
+from scan2sim.pipeline.store import Manifest, Store
 
 
 @task(name="step", task_run_name="{label}", cache_policy=NO_CACHE)

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
-from pipeline.errors import SettingError, UnavailableError
+from scan2sim.pipeline.errors import SettingError, UnavailableError
 
 Call = Callable[..., Any]
 """Has a worker call a function with arguments, waits, and returns its result or raises its exception."""

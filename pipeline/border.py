@@ -19,8 +19,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.cells import Cell
-from pipeline.types import F64, Frame, Mesh
+from scan2sim.pipeline.cells import Cell
+from scan2sim.pipeline.types import F64, Frame, Mesh
 
 Bools = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]

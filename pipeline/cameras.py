@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
-from pipeline.types import F32, F64, Camera
+from scan2sim.pipeline.types import F32, F64, Camera
 
 PINHOLE, OPENCV, FISHEYE, EQUIRECTANGULAR = range(4)
 MODEL_ID: dict[str, int] = {

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.cells import Seed
-from pipeline.errors import DataError
-from pipeline.types import F64, Frame, Trajectory, View
+from scan2sim.pipeline.cells import Seed
+from scan2sim.pipeline.errors import DataError
+from scan2sim.pipeline.types import F64, Frame, Trajectory, View
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -125,7 +125,7 @@ def members(xy: F64, places: F64, buffer: float) -> tuple[I64, I64, I64]:
 
 def sees(view: View, xyz: F64) -> bool:
     """Whether a photo shows enough of points (N, 3), local coordinates; what hides them is not asked."""
-    from pipeline.cameras import inside, project
+    from scan2sim.pipeline.cameras import inside, project
 
     xyz = xyz[np.linalg.norm(xyz - view.centre, axis=1) <= SIGHT]
     if len(xyz) == 0:

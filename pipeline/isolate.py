@@ -12,7 +12,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import StepError
+from scan2sim.pipeline.errors import StepError
 
 
 def call(target: str, *args: Any, timeout: float, threads: int | None = None) -> Any:
@@ -34,7 +34,7 @@ def call(target: str, *args: Any, timeout: float, threads: int | None = None) ->
         exchange = Path(folder)
         (exchange / "in").write_bytes(pickle.dumps((target, args), protocol=5))
         child = subprocess.Popen(
-            [sys.executable, "-P", "-m", "pipeline.isolate", folder],
+            [sys.executable, "-P", "-m", "scan2sim.pipeline.isolate", folder],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             env=environment,

@@ -9,7 +9,7 @@ import numpy.typing as npt
 import open3d as o3d
 from scipy.spatial import cKDTree
 
-from pipeline.types import F32, F64, PointCloud, Trajectory
+from scan2sim.pipeline.types import F32, F64, PointCloud, Trajectory
 
 STEEP = 0.3  # |nz| below which "up" says nothing of a surface's outside
 CHUNK = 20_000

@@ -11,8 +11,8 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from pipeline.cameras import EQUIRECTANGULAR, FISHEYE, project_point
-from pipeline.types import F32, F64
+from scan2sim.pipeline.cameras import EQUIRECTANGULAR, FISHEYE, project_point
+from scan2sim.pipeline.types import F32, F64
 
 BAND = 32
 SLOPE_SHARE = 0.4

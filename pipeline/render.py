@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.errors import InputError
-from pipeline.types import F32, F64, I32, U8, Camera, Mesh
+from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.types import F32, F64, I32, U8, Camera, Mesh
 
 CHUNK = 500_000
 """Rays at a time, to bound memory."""
@@ -124,7 +124,7 @@ class Renderer:
                 them that meet one. A simulator filters far textures with mip-maps; one ray a pixel makes them look
                 sharper than they are. All but the colours is of the ray through the pixel's centre.
         """
-        from pipeline.cameras import unproject
+        from scan2sim.pipeline.cameras import unproject
 
         rotation, centre = np.asarray(T_world_cam)[:3, :3], np.asarray(T_world_cam)[:3, 3]
 

@@ -21,9 +21,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import from_os_error
-from pipeline.io.remote import Remote
-from pipeline.step import Done, Params, Step
+from scan2sim.pipeline.errors import from_os_error
+from scan2sim.pipeline.io.remote import Remote
+from scan2sim.pipeline.step import Done, Params, Step
 
 KEY_LENGTH = 24
 TEMPORARY = ".tmp-"

@@ -15,7 +15,7 @@ from typing import Any, Literal, Self
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.cells import Cell
+from scan2sim.pipeline.cells import Cell
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]

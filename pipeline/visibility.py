@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.classes import CODE
-from pipeline.types import F32, F64, Camera, Mesh, PointCloud
+from scan2sim.pipeline.classes import CODE
+from scan2sim.pipeline.types import F32, F64, Camera, Mesh, PointCloud
 
 BIAS = 0.04
 """Metres that a point may lie behind what the range image shows and still count as seen."""
@@ -185,8 +185,8 @@ def depth_map(
         time: of the photo, seconds, for what moves; None: everything hides wherever it was scanned.
         pixels: the camera is scaled to at most this many, and to at most `ENLARGED` times its width.
     """
-    from pipeline import range_image
-    from pipeline.cameras import MODEL_ID, parameters, pixel_rays
+    from scan2sim.pipeline import range_image
+    from scan2sim.pipeline.cameras import MODEL_ID, parameters, pixel_rays
 
     camera = camera.scaled(min(ENLARGED, math.sqrt(pixels / (camera.width * camera.height))))
     model, p, rays = MODEL_ID[camera.model], parameters(camera), pixel_rays(camera)
@@ -232,8 +232,8 @@ def visible(
         normals: (N, 3) unit, of the surface at the points; either side; None: seen head-on.
         bias: metres allowed behind the range image, before the slope's share.
     """
-    from pipeline import range_image
-    from pipeline.cameras import MODEL_ID, parameters, pixel_angle
+    from scan2sim.pipeline import range_image
+    from scan2sim.pipeline.cameras import MODEL_ID, parameters, pixel_angle
 
     points = np.ascontiguousarray(points, np.float64).reshape(-1, 3)
     facing = np.zeros((0, 3)) if normals is None else np.ascontiguousarray(normals, np.float64).reshape(-1, 3)

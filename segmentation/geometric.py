@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.classes import CODE
-from pipeline.step import Report, silent
-from pipeline.types import F32, F64, I32, U8, PointCloud
+from scan2sim.pipeline.classes import CODE
+from scan2sim.pipeline.step import Report, silent
+from scan2sim.pipeline.types import F32, F64, I32, U8, PointCloud
 
 Bools = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]

@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from pipeline.types import U8
+    from scan2sim.pipeline.types import U8
 
 
 class LabelParams(Params):
@@ -43,11 +43,11 @@ def label(inputs: Inputs, params: LabelParams, out: Path, report: Report) -> Don
 
     import numpy as np
 
-    from pipeline.io import image
-    from pipeline.io import views as views_io
-    from pipeline.types import PointCloud
-    from segmentation.backends import load
-    from segmentation.photos import Labeller
+    from scan2sim.pipeline.io import image
+    from scan2sim.pipeline.io import views as views_io
+    from scan2sim.pipeline.types import PointCloud
+    from scan2sim.segmentation.backends import load
+    from scan2sim.segmentation.photos import Labeller
 
     folder = out / "labels"
     folder.mkdir()
@@ -79,7 +79,7 @@ def classified(label: U8 | None) -> float:
     """Share of points that have a class of their own (other than never classified and unclassified)."""
     import numpy as np
 
-    from pipeline.classes import UNKNOWN
+    from scan2sim.pipeline.classes import UNKNOWN
 
     if label is None or not len(label):
         return 0.0

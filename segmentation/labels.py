@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.classes import CODE
-from pipeline.errors import InputError
-from pipeline.types import U8
+from scan2sim.pipeline.classes import CODE
+from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.types import U8
 
 CLASSES = (
     "road", "sidewalk", "terrain", "building", "road_sign", "pole", "low_vegetation", "high_vegetation", "vehicle",

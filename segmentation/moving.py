@@ -10,9 +10,9 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.classes import CODE
-from pipeline.types import F32, PointCloud
-from pipeline.visibility import times_of_moving
+from scan2sim.pipeline.classes import CODE
+from scan2sim.pipeline.types import F32, PointCloud
+from scan2sim.pipeline.visibility import times_of_moving
 
 HEIGHTS = (0.15, 2.6)
 """Metres above ground between which things that move are looked for."""

@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from pipeline.types import F32, U8, Camera
-from segmentation.backends import Network
-from segmentation.labels import CLASSES, IGNORED, mapped
+from scan2sim.pipeline.types import F32, U8, Camera
+from scan2sim.segmentation.backends import Network
+from scan2sim.segmentation.labels import CLASSES, IGNORED, mapped
 
 TILE = 1536
 """Pixels of the largest tile's side that a network is given at once."""

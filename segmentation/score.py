@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.classes import CLASSES, CODE, UNKNOWN
-from pipeline.types import U8
+from scan2sim.pipeline.classes import CLASSES, CODE, UNKNOWN
+from scan2sim.pipeline.types import U8
 
 MEAN_OF = ("road", "terrain", "building", "low_vegetation", "high_vegetation")
 """Classes that the mean intersection over union is of."""

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
 
-from pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
-    from pipeline.types import U8, PointCloud
+    from scan2sim.pipeline.types import U8, PointCloud
 
 PHOTO, SHAPE, OWN = 1, 2, 3
 """What a point's class is told from: photos that see it (with its shape and neighbours), those alone, the cloud."""
@@ -48,9 +48,9 @@ def segment(inputs: Inputs, params: SegmentParams, out: Path, report: Report) ->
 
     import numpy as np
 
-    from pipeline.classes import CLASSES, group_of
-    from pipeline.types import PointCloud
-    from segmentation.label import classified
+    from scan2sim.pipeline.classes import CLASSES, group_of
+    from scan2sim.pipeline.types import PointCloud
+    from scan2sim.segmentation.label import classified
 
     report(0.0, "reading")
     cloud = PointCloud.load(inputs["cloud"])
@@ -100,11 +100,11 @@ def tell(cloud: PointCloud, inputs: Inputs, params: SegmentParams, report: Repor
     """LAS codes, confidence (255: sure) and source of every point (N,), and facts where photos told something."""
     import numpy as np
 
-    from pipeline.io import views as views_io
-    from pipeline.normals import oriented_normals
-    from pipeline.steps.voxel import sample, voxel_groups
-    from pipeline.types import Trajectory
-    from segmentation.geometric import classify
+    from scan2sim.pipeline.io import views as views_io
+    from scan2sim.pipeline.normals import oriented_normals
+    from scan2sim.pipeline.steps.voxel import sample, voxel_groups
+    from scan2sim.pipeline.types import Trajectory
+    from scan2sim.segmentation.geometric import classify
 
     n = len(cloud)
     views = views_io.load(inputs["views"]) if "views" in inputs else ()
@@ -133,11 +133,11 @@ def _from_photos(
 
     import numpy as np
 
-    from segmentation.geometric import split_ground
-    from segmentation.labels import code_of_index
-    from segmentation.moving import moving
-    from segmentation.smooth import decide
-    from segmentation.votes import vote
+    from scan2sim.segmentation.geometric import split_ground
+    from scan2sim.segmentation.labels import code_of_index
+    from scan2sim.segmentation.moving import moving
+    from scan2sim.segmentation.smooth import decide
+    from scan2sim.segmentation.votes import vote
 
     votes = vote(thin, views, labels, radius=0.8 * params.size, report=lambda f, m="": report(0.5 + 0.3 * f, m))
     report(0.8, "smoothing")

@@ -13,11 +13,11 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
-from pipeline.classes import CODE
-from pipeline.types import F32, I32, U8, PointCloud
-from segmentation.labels import CLASSES, GROUND, SKY
-from segmentation.tidy import by_height, with_feet, without_specks
-from segmentation.votes import Votes
+from scan2sim.pipeline.classes import CODE
+from scan2sim.pipeline.types import F32, I32, U8, PointCloud
+from scan2sim.segmentation.labels import CLASSES, GROUND, SKY
+from scan2sim.segmentation.tidy import by_height, with_feet, without_specks
+from scan2sim.segmentation.votes import Votes
 
 Bools = npt.NDArray[np.bool_]
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.types import F32, I32, U8
-from segmentation.labels import CLASSES, GROUND
+from scan2sim.pipeline.types import F32, I32, U8
+from scan2sim.segmentation.labels import CLASSES, GROUND
 
 FLOATING, LINK = 0.35, 0.35
 """Vegetation whose lowest is so many metres above ground floats; its points are linked within so many."""

@@ -18,11 +18,11 @@ import numpy.typing as npt
 import torch
 import torch.nn.functional as F
 
-from pipeline.errors import DataError
-from pipeline.step import Report, silent
-from pipeline.types import F32, U8
-from segmentation.labels import CLASSES, IGNORED, index_of_code
-from segmentation.network import StreetNet
+from scan2sim.pipeline.errors import DataError
+from scan2sim.pipeline.step import Report, silent
+from scan2sim.pipeline.types import F32, U8
+from scan2sim.segmentation.labels import CLASSES, IGNORED, index_of_code
+from scan2sim.segmentation.network import StreetNet
 
 Ints = npt.NDArray[np.int64]
 

@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 from numba import njit, prange
 
-from pipeline.cameras import EQUIRECTANGULAR, MODEL_ID, parameters, pixel_angle, project_point
-from pipeline.range_image import is_visible
-from pipeline.step import Report, silent
-from pipeline.types import F32, PointCloud, View
-from pipeline.visibility import depth_map, scene
-from segmentation.labels import CLASSES, SKY
+from scan2sim.pipeline.cameras import EQUIRECTANGULAR, MODEL_ID, parameters, pixel_angle, project_point
+from scan2sim.pipeline.range_image import is_visible
+from scan2sim.pipeline.step import Report, silent
+from scan2sim.pipeline.types import F32, PointCloud, View
+from scan2sim.pipeline.visibility import depth_map, scene
+from scan2sim.segmentation.labels import CLASSES, SKY
 
 BIAS = 0.12
 """Metres that a point may lie behind the discs and still count as seen: they are of voxels, and rough."""
@@ -76,7 +76,7 @@ def vote(cloud: PointCloud, views: Sequence[View], labels: Path, *, radius: floa
 
 
 def _mask(view: View) -> np.ndarray:
-    from pipeline.io import image
+    from scan2sim.pipeline.io import image
 
     mask = image.read_mask(view) if view.mask is not None else None
     return np.zeros((0, 0), np.uint8) if mask is None else mask

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.errors import UnavailableError
-from pipeline.types import Trajectory
-from slam.evaluate import umeyama
-from slam.geometry import angles
-from slam.odometry import Odometry
-from slam.output import SparseMap, write_colmap
-from slam.sparse import kept, move
+from scan2sim.pipeline.errors import UnavailableError
+from scan2sim.pipeline.types import Trajectory
+from scan2sim.slam.evaluate import umeyama
+from scan2sim.slam.geometry import angles
+from scan2sim.slam.odometry import Odometry
+from scan2sim.slam.output import SparseMap, write_colmap
+from scan2sim.slam.sparse import kept, move
 
 LOSS = 1.0
 """Pixels, of Cauchy's loss."""
@@ -34,7 +34,7 @@ def adjust(odometry: Odometry) -> dict[str, float]:
     Raises:
         UnavailableError: pycolmap isn't installed.
     """
-    from pipeline.cameras import project
+    from scan2sim.pipeline.cameras import project
 
     try:
         import pycolmap

@@ -14,8 +14,8 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.cameras import pixel_rays, project, unproject
-from pipeline.types import F32, F64, I32, U8, Camera
+from scan2sim.pipeline.cameras import pixel_rays, project, unproject
+from scan2sim.pipeline.types import F32, F64, I32, U8, Camera
 
 Bools = npt.NDArray[np.bool_]
 

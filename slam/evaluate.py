@@ -16,10 +16,10 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.errors import DataError, UnavailableError
-from pipeline.io.trajectory import replacing
-from pipeline.types import F64, Trajectory
-from slam.gps import GpsTrack, noise, smooth
+from scan2sim.pipeline.errors import DataError, UnavailableError
+from scan2sim.pipeline.io.trajectory import replacing
+from scan2sim.pipeline.types import F64, Trajectory
+from scan2sim.slam.gps import GpsTrack, noise, smooth
 
 AlignmentKind = Literal["similarity2d", "rigid2d", "similarity3d"]
 Index = npt.NDArray[np.int64]

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.types import F64, Frame, Trajectory
-from slam import scale
-from slam.geometry import exp_so3
-from slam.gps import GpsTrack
-from slam.odometry import Odometry
+from scan2sim.pipeline.types import F64, Frame, Trajectory
+from scan2sim.slam import scale
+from scan2sim.slam.geometry import exp_so3
+from scan2sim.slam.gps import GpsTrack
+from scan2sim.slam.odometry import Odometry
 
 DRIFT, TURN = 0.003, 2e-5
 """Of the way and radians a metre: how far tracked poses are off, one standard deviation (bench/slam.py measures it)."""

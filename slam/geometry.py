@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from pipeline.types import F64, I32
+from scan2sim.pipeline.types import F64, I32
 
 Bools = npt.NDArray[np.bool_]
 

@@ -18,8 +18,8 @@ from xml.etree import ElementTree
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.errors import InputError, UnavailableError, from_os_error
-from pipeline.types import F64, Frame
+from scan2sim.pipeline.errors import InputError, UnavailableError, from_os_error
+from scan2sim.pipeline.types import F64, Frame
 
 MAX_SPEED = 70.0
 """Metres a second (252 km/h) that no car drives: a fix that would need more is a jump."""

@@ -9,13 +9,13 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
-from pipeline.step import Params
-from pipeline.types import F64, I32, Camera
-from slam import shared
-from slam.geometry import triangulate
-from slam.gps import GpsTrack
-from slam.graph import backend_named
-from slam.graph.problem import Chord, Graph, errors
+from scan2sim.pipeline.step import Params
+from scan2sim.pipeline.types import F64, I32, Camera
+from scan2sim.slam import shared
+from scan2sim.slam.geometry import triangulate
+from scan2sim.slam.gps import GpsTrack
+from scan2sim.slam.graph import backend_named
+from scan2sim.slam.graph.problem import Chord, Graph, errors
 
 I64 = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]

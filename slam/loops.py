@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.types import F32, F64, U8
-from slam.charts import Charts
-from slam.geometry import exp_so3, inverse, log_so3
-from slam.odometry import Odometry
-from slam.relocalise import Remembered, Seen, describe, relocalise
-from slam.sparse import kept, move
+from scan2sim.pipeline.types import F32, F64, U8
+from scan2sim.slam.charts import Charts
+from scan2sim.slam.geometry import exp_so3, inverse, log_so3
+from scan2sim.slam.odometry import Odometry
+from scan2sim.slam.relocalise import Remembered, Seen, describe, relocalise
+from scan2sim.slam.sparse import kept, move
 
 THUMBNAIL = 64, 12
 APART = 60.0

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.types import F32, F64, U8
-from slam.charts import Charts
-from slam.features import Features, Found
-from slam.matchers import Matcher, check
-from slam.tracking import FINE, RETURN, SPACING, WINDOW, Tracker, Tracks, _flow
+from scan2sim.pipeline.types import F32, F64, U8
+from scan2sim.slam.charts import Charts
+from scan2sim.slam.features import Features, Found
+from scan2sim.slam.matchers import Matcher, check
+from scan2sim.slam.tracking import FINE, RETURN, SPACING, WINDOW, Tracker, Tracks, _flow
 
 Bools = npt.NDArray[np.bool_]
 I64 = npt.NDArray[np.int64]

@@ -16,15 +16,15 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from pipeline.types import F64, U8, Camera
-from slam.charts import Charts
-from slam.geometry import angles, exp_so3, inverse, log_so3, relative_pose, rigid
-from slam.gps import GpsTrack
-from slam.graph import backend_named
-from slam.graph.problem import Graph
-from slam.localmap import Keyframe, LocalMap, MapParams, gps_distance
-from slam.relocalise import Remembered, describe, relocalise
-from slam.tracking import Tracker, Tracks
+from scan2sim.pipeline.types import F64, U8, Camera
+from scan2sim.slam.charts import Charts
+from scan2sim.slam.geometry import angles, exp_so3, inverse, log_so3, relative_pose, rigid
+from scan2sim.slam.gps import GpsTrack
+from scan2sim.slam.graph import backend_named
+from scan2sim.slam.graph.problem import Graph
+from scan2sim.slam.localmap import Keyframe, LocalMap, MapParams, gps_distance
+from scan2sim.slam.relocalise import Remembered, describe, relocalise
+from scan2sim.slam.tracking import Tracker, Tracks
 
 LOST = 0.4
 """Seconds after which a new map is begun."""

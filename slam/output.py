@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.errors import DataError, from_os_error
-from pipeline.io import trajectory as trajectory_io
-from pipeline.types import F64, I32, U8, Camera, Frame, Trajectory
+from scan2sim.pipeline.errors import DataError, from_os_error
+from scan2sim.pipeline.io import trajectory as trajectory_io
+from scan2sim.pipeline.types import F64, I32, U8, Camera, Frame, Trajectory
 
 
 @dataclass(frozen=True)
@@ -171,7 +171,7 @@ def _camera(camera: Camera, frame: Frame) -> str:
 
 def _reprojection(trajectory: Trajectory, camera: Camera, sparse: SparseMap) -> F64:
     """(M,) mean reprojection error of each point in pixels; -1, COLMAP's word for unknown, for one never seen."""
-    from pipeline.cameras import project
+    from scan2sim.pipeline.cameras import project
 
     assert trajectory.rotations is not None
     away = sparse.xyz[sparse.point] - trajectory.positions[sparse.frame]

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.cameras import project
-from pipeline.types import F64, I32, Camera
+from scan2sim.pipeline.cameras import project
+from scan2sim.pipeline.types import F64, I32, Camera
 
 NAMES = ("readout", "lens_offset")
 SIGMA = (0.02, 0.05)

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.cameras import project
-from pipeline.types import F64, I32, Trajectory
-from slam.finish import Placing
-from slam.localmap import Landmarks
-from slam.odometry import Odometry
-from slam.output import SparseMap
+from scan2sim.pipeline.cameras import project
+from scan2sim.pipeline.types import F64, I32, Trajectory
+from scan2sim.slam.finish import Placing
+from scan2sim.slam.localmap import Landmarks
+from scan2sim.slam.odometry import Odometry
+from scan2sim.slam.output import SparseMap
 
 
 @dataclass(frozen=True)

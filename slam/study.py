@@ -25,16 +25,16 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.errors import InputError, ScanError, SettingError, SpaceError, UnavailableError, from_os_error
-from pipeline.io.trajectory import replacing
-from pipeline.io.video import Encoder
-from pipeline.step import Report, silent
-from pipeline.types import U8, Camera, Trajectory
-from slam.evaluate import SEGMENT, evaluate, way
-from slam.gps import GpsTrack, smooth
-from slam.odometry import Odometry, OdometryParams
-from slam.track import camera_of, track
-from slam.video import Video, _files, open_video
+from scan2sim.pipeline.errors import InputError, ScanError, SettingError, SpaceError, UnavailableError, from_os_error
+from scan2sim.pipeline.io.trajectory import replacing
+from scan2sim.pipeline.io.video import Encoder
+from scan2sim.pipeline.step import Report, silent
+from scan2sim.pipeline.types import U8, Camera, Trajectory
+from scan2sim.slam.evaluate import SEGMENT, evaluate, way
+from scan2sim.slam.gps import GpsTrack, smooth
+from scan2sim.slam.odometry import Odometry, OdometryParams
+from scan2sim.slam.track import camera_of, track
+from scan2sim.slam.video import Video, _files, open_video
 
 HEIGHTS = (512, 768, 1024, 1536)
 """Pixels, vertical resolutions of D3.2's tables 4 and 5."""
@@ -479,7 +479,7 @@ def _plane(plane: Any) -> U8:
 def _of_picture(path: Path, size: tuple[int, int]) -> U8:
     import cv2
 
-    from pipeline.io.image import read_rgb
+    from scan2sim.pipeline.io.image import read_rgb
 
     rgb = read_rgb(path)
     if rgb is None:

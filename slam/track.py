@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.errors import DataError, InputError
-from pipeline.step import Report, silent
-from pipeline.types import U8, Camera, Frame, Trajectory
-from slam.finish import Placing, finish
-from slam.gps import GpsTrack
-from slam.odometry import Odometry
-from slam.video import Video
+from scan2sim.pipeline.errors import DataError, InputError
+from scan2sim.pipeline.step import Report, silent
+from scan2sim.pipeline.types import U8, Camera, Frame, Trajectory
+from scan2sim.slam.finish import Placing, finish
+from scan2sim.slam.gps import GpsTrack
+from scan2sim.slam.odometry import Odometry
+from scan2sim.slam.video import Video
 
 KEEP_EVERY = 60.0
 """Seconds between states kept."""

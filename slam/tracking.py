@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.types import F32, F64, U8
-from slam.charts import Charts
+from scan2sim.pipeline.types import F32, F64, U8
+from scan2sim.slam.charts import Charts
 
 I64 = npt.NDArray[np.int64]
 

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.errors import InputError
-from pipeline.types import F64, U8
+from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.types import F64, U8
 
 PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 
@@ -98,7 +98,7 @@ def _av() -> Any:
     try:
         import av
     except ImportError:
-        from pipeline.errors import UnavailableError
+        from scan2sim.pipeline.errors import UnavailableError
 
         raise UnavailableError("PyAV", "is not installed", "pip install 'scan2sim[slam]'") from None
     return av

@@ -10,12 +10,12 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.cameras import project
-from pipeline.errors import from_os_error
-from pipeline.io.video import Encoder
-from pipeline.types import F64, U8
-from slam.geometry import angles
-from slam.odometry import Odometry
+from scan2sim.pipeline.cameras import project
+from scan2sim.pipeline.errors import from_os_error
+from scan2sim.pipeline.io.video import Encoder
+from scan2sim.pipeline.types import F64, U8
+from scan2sim.slam.geometry import angles
+from scan2sim.slam.odometry import Odometry
 
 Bools = npt.NDArray[np.bool_]
 

@@ -25,7 +25,7 @@ def real_data() -> Path:
 @pytest.fixture(scope="session")
 def small_street(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A synthetic street small enough for tests: 12 m, 150,000 points, 8 photos."""
-    from data_samples.street import generate
+    from scan2sim.data_samples.street import generate
 
     out = tmp_path_factory.mktemp("street") / "tile"
     generate(out, length=12.0, points=150_000, photos=8, seed=5, photo_width=480)

@@ -15,17 +15,17 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
 
-from pipeline.errors import InputError
-from pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from pipeline.types import F32, U8, View
-    from pipeline.visibility import DepthMap
-    from texturing.photos import Exposures, Photos
-    from texturing.predict import Prediction
+    from scan2sim.pipeline.types import F32, U8, View
+    from scan2sim.pipeline.visibility import DepthMap
+    from scan2sim.texturing.photos import Exposures, Photos
+    from scan2sim.texturing.predict import Prediction
 
 PIXELS = 250_000
 """Photos are compared at this size at most."""
@@ -103,7 +103,7 @@ class Agreement:
         """(h, w) uint8, 0 where photo `i` must not be used: its own mask and ghosts; (0, 0) for nowhere."""
         import numpy as np
 
-        from pipeline.io import image
+        from scan2sim.pipeline.io import image
 
         path = self.folder / f"mask_{i}.png"
         return image.read_grey(path) if path.is_file() else np.zeros((0, 0), np.uint8)
@@ -124,10 +124,10 @@ def agreement(inputs: Inputs, params: AgreementParams, out: Path, report: Report
     """
     import numpy as np
 
-    from pipeline.io import image
-    from pipeline.io import views as views_io
-    from pipeline.visibility import load_depth_map
-    from texturing.photos import Exposures, Photos, camera_of
+    from scan2sim.pipeline.io import image
+    from scan2sim.pipeline.io import views as views_io
+    from scan2sim.pipeline.visibility import load_depth_map
+    from scan2sim.texturing.photos import Exposures, Photos, camera_of
 
     folder = out / "agreement"
     folder.mkdir()
@@ -168,9 +168,9 @@ def neighbours(
     """The views that see most of what each one sees, at no much lower resolution."""
     import numpy as np
 
-    from pipeline.cameras import pixel_angle
-    from pipeline.visibility import visible
-    from texturing.predict import surface
+    from scan2sim.pipeline.cameras import pixel_angle
+    from scan2sim.pipeline.visibility import visible
+    from scan2sim.texturing.predict import surface
 
     rng = np.random.default_rng(0)
     place, normal, owner = [], [], []
@@ -226,7 +226,7 @@ def compare(
     import cv2
     import numpy as np
 
-    from texturing.predict import Predictor, corrected_photo, surface
+    from scan2sim.texturing.predict import Predictor, corrected_photo, surface
 
     photo = photos.get(i)
     assert photo is not None

@@ -13,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
-from pipeline.cameras import EQUIRECTANGULAR, project_point
-from pipeline.range_image import SLOPE_SHARE, slope_of
-from pipeline.types import F32, F64, I32, U8
-from texturing.photos import OFFSET, Photo
+from scan2sim.pipeline.cameras import EQUIRECTANGULAR, project_point
+from scan2sim.pipeline.range_image import SLOPE_SHARE, slope_of
+from scan2sim.pipeline.types import F32, F64, I32, U8
+from scan2sim.texturing.photos import OFFSET, Photo
 
 BAND = 32
 WHITE = 251.0

@@ -12,17 +12,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pipeline.cameras import EQUIRECTANGULAR, FISHEYE, OPENCV
-from pipeline.errors import InputError
-from pipeline.range_image import MAX_SLOPE, SLOPE_SHARE
-from texturing.blend import EDGE, WHITE
-from texturing.photos import OFFSET
+from scan2sim.pipeline.cameras import EQUIRECTANGULAR, FISHEYE, OPENCV
+from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.range_image import MAX_SLOPE, SLOPE_SHARE
+from scan2sim.texturing.blend import EDGE, WHITE
+from scan2sim.texturing.photos import OFFSET
 
 if TYPE_CHECKING:
     import numpy.typing as npt
 
-    from pipeline.types import F32, F64, I32, U8
-    from texturing.blend import Look, Weighing
+    from scan2sim.pipeline.types import F32, F64, I32, U8
+    from scan2sim.texturing.blend import Look, Weighing
 
 CHUNK = 2_000_000
 """Texels that are worked on at a time: some 500 MB."""

@@ -15,11 +15,11 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
-from pipeline.errors import InputError
-from pipeline.io import image
-from pipeline.io.textured import Textured
-from pipeline.types import F32, F64, I32, U8, Mesh
-from texturing.blend import _box, frame
+from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.io import image
+from scan2sim.pipeline.io.textured import Textured
+from scan2sim.pipeline.types import F32, F64, I32, U8, Mesh
+from scan2sim.texturing.blend import _box, frame
 
 Index = npt.NDArray[np.int64]
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipeline.classes import GROUPS
-from pipeline.step import Done, Inputs, Report, Step
-from pipeline.steps.clip import CellParams
+from scan2sim.pipeline.classes import GROUPS
+from scan2sim.pipeline.step import Done, Inputs, Report, Step
+from scan2sim.pipeline.steps.clip import CellParams
 
 if TYPE_CHECKING:
-    from pipeline.cells import Cell
-    from pipeline.io.textured import Textured
+    from scan2sim.pipeline.cells import Cell
+    from scan2sim.pipeline.io.textured import Textured
 
 
 def borders(inputs: Inputs, params: CellParams, out: Path, report: Report) -> Done:
@@ -22,7 +22,7 @@ def borders(inputs: Inputs, params: CellParams, out: Path, report: Report) -> Do
     doesn't; `shared`, of 1, the border edges that are the very same in both; `overlap_m` beyond the border;
     `colour_step` and its 95th percentile, grey levels.
     """
-    from pipeline.io import textured
+    from scan2sim.pipeline.io import textured
 
     names = sorted({name.split(".", 2)[2] for name in inputs if name.count(".") == 2})
     found: dict[str, dict[str, dict[str, float]]] = {}
@@ -37,8 +37,8 @@ def borders(inputs: Inputs, params: CellParams, out: Path, report: Report) -> Do
 
 
 def _measured(own: Textured, other: Textured, cell: Cell, name: str) -> dict[str, float]:
-    from pipeline.border import gap
-    from texturing.border_colours import border_step
+    from scan2sim.pipeline.border import gap
+    from scan2sim.texturing.border_colours import border_step
 
     between, (step, p95, _) = gap(own.mesh, other.mesh, cell, name), border_step(own, other)
     values = {

@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
 
-from pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
-    from pipeline.types import F32, I32, U8, Mesh, View
-    from pipeline.visibility import DepthMap
+    from scan2sim.pipeline.types import F32, I32, U8, Mesh, View
+    from scan2sim.pipeline.visibility import DepthMap
 
 
 class ChooseParams(Params):
@@ -73,10 +73,10 @@ def choose(inputs: Inputs, params: ChooseParams, out: Path, report: Report) -> D
     Inputs: `mesh`, `views`, `depth` (folder of depth maps), `agreement` (which views may be used, and where).
     File: `choice`, a `Choice`.
     """
-    from pipeline.io import views as views_io
-    from pipeline.types import Mesh
-    from pipeline.visibility import load_depth_map
-    from texturing.agreement import Agreement
+    from scan2sim.pipeline.io import views as views_io
+    from scan2sim.pipeline.types import Mesh
+    from scan2sim.pipeline.visibility import load_depth_map
+    from scan2sim.texturing.agreement import Agreement
 
     mesh = Mesh.load(inputs["mesh"])
     views = views_io.load(inputs["views"])
@@ -105,8 +105,8 @@ def choose_views(
     """The choice for all faces, and the share of the edges' length that is a seam."""
     import numpy as np
 
-    from texturing.labels import adjacent, label
-    from texturing.select import Candidates
+    from scan2sim.texturing.labels import adjacent, label
+    from scan2sim.texturing.select import Candidates
 
     best = Candidates(mesh.corners, mesh.face_normal, params.views_per_face)
     for done, i in enumerate(usable):

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.types import F32, F64, U8
+from scan2sim.pipeline.types import F32, F64, U8
 
 if TYPE_CHECKING:
-    from pipeline.render import Image
-    from pipeline.types import View
+    from scan2sim.pipeline.render import Image
+    from scan2sim.pipeline.types import View
 
 Mask = npt.NDArray[np.bool_]
 
@@ -194,8 +194,8 @@ def held_out(folders: Sequence[Path], views: Sequence[View], depths: Sequence[Pa
     """
     import cv2
 
-    from pipeline.io import image
-    from pipeline.render import Renderer, textured
+    from scan2sim.pipeline.io import image
+    from scan2sim.pipeline.render import Renderer, textured
 
     renderer = Renderer([textured(folder) for folder in folders])
     files: list[Path | None] = list(depths) if depths is not None else [None] * len(views)

@@ -16,15 +16,15 @@ from typing import TYPE_CHECKING
 
 from pydantic import Field
 
-from pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from pipeline.types import F64, View
-    from pipeline.visibility import DepthMap
-    from texturing.photos import Exposures
+    from scan2sim.pipeline.types import F64, View
+    from scan2sim.pipeline.visibility import DepthMap
+    from scan2sim.texturing.photos import Exposures
 
 
 class ExposureParams(Params):
@@ -70,8 +70,8 @@ def exposure(inputs: Inputs, params: ExposureParams, out: Path, report: Report) 
     """
     import numpy as np
 
-    from pipeline.io import views as views_io
-    from texturing.photos import Exposures, camera_of
+    from scan2sim.pipeline.io import views as views_io
+    from scan2sim.texturing.photos import Exposures, camera_of
 
     views = views_io.load(inputs["views"])
     held = views_io.load_held_out(inputs["views"])
@@ -117,8 +117,8 @@ def observe(
     """Look random places of every photo up in all photos that see them; read photo by photo."""
     import numpy as np
 
-    from pipeline.visibility import load_depth_map
-    from texturing.photos import Photos
+    from scan2sim.pipeline.visibility import load_depth_map
+    from scan2sim.texturing.photos import Photos
 
     rng = np.random.default_rng(0)
     points, normals = [], []
@@ -152,7 +152,7 @@ def _places(
     """Random places (N, 3) that a depth map shows, and their normals, in camera axes."""
     import numpy as np
 
-    from texturing.predict import surface
+    from scan2sim.texturing.predict import surface
 
     small = surface(depth.camera.scaled(min(1.0, (400_000 / depth.range.size) ** 0.5)), depth)
     near = np.einsum("hwk,hwk->hw", small.points, small.points) < max_distance**2
@@ -174,10 +174,10 @@ def _look_up(
     import cv2
     import numpy as np
 
-    from pipeline.cameras import inside, project
-    from pipeline.visibility import DepthMap as Map
-    from pipeline.visibility import visible
-    from texturing.photos import OFFSET
+    from scan2sim.pipeline.cameras import inside, project
+    from scan2sim.pipeline.visibility import DepthMap as Map
+    from scan2sim.pipeline.visibility import visible
+    from scan2sim.texturing.photos import OFFSET
 
     camera = view.camera
     to = view.centre - place
@@ -216,7 +216,7 @@ def solve(
     """
     import numpy as np
 
-    from texturing.photos import camera_of
+    from scan2sim.texturing.photos import camera_of
 
     if len(seen.photo) == 0:
         return prior, (0.0, 0.0)
@@ -235,7 +235,7 @@ def _least_squares(
     import numpy as np
     import scipy.sparse as sp
 
-    from texturing.photos import GAMMA, Exposures, camera_of
+    from scan2sim.texturing.photos import GAMMA, Exposures, camera_of
 
     photos = np.unique(seen.photo)
     n, m, places = len(photos), len(lenses), len(np.unique(seen.place))
@@ -289,7 +289,7 @@ def _prior(
     """Centre (U,) and precision (U, U) of the unknowns, in units of an observation's own precision."""
     import numpy as np
 
-    from texturing.photos import GAMMA
+    from scan2sim.texturing.photos import GAMMA
 
     stop = np.log(2) / GAMMA  # a stop, in logarithms of encoded values
     n, m = len(photos), len(lenses)

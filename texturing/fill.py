@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
-from pipeline.types import F32, I32, U8
-from texturing.blend import _box, frame
+from scan2sim.pipeline.types import F32, I32, U8
+from scan2sim.texturing.blend import _box, frame
 
 LATTICE = 0.08
 """Metres between the places where points are asked for their colour."""
@@ -189,7 +189,7 @@ def _texel_places(owner, flat, corners, rows, columns):  # type: ignore[no-untyp
 
 def shaded(label: U8, normal: npt.NDArray[np.floating] | None) -> U8:
     """(N, 3) display colours of classes (N,), a little darker where normals (N, 3) turn from above."""
-    from pipeline.classes import colour_of
+    from scan2sim.pipeline.classes import colour_of
 
     rgb = colour_of()[label].astype(np.float32)
     if normal is not None:

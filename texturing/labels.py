@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.types import F32, I32
+from scan2sim.pipeline.types import F32, I32
 
 UNSEEN = 1e3
 SWEEPS = 3

@@ -19,12 +19,12 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
 
-from pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
-    from pipeline.io.textured import Textured
-    from pipeline.types import F32
-    from texturing.border_colours import Border
+    from scan2sim.pipeline.io.textured import Textured
+    from scan2sim.pipeline.types import F32
+    from scan2sim.texturing.border_colours import Border
 
 NEIGHBOUR = "neighbour."
 
@@ -51,8 +51,8 @@ def level(inputs: Inputs, params: LevelParams, out: Path, report: Report) -> Don
     """
     import numpy as np
 
-    from pipeline.io import textured
-    from texturing import border_colours as at_border
+    from scan2sim.pipeline.io import textured
+    from scan2sim.texturing import border_colours as at_border
 
     folder = out / "textured"
     folder.mkdir()
@@ -83,9 +83,9 @@ def _level_pages(
     """
     import numpy as np
 
-    from pipeline.io import image
-    from texturing import blend
-    from texturing import border_colours as at_border
+    from scan2sim.pipeline.io import image
+    from scan2sim.texturing import blend
+    from scan2sim.texturing import border_colours as at_border
 
     mesh, looks = own.mesh, border.looks[0]
     assert mesh.uv is not None and mesh.page is not None

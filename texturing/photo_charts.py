@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.types import F32, F64, I32, Mesh
+from scan2sim.pipeline.types import F32, F64, I32, Mesh
 
 TILT = 0.2
 """How far a chart's plane is turned from its faces' mean normal towards the camera."""
@@ -135,7 +135,7 @@ def pack(size: npt.NDArray[np.int64], side: int, gutter: int) -> tuple[Index, In
 
 def overlapping(flat: F32, page: Index, pages: list[tuple[int, int]]) -> npt.NDArray[np.bool_]:
     """(N,) faces of which others cover too much; `flat` (N, 3, 2) texels of their page."""
-    from texturing.blend import owners
+    from scan2sim.texturing.blend import owners
 
     area = np.abs(_signed_area(flat))
     covered = np.zeros(len(flat), bool)
@@ -152,7 +152,7 @@ def _components(mesh: Mesh, label: I32, cell: float) -> Index:
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    from texturing.labels import adjacent
+    from scan2sim.texturing.labels import adjacent
 
     pairs, _ = adjacent(mesh.faces)
     place = np.floor(mesh.corners.mean(axis=1) / cell).astype(np.int64)

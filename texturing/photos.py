@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.errors import InputError
-from pipeline.types import F64, U8, View
+from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.types import F64, U8, View
 
 CACHE = 300_000_000
 """Bytes of photos kept in memory between uses."""
@@ -122,7 +122,7 @@ class Photos:
 
     def mask(self, i: int) -> U8 | None:
         """The mask of view `i` at its photo's size, (0, 0) for none; None if it can't be used."""
-        from pipeline.io import image
+        from scan2sim.pipeline.io import image
 
         view = self._views[i]
         if view.mask is None:
@@ -133,7 +133,7 @@ class Photos:
         return mask
 
     def _read(self, i: int) -> Photo | None:
-        from pipeline.io import image
+        from scan2sim.pipeline.io import image
 
         view = self._views[i]
         size = (view.camera.height, view.camera.width)

@@ -14,12 +14,12 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
-from pipeline.cameras import EQUIRECTANGULAR, MODEL_ID, parameters, pixel_angle, pixel_rays, project_point
-from pipeline.range_image import is_visible
-from pipeline.types import F32, F64, U8, Camera
-from pipeline.visibility import DepthMap
-from texturing.blend import corrected, mask_allows, sample, vignette
-from texturing.photos import Photo
+from scan2sim.pipeline.cameras import EQUIRECTANGULAR, MODEL_ID, parameters, pixel_angle, pixel_rays, project_point
+from scan2sim.pipeline.range_image import is_visible
+from scan2sim.pipeline.types import F32, F64, U8, Camera
+from scan2sim.pipeline.visibility import DepthMap
+from scan2sim.texturing.blend import corrected, mask_allows, sample, vignette
+from scan2sim.texturing.photos import Photo
 
 ALIKE = 28.0
 """Grey levels within which photos agree on a colour."""
@@ -237,7 +237,7 @@ def _apart(a, b):  # type: ignore[no-untyped-def]
 
 def corrected_photo(photo: npt.NDArray[np.uint8], camera: Camera, exposure: F64) -> F32:
     """The photo (H, W, 3), of a camera scaled to it, with its exposure corrected; (H, W, 3) float32, unclipped."""
-    from texturing.photos import OFFSET
+    from scan2sim.texturing.photos import OFFSET
 
     v, u = np.mgrid[: camera.height, : camera.width].astype(np.float32)
     cx, cy = (camera.width - 1) / 2, (camera.height - 1) / 2

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
 
-from pipeline.classes import GROUPS
-from pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.classes import GROUPS
+from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from pipeline.types import F32
+    from scan2sim.pipeline.types import F32
 
 FIGURES = ("psnr_db", "psnr_gain_db", "ssim", "sharpness")
 
@@ -49,9 +49,9 @@ def score(inputs: Inputs, params: ScoreParams, out: Path, report: Report) -> Don
     """
     import numpy as np
 
-    from pipeline.io import views as views_io
-    from pipeline.steps.pictures import Album
-    from texturing import evaluate
+    from scan2sim.pipeline.io import views as views_io
+    from scan2sim.pipeline.steps.pictures import Album
+    from scan2sim.texturing import evaluate
 
     groups = [g for g in GROUPS if g in inputs]
     folders = [inputs[g] for g in groups]
@@ -117,9 +117,9 @@ def _truth(inputs: Inputs, folders: list[Path], params: ScoreParams) -> dict[str
     """
     import numpy as np
 
-    from pipeline.io import las
-    from pipeline.render import Renderer, textured
-    from texturing.evaluate import psnr
+    from scan2sim.pipeline.io import las
+    from scan2sim.pipeline.render import Renderer, textured
+    from scan2sim.texturing.evaluate import psnr
 
     bodies = [textured(folder) for folder in folders]
     truth = las.read(inputs["truth.points"], bodies[0].mesh.frame)
@@ -142,8 +142,8 @@ def _seen_from_near(inputs: Inputs, places: F32, normals: F32, near: float) -> n
     """(N,) which places (N, 3) on the meshes a photo that was not held out sees from `near` metres or nearer."""
     import numpy as np
 
-    from pipeline.io import views as views_io
-    from pipeline.visibility import load_depth_map, visible
+    from scan2sim.pipeline.io import views as views_io
+    from scan2sim.pipeline.visibility import load_depth_map, visible
 
     seen = np.zeros(len(places), bool)
     for i, (view, held) in enumerate(

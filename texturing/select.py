@@ -7,10 +7,10 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from pipeline.cameras import MODEL_ID, parameters, pixel_angle
-from pipeline.range_image import is_visible
-from pipeline.types import F32, U8
-from pipeline.visibility import DepthMap
+from scan2sim.pipeline.cameras import MODEL_ID, parameters, pixel_angle
+from scan2sim.pipeline.range_image import is_visible
+from scan2sim.pipeline.types import F32, U8
+from scan2sim.pipeline.visibility import DepthMap
 
 # where a face is looked at (barycentric): its middle, near its corners, near the middles of its edges
 _SAMPLES = np.array(

@@ -20,19 +20,19 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
 
-from pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from pipeline.types import F32, I32, U8, Mesh, PointCloud, View
-    from pipeline.visibility import DepthMap
-    from texturing.agreement import Agreement
-    from texturing.blend import Rows
-    from texturing.choose import Choice
-    from texturing.fill import Colours, Page
-    from texturing.photos import Exposures
+    from scan2sim.pipeline.types import F32, I32, U8, Mesh, PointCloud, View
+    from scan2sim.pipeline.visibility import DepthMap
+    from scan2sim.texturing.agreement import Agreement
+    from scan2sim.texturing.blend import Rows
+    from scan2sim.texturing.choose import Choice
+    from scan2sim.texturing.fill import Colours, Page
+    from scan2sim.texturing.photos import Exposures
 
 NEIGHBOUR_STEP = 8
 """Where points have no colour, every so many seen texels (each way) lend theirs to the unseen ones."""
@@ -80,11 +80,11 @@ def texture(inputs: Inputs, params: TextureParams, out: Path, report: Report) ->
     """
     import numpy as np
 
-    from pipeline.io import views as views_io
-    from pipeline.types import Mesh
-    from texturing.agreement import Agreement
-    from texturing.choose import Choice
-    from texturing.photos import Exposures
+    from scan2sim.pipeline.io import views as views_io
+    from scan2sim.pipeline.types import Mesh
+    from scan2sim.texturing.agreement import Agreement
+    from scan2sim.texturing.choose import Choice
+    from scan2sim.texturing.photos import Exposures
 
     folder = out / "textured"
     folder.mkdir()
@@ -136,7 +136,7 @@ class Writer:
 
 
 def _write(path: Path, rgb: U8, seen: U8) -> None:
-    from pipeline.io import image
+    from scan2sim.pipeline.io import image
 
     image.write(path.with_name(f"{path.name}.png"), rgb)
     image.write(path.with_name(f"{path.name}_seen.png"), seen, compression=1)
@@ -169,7 +169,7 @@ class Painter:
         agreement: Agreement,
         params: TextureParams,
     ) -> None:
-        from texturing.photos import Photos
+        from scan2sim.texturing.photos import Photos
 
         self._mesh, self._views, self._params = mesh, views, params
         self._corners, self._normals = mesh.corners, mesh.face_normal
@@ -191,8 +191,8 @@ class Painter:
         """
         import numpy as np
 
-        from texturing import blend
-        from texturing.fill import Page
+        from scan2sim.texturing import blend
+        from scan2sim.texturing.fill import Page
 
         assert self._mesh.uv is not None
         flat = blend.texels(self._mesh.uv[faces], width, height)
@@ -231,10 +231,10 @@ class Painter:
     def _rows(self, owner: I32, flat: F32, corners: F32, normals: F32) -> Rows:
         """What paints, on this machine's GPU or its processors."""
         if self._device == "numba":
-            from texturing.blend import NumbaRows
+            from scan2sim.texturing.blend import NumbaRows
 
             return NumbaRows(owner, flat, corners, normals)
-        from texturing.blend_torch import TorchRows
+        from scan2sim.texturing.blend_torch import TorchRows
 
         return TorchRows(owner, flat, corners, normals, self._device)
 
@@ -242,8 +242,8 @@ class Painter:
         """Add what photo `i` says of the page's faces `mine`, the mesh's `faces`; returns the texels it sees."""
         import numpy as np
 
-        from pipeline.cameras import MODEL_ID, parameters, pixel_angle
-        from texturing.blend import Look, Weighing
+        from scan2sim.pipeline.cameras import MODEL_ID, parameters, pixel_angle
+        from scan2sim.texturing.blend import Look, Weighing
 
         photo = self.photos.get(i)
         if photo is None:
@@ -274,7 +274,7 @@ class Painter:
         import cv2
         import numpy as np
 
-        from pipeline.visibility import load_depth_map
+        from scan2sim.pipeline.visibility import load_depth_map
 
         view, band = self._views[i], self._params.band
         depth = load_depth_map(self._depth_file(i), view.camera, view.T_world_cam)
@@ -318,8 +318,8 @@ def shares(faces: I32, label: I32, vertices: int, views: int) -> Callable[[int],
 
 def _colours_of(inputs: Inputs) -> tuple[Colours | None, bool]:
     """The points' colours, and whether they are their own (else their classes'); None where there are no points."""
-    from pipeline.types import PointCloud
-    from texturing.fill import FILLED, FROM_POINTS, Colours, shaded
+    from scan2sim.pipeline.types import PointCloud
+    from scan2sim.texturing.fill import FILLED, FROM_POINTS, Colours, shaded
 
     clouds = [PointCloud.load(path) for name, path in sorted(inputs.items()) if name.startswith("cloud")]
     rest = [name == "cloud.rest" for name in sorted(inputs) if name.startswith("cloud")]
@@ -344,7 +344,7 @@ def _finish(
     """Fill what no photo saw, pad the charts; returns (N, 4) texels of the faces, as `blend.count`."""
     import numpy as np
 
-    from texturing import blend, fill
+    from scan2sim.texturing import blend, fill
 
     area = float(mesh.face_area[faces].sum())
     texel = (area / max(1, int((page.owner >= 0).sum()))) ** 0.5

@@ -15,15 +15,15 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
 
-from pipeline.errors import StepError
-from pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.errors import StepError
+from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from pipeline.types import Mesh
-    from texturing.atlas import Backend, Chartered
+    from scan2sim.pipeline.types import Mesh
+    from scan2sim.texturing.atlas import Backend, Chartered
 
     Index = npt.NDArray[np.int64]
 
@@ -67,7 +67,7 @@ def unwrap(inputs: Inputs, params: UnwrapParams, out: Path, report: Report) -> D
     """
     import numpy as np
 
-    from pipeline.types import Mesh
+    from scan2sim.pipeline.types import Mesh
 
     mesh = Mesh.load(inputs["mesh"])
     laid = Laid(np.zeros((len(mesh), 3, 2), np.float32), np.full(len(mesh), -1, np.int16), [], 0, 0)
@@ -114,8 +114,8 @@ def _photos(inputs: Inputs) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float
     """The view (F,) of every face's detail, and the cameras' centres (V, 3)."""
     import numpy as np
 
-    from pipeline.io import views as views_io
-    from texturing.choose import Choice
+    from scan2sim.pipeline.io import views as views_io
+    from scan2sim.texturing.choose import Choice
 
     views = views_io.load(inputs["views"])
     return Choice.load(inputs["choice"]).label, np.array([view.centre for view in views]).reshape(-1, 3)
@@ -127,7 +127,7 @@ def lay_by_photo(
     """Charts as the chosen photos see them; faces that can't be laid so have no page."""
     import numpy as np
 
-    from texturing import photo_charts
+    from scan2sim.texturing import photo_charts
 
     uv, page = np.zeros((len(mesh), 3, 2), np.float32), np.full(len(mesh), -1, np.int16)
     charts = photo_charts.cut(mesh, label, centres, params.texel, params.page_size - 2 * params.gutter)
@@ -231,7 +231,7 @@ def _in_child(mesh: Mesh, blocks: list[Index], backend: Backend, params: UnwrapP
     """Unwrap blocks in one child process; a reason for each that failed."""
     import numpy as np
 
-    from pipeline import isolate
+    from scan2sim.pipeline import isolate
 
     parts = []
     for block in blocks:
@@ -240,7 +240,13 @@ def _in_child(mesh: Mesh, blocks: list[Index], backend: Backend, params: UnwrapP
     timeout = params.timeout * sum(max(1.0, len(block) / 10_000) for block in blocks)
     try:
         return isolate.call(
-            "texturing.atlas:unwrap_blocks", backend, parts, params.texel, params.gutter, timeout=timeout, threads=1
+            "scan2sim.texturing.atlas:unwrap_blocks",
+            backend,
+            parts,
+            params.texel,
+            params.gutter,
+            timeout=timeout,
+            threads=1,
         )
     except StepError as error:
         return [CHILD + error.cause] * len(blocks)

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.errors import InputError
-from pipeline.io import las, ply
-from pipeline.types import F64, Frame, PointCloud
+from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.io import las, ply
+from scan2sim.pipeline.types import F64, Frame, PointCloud
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.io.textured import Textured, unique_uv
+from scan2sim.pipeline.io.textured import Textured, unique_uv
 
 EPOCH = datetime(2000, 1, 1)  # written for the time of making, so that the same mesh gives the same bytes
 

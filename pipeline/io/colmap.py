@@ -14,13 +14,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from pipeline.errors import InputError, SettingError
-from pipeline.io import clouds as cloud_io
-from pipeline.io import las
-from pipeline.io.importing import place, tile_folder
-from pipeline.io.tile import read_tile, tile_name, write_tile
-from pipeline.step import Report, silent
-from pipeline.types import F64, Camera, CameraModel, Frame, PointCloud
+from scan2sim.pipeline.errors import InputError, SettingError
+from scan2sim.pipeline.io import clouds as cloud_io
+from scan2sim.pipeline.io import las
+from scan2sim.pipeline.io.importing import place, tile_folder
+from scan2sim.pipeline.io.tile import read_tile, tile_name, write_tile
+from scan2sim.pipeline.step import Report, silent
+from scan2sim.pipeline.types import F64, Camera, CameraModel, Frame, PointCloud
 
 # COLMAP's model: ours, number of focal lengths, places of COLMAP's coefficients among ours
 MODELS: dict[str, tuple[CameraModel, int, tuple[int, ...]]] = {

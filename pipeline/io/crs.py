@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.errors import InputError
-from pipeline.types import Frame
+from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.types import Frame
 
 if TYPE_CHECKING:
-    from pipeline.io.clouds import Header
+    from scan2sim.pipeline.io.clouds import Header
 
 UNITS = {"m": 1.0, "ft": 0.3048, "us-ft": 1200 / 3937}
 LOCAL = "local"

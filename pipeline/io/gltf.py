@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.errors import InputError
-from pipeline.io.textured import Textured, unique_uv
+from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.io.textured import Textured, unique_uv
 
 
 def write(path: Path, surfaces: Mapping[str, Textured], jpeg_quality: int = 90) -> None:

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.errors import InputError
-from pipeline.types import U8, View
+from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.types import U8, View
 
 
 def read_rgb(path: Path) -> U8 | None:

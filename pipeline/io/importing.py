@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
 
-from pipeline.errors import InputError, SettingError, from_os_error
+from scan2sim.pipeline.errors import InputError, SettingError, from_os_error
 
 
 @contextmanager

@@ -21,14 +21,14 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.errors import InputError, SettingError
-from pipeline.io import las
-from pipeline.io.importing import place, tile_folder
-from pipeline.io.merging import GREY as GREY
-from pipeline.io.merging import borrow_colours, colour, interpolate, phase_of, read_bin
-from pipeline.io.tile import tile_name, write_tile
-from pipeline.step import Report, silent
-from pipeline.types import F32, F64, Camera, Frame, PointCloud
+from scan2sim.pipeline.errors import InputError, SettingError
+from scan2sim.pipeline.io import las
+from scan2sim.pipeline.io.importing import place, tile_folder
+from scan2sim.pipeline.io.merging import GREY as GREY
+from scan2sim.pipeline.io.merging import borrow_colours, colour, interpolate, phase_of, read_bin
+from scan2sim.pipeline.io.tile import tile_name, write_tile
+from scan2sim.pipeline.step import Report, silent
+from scan2sim.pipeline.types import F32, F64, Camera, Frame, PointCloud
 
 GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
 # the recording car's own returns, scanner axes: (low, high) corner in metres

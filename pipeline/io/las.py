@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.errors import InputError
-from pipeline.types import F64, Frame, PointCloud
+from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.types import F64, Frame, PointCloud
 
 CHUNK = 2_000_000
 DAY = date(2000, 1, 1)

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.classes import CLASSES
-from pipeline.errors import DataError, SpaceError, UnavailableError, from_os_error
-from pipeline.io.las import CHUNK, _open, _truncated
-from pipeline.types import U8
+from scan2sim.pipeline.classes import CLASSES
+from scan2sim.pipeline.errors import DataError, SpaceError, UnavailableError, from_os_error
+from scan2sim.pipeline.io.las import CHUNK, _open, _truncated
+from scan2sim.pipeline.types import U8
 
 ADDED = {"confidence": "255: sure", "told_from": "1 photos 2 shape 3 own"}
 """Extra bytes that are added (uint8 each): name and description."""

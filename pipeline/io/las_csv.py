@@ -29,13 +29,13 @@ from typing import Any, get_args
 
 import numpy as np
 
-from pipeline.errors import InputError
-from pipeline.io import clouds as cloud_io
-from pipeline.io import crs as crs_io
-from pipeline.io.importing import place, tile_folder
-from pipeline.io.tile import read_tile, tile_name, write_tile
-from pipeline.step import Report, silent
-from pipeline.types import F64, Camera, CameraModel
+from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.io import clouds as cloud_io
+from scan2sim.pipeline.io import crs as crs_io
+from scan2sim.pipeline.io.importing import place, tile_folder
+from scan2sim.pipeline.io.tile import read_tile, tile_name, write_tile
+from scan2sim.pipeline.step import Report, silent
+from scan2sim.pipeline.types import F64, Camera, CameraModel
 
 Row = Mapping[str, str]
 MATRIX = tuple(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3))

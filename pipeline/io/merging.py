@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.errors import InputError
-from pipeline.io.image import read_rgb
-from pipeline.types import F32, F64, U8, Camera
+from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.io.image import read_rgb
+from scan2sim.pipeline.types import F32, F64, U8, Camera
 
 Bools = npt.NDArray[np.bool_]
 
@@ -79,7 +79,7 @@ def colour(
     Raises:
         InputError: the photo can't be read, or has another size.
     """
-    from pipeline.cameras import inside, project
+    from scan2sim.pipeline.cameras import inside, project
 
     image = read_rgb(photo)
     if image is None:

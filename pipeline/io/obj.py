@@ -12,8 +12,8 @@ from typing import Any, TextIO
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.io.textured import Textured, unique_uv, vertex_normals
-from pipeline.types import Mesh
+from scan2sim.pipeline.io.textured import Textured, unique_uv, vertex_normals
+from scan2sim.pipeline.types import Mesh
 
 CHUNK = 100_000  # rows formatted at once
 

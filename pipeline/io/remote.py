@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import InputError, UnavailableError
-from pipeline.step import Report, silent
+from scan2sim.pipeline.errors import InputError, UnavailableError
+from scan2sim.pipeline.step import Report, silent
 
 INDEX, PUSHED = ".remote.json", ".pushed.json"
 CACHE = "SCAN2SIM_CACHE"

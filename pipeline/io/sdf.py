@@ -24,9 +24,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from xml.sax.saxutils import escape
 
-from pipeline.classes import CODE
-from pipeline.io import crs
-from pipeline.types import Frame
+from scan2sim.pipeline.classes import CODE
+from scan2sim.pipeline.io import crs
+from scan2sim.pipeline.types import Frame
 
 LABEL = {"terrain": CODE["terrain"], "building": CODE["building"], "vegetation": CODE["high_vegetation"]}
 HEADROOM = 500.0

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.types import F64, Frame, PointCloud
+from scan2sim.pipeline.types import F64, Frame, PointCloud
 
 QUANTUM = 0.001
 """CRS units, of coordinates; a whole number of them makes a unit, so that tiles with whole offsets agree on them."""

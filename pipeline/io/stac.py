@@ -20,12 +20,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.errors import DataError, from_os_error
-from pipeline.io import las
-from pipeline.io.clouds import Header
-from pipeline.io.crs import LOCAL, _horizontal, _parsed
-from pipeline.io.worlds import swap
-from pipeline.types import F64, Frame
+from scan2sim.pipeline.errors import DataError, from_os_error
+from scan2sim.pipeline.io import las
+from scan2sim.pipeline.io.clouds import Header
+from scan2sim.pipeline.io.crs import LOCAL, _horizontal, _parsed
+from scan2sim.pipeline.io.worlds import swap
+from scan2sim.pipeline.types import F64, Frame
 
 if TYPE_CHECKING:
     import pystac

@@ -21,8 +21,8 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from pipeline.errors import InputError
-from pipeline.io import toml
+from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.io import toml
 
 
 class SurveyFile(BaseModel):

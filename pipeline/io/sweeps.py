@@ -21,16 +21,16 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
 
-from pipeline.errors import DataError, InputError, SettingError
-from pipeline.io import crs as crs_io
-from pipeline.io import las
-from pipeline.io import trajectory as trajectory_io
-from pipeline.io.image import read_rgb
-from pipeline.io.importing import place, tile_folder
-from pipeline.io.merging import borrow_colours, colour, interpolate, phase_of, read_bin, thin
-from pipeline.io.tile import DISTORTION_LENGTHS, CameraEntry, read_tile, tile_name, write_tile
-from pipeline.step import Report, silent
-from pipeline.types import F32, F64, U8, Camera, Frame, PointCloud, Trajectory
+from scan2sim.pipeline.errors import DataError, InputError, SettingError
+from scan2sim.pipeline.io import crs as crs_io
+from scan2sim.pipeline.io import las
+from scan2sim.pipeline.io import trajectory as trajectory_io
+from scan2sim.pipeline.io.image import read_rgb
+from scan2sim.pipeline.io.importing import place, tile_folder
+from scan2sim.pipeline.io.merging import borrow_colours, colour, interpolate, phase_of, read_bin, thin
+from scan2sim.pipeline.io.tile import DISTORTION_LENGTHS, CameraEntry, read_tile, tile_name, write_tile
+from scan2sim.pipeline.step import Report, silent
+from scan2sim.pipeline.types import F32, F64, U8, Camera, Frame, PointCloud, Trajectory
 
 Bools = npt.NDArray[np.bool_]
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.errors import InputError
-from pipeline.types import F32, I32, Mesh
+from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.types import F32, I32, Mesh
 
 
 @dataclass(frozen=True)

@@ -39,13 +39,13 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from pipeline.cells import Cell
-from pipeline.errors import InputError
-from pipeline.io import clouds as cloud_io
-from pipeline.io import crs as crs_io
-from pipeline.io import toml
-from pipeline.io import trajectory as trajectory_io
-from pipeline.types import Camera, CameraModel, Frame, Tile, Trajectory, View
+from scan2sim.pipeline.cells import Cell
+from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.io import clouds as cloud_io
+from scan2sim.pipeline.io import crs as crs_io
+from scan2sim.pipeline.io import toml
+from scan2sim.pipeline.io import trajectory as trajectory_io
+from scan2sim.pipeline.types import Camera, CameraModel, Frame, Tile, Trajectory, View
 
 Vector = tuple[float, float, float]
 DISTORTION_LENGTHS = {"pinhole": (0,), "opencv": (0, 4, 5, 8), "fisheye": (0, 4), "equirectangular": (0,)}

@@ -22,9 +22,9 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.errors import DataError, InputError, SettingError, from_os_error
-from pipeline.io import crs as crs_io
-from pipeline.types import F64, Frame, Trajectory
+from scan2sim.pipeline.errors import DataError, InputError, SettingError, from_os_error
+from scan2sim.pipeline.io import crs as crs_io
+from scan2sim.pipeline.types import F64, Frame, Trajectory
 
 POSITION = ("time", "x", "y", "z")
 QUATERNION = ("qx", "qy", "qz", "qw")

@@ -6,8 +6,8 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any, Self
 
-from pipeline.errors import UnavailableError, from_os_error
-from pipeline.types import U8
+from scan2sim.pipeline.errors import UnavailableError, from_os_error
+from scan2sim.pipeline.types import U8
 
 TICKS = 90_000
 """A second of the video's clock."""

@@ -15,9 +15,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import DataError, InputError, from_os_error
-from pipeline.io import crs, sdf
-from pipeline.types import Frame
+from scan2sim.pipeline.errors import DataError, InputError, from_os_error
+from scan2sim.pipeline.io import crs, sdf
+from scan2sim.pipeline.types import Frame
 
 EDITED = (".sdf", ".config", ".json", ".mtl", ".geojson", ".csv")
 """Suffixes of what users change by hand: copied, never linked."""

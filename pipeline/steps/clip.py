@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 from pydantic import Field
 
-from pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
-    from pipeline.cells import Cell
+    from scan2sim.pipeline.cells import Cell
 
 
 class CellParams(Params):
@@ -27,15 +27,15 @@ class CellParams(Params):
     @property
     def cell(self) -> Cell:
         """The tile's cell."""
-        from pipeline.cells import Cell
+        from scan2sim.pipeline.cells import Cell
 
         return Cell(self.seed, self.neighbours)
 
 
 def clip(inputs: Inputs, params: CellParams, out: Path, report: Report) -> Done:
     """Cut `mesh` to the tile's own cell, and tell which vertices lie on which border (`on`)."""
-    from pipeline import border
-    from pipeline.types import Mesh
+    from scan2sim.pipeline import border
+    from scan2sim.pipeline.types import Mesh
 
     mesh = Mesh.load(inputs["mesh"])
     clipped = border.clip(mesh, params.cell)

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 from pydantic import Field
 
-from pipeline.errors import DataError, StepError
-from pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.errors import DataError, StepError
+from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
-    from pipeline.types import Mesh
+    from scan2sim.pipeline.types import Mesh
 
 SAMPLES = 100_000  # points at which the deviation is measured
 MOST = 200_000  # triangles, whatever the borders need
@@ -43,7 +43,7 @@ def collision(inputs: Inputs, params: CollisionParams, out: Path, report: Report
         DataError: no mesh has a face.
         StepError: the budget can't be met; with `keep_border`, the borders alone need over 200,000 triangles.
     """
-    from pipeline.steps.decimate import simplify
+    from scan2sim.pipeline.steps.decimate import simplify
 
     groups = ("terrain", "building", "vegetation") if params.vegetation else ("terrain", "building")
     source = _joined(inputs, groups)
@@ -78,7 +78,7 @@ def _joined(inputs: Inputs, groups: tuple[str, ...]) -> Mesh:
     """The meshes of `groups` that there are, as one."""
     import numpy as np
 
-    from pipeline.types import Mesh
+    from scan2sim.pipeline.types import Mesh
 
     meshes = [mesh for group in groups if group in inputs and len(mesh := Mesh.load(inputs[group]))]
     if not meshes:

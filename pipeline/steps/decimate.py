@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 from pydantic import Field
 
-from pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
-    from pipeline.types import Mesh
+    from scan2sim.pipeline.types import Mesh
 
 
 class DecimateParams(Params):
@@ -31,7 +31,7 @@ def decimate(inputs: Inputs, params: DecimateParams, out: Path, report: Report) 
     Where the border alone is more than the target allows, the border is thinned as well (but for `keep_border`),
     and a warning says so.
     """
-    from pipeline.types import Mesh
+    from scan2sim.pipeline.types import Mesh
 
     mesh = Mesh.load(inputs["mesh"])
     small, warnings = simplify(mesh, params.target), []
@@ -51,7 +51,7 @@ def simplify(mesh: Mesh, target: int, *, preserve_border: bool = True) -> Mesh:
     import numpy as np
     import pyfqmr
 
-    from pipeline.types import Mesh
+    from scan2sim.pipeline.types import Mesh
 
     if len(mesh) <= target:
         return Mesh(mesh.frame, mesh.vertices, mesh.faces)

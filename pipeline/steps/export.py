@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
 
-from pipeline.classes import GROUPS
-from pipeline.errors import DataError, SettingError
-from pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.classes import GROUPS
+from scan2sim.pipeline.errors import DataError, SettingError
+from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
-    from pipeline.io.textured import Textured
-    from pipeline.types import Frame
+    from scan2sim.pipeline.io.textured import Textured
+    from scan2sim.pipeline.types import Frame
 
 PLANT_LISTS = {"plants": "plants.geojson", "plants_csv": "plants.csv"}  # input to file in the world's folder
 
@@ -62,8 +62,8 @@ def export(inputs: Inputs, params: ExportParams, out: Path, report: Report) -> D
     import json
     import shutil
 
-    from pipeline.io import gltf, obj, textured
-    from pipeline.types import Mesh
+    from scan2sim.pipeline.io import gltf, obj, textured
+    from scan2sim.pipeline.types import Mesh
 
     if params.gazebo and not (params.obj or params.collada):
         raise SettingError("export", "gazebo needs a mesh format", "Set export.obj=true or export.collada=true")
@@ -109,7 +109,7 @@ def export(inputs: Inputs, params: ExportParams, out: Path, report: Report) -> D
 
 def _common_frame(inputs: Inputs, surfaces: dict[str, Textured], solid: Any) -> Frame:
     """The frame of all meshes, which must be one."""
-    from pipeline.errors import InputError
+    from scan2sim.pipeline.errors import InputError
 
     frame: Frame = solid.frame
     for group, surface in surfaces.items():
@@ -126,7 +126,7 @@ def _write_group(folder: Path, group: str, surface: Textured, params: ExportPara
     """Write a group's OBJ and Collada files and their images; triangles of every mesh file."""
     import shutil
 
-    from pipeline.io import collada, image, obj
+    from scan2sim.pipeline.io import collada, image, obj
 
     if not (params.obj or params.collada):
         return {}
@@ -153,8 +153,8 @@ def _write_group(folder: Path, group: str, surface: Textured, params: ExportPara
 
 
 def _write_gazebo(world: Path, model: Path, visuals: dict[str, str], frame: Frame, params: ExportParams) -> None:
-    from pipeline.io import sdf
-    from pipeline.types import Frame
+    from scan2sim.pipeline.io import sdf
+    from scan2sim.pipeline.types import Frame
 
     origin = params.world_origin or frame.origin
     x, y, z = (here - there for here, there in zip(frame.origin, origin, strict=True))
@@ -169,7 +169,7 @@ def _metadata(
     """What a reader needs to put the meshes back on the map, and to check that they are whole."""
     import numpy as np
 
-    from pipeline.io import sdf
+    from scan2sim.pipeline.io import sdf
 
     place = sdf.Georeference.of(frame)
     return {

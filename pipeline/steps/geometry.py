@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
 
-from pipeline.classes import GROUPS, group_of
-from pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.classes import GROUPS, group_of
+from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
-    from pipeline.types import F32, Mesh
+    from scan2sim.pipeline.types import F32, Mesh
 
 
 class GeometryParams(Params):
@@ -37,8 +37,8 @@ def geometry(inputs: Inputs, params: GeometryParams, out: Path, report: Report) 
     """
     import numpy as np
 
-    from pipeline.cells import Cell
-    from pipeline.types import Mesh, PointCloud
+    from scan2sim.pipeline.cells import Cell
+    from scan2sim.pipeline.types import Mesh, PointCloud
 
     facts: dict[str, dict[str, Any]] = {}
     truth = Mesh.load(inputs["truth.mesh"]) if "truth.mesh" in inputs else None

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pipeline.errors import DataError
-from pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.errors import DataError
+from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 MIN_POINTS = 1000
 
@@ -29,8 +29,8 @@ def ingest(inputs: Inputs, params: IngestParams, out: Path, report: Report) -> D
     """
     import numpy as np
 
-    from pipeline.io import clouds
-    from pipeline.types import Frame, PointCloud
+    from scan2sim.pipeline.io import clouds
+    from scan2sim.pipeline.types import Frame, PointCloud
 
     frame = Frame(params.crs, params.origin, params.unit)
     parts: list[PointCloud] = []

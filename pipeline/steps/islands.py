@@ -6,7 +6,7 @@ from pathlib import Path
 
 from pydantic import Field
 
-from pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 
 class IslandsParams(Params):
@@ -25,7 +25,7 @@ def islands(inputs: Inputs, params: IslandsParams, out: Path, report: Report) ->
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    from pipeline.types import Mesh
+    from scan2sim.pipeline.types import Mesh
 
     mesh = Mesh.load(inputs["mesh"])
     n = len(mesh.vertices)

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from pydantic import Field
 
-from pipeline.step import Done, Inputs, Report, Step
-from pipeline.steps.clip import CellParams
+from scan2sim.pipeline.step import Done, Inputs, Report, Step
+from scan2sim.pipeline.steps.clip import CellParams
 
 
 class JoinParams(CellParams):
@@ -30,7 +30,7 @@ def join(inputs: Inputs, params: JoinParams, out: Path, report: Report) -> Done:
 
     Neighbours whose names sort after the tile's own needn't be given: they fit theirs to this one.
     """
-    from pipeline import border
+    from scan2sim.pipeline import border
 
     clips = {params.name: border.Clipped.load(inputs["mesh"], inputs["on"])}
     for name in sorted(params.neighbours):

@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING
 
 from pydantic import Field
 
-from pipeline.step import Done, Inputs, Report, Step
-from pipeline.steps.clip import CellParams
+from scan2sim.pipeline.step import Done, Inputs, Report, Step
+from scan2sim.pipeline.steps.clip import CellParams
 
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from pipeline.cells import Seed
-    from pipeline.types import F64
+    from scan2sim.pipeline.cells import Seed
+    from scan2sim.pipeline.types import F64
 
 
 class OverlapParams(CellParams):
@@ -42,8 +42,8 @@ def overlap(inputs: Inputs, params: OverlapParams, out: Path, report: Report) ->
 
     import numpy as np
 
-    from pipeline.border import on_grid
-    from pipeline.types import PointCloud
+    from scan2sim.pipeline.border import on_grid
+    from scan2sim.pipeline.types import PointCloud
 
     seeds = dict(sorted({params.name: params.seed, **params.neighbours}.items()))
     given = [name for name in seeds if name == params.name or f"cloud.{name}" in inputs]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 
 class PathParams(Params):
@@ -23,7 +23,7 @@ def path(inputs: Inputs, params: PathParams, out: Path, report: Report) -> Done:
     """Write the path as a `Trajectory`, ordered by time; times are NaN where unknown."""
     import numpy as np
 
-    from pipeline.types import Trajectory
+    from scan2sim.pipeline.types import Trajectory
 
     positions = np.array(params.positions, np.float64)
     times = np.full(len(positions), np.nan) if params.times is None else np.array(params.times)

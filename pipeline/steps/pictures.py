@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import Field
 
-from pipeline.classes import GROUPS, colour_of
-from pipeline.io import image
-from pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.classes import GROUPS, colour_of
+from scan2sim.pipeline.io import image
+from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
-    from pipeline.render import Image
-    from pipeline.types import F64, U8, Camera, PointCloud
+    from scan2sim.pipeline.render import Image
+    from scan2sim.pipeline.types import F64, U8, Camera, PointCloud
 
 GROUP_RGB = {"terrain": (176, 158, 138), "building": (206, 160, 132), "vegetation": (126, 172, 104)}
 SEEN_RGB = {255: (92, 160, 96), 128: (222, 170, 70), 64: (196, 84, 76)}
@@ -65,9 +65,9 @@ def pictures(inputs: Inputs, params: PicturesParams, out: Path, report: Report) 
     """Render classes, meshes, triangles, the textured world from above and from a driver's eye, its pages,
     what photos saw, and the world beside photos (held-out ones first).
     """
-    from pipeline import render
-    from pipeline.io import views as views_io
-    from pipeline.types import Mesh, PointCloud, Trajectory
+    from scan2sim.pipeline import render
+    from scan2sim.pipeline.io import views as views_io
+    from scan2sim.pipeline.types import Mesh, PointCloud, Trajectory
 
     folder = out / "pictures"
     folder.mkdir()
@@ -160,7 +160,7 @@ def bounds(parts: list[Any]) -> tuple[F64, F64]:
 
 def driver_pose(path: F64 | None, low: F64, high: F64, ground: Any) -> F64:
     """(4, 4) pose of an eye on the path, an eighth of it in, looking along it; without a path, along the tile."""
-    from pipeline.render import look_at
+    from scan2sim.pipeline.render import look_at
 
     if path is not None and len(path) > 1:
         inside = path[((path[:, :2] > low[:2]) & (path[:, :2] < high[:2])).all(axis=1)]
@@ -192,7 +192,7 @@ def ground_height(renderer: Any, point: F64, low: F64, high: F64) -> float:
 
 def bird_pose(low: F64, high: F64) -> F64:
     """(4, 4) pose of an eye above one end that overlooks the tile."""
-    from pipeline.render import look_at
+    from scan2sim.pipeline.render import look_at
 
     size = high - low
     along = 0 if size[0] >= size[1] else 1

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 
 from pydantic import Field
 
-from pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from pipeline.types import F32
+    from scan2sim.pipeline.types import F32
 
 CELL = 0.25  # metres, of the canopy raster
 
@@ -44,8 +44,8 @@ def plants(inputs: Inputs, params: PlantsParams, out: Path, report: Report) -> D
     """
     import numpy as np
 
-    from pipeline.cells import Cell
-    from pipeline.types import PointCloud
+    from scan2sim.pipeline.cells import Cell
+    from scan2sim.pipeline.types import PointCloud
 
     cloud, ground = PointCloud.load(inputs["vegetation"]), PointCloud.load(inputs["terrain"])
     found = crowns(cloud.xyz, ground.xyz, params) if len(cloud) else np.empty((0, 5))

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 from pydantic import Field
 
-from pipeline.errors import StepError
-from pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.errors import StepError
+from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
-    from pipeline.types import F32, I32
+    from scan2sim.pipeline.types import F32, I32
 
 MIN_POINTS = 50
 MARGIN = 1.02  # the octree's cube must be a little larger than the cloud
@@ -50,8 +50,8 @@ def poisson(inputs: Inputs, params: PoissonParams, out: Path, report: Report) ->
     """
     import numpy as np
 
-    from pipeline import isolate
-    from pipeline.types import Mesh, PointCloud
+    from scan2sim.pipeline import isolate
+    from scan2sim.pipeline.types import Mesh, PointCloud
 
     cloud = PointCloud.load(inputs["cloud"])
     if len(cloud) < MIN_POINTS:
@@ -74,7 +74,7 @@ def poisson(inputs: Inputs, params: PoissonParams, out: Path, report: Report) ->
     for threads, coarser in ((params.threads, 0), (1, 0), (1, 1)):
         try:
             vertices, faces, density = isolate.call(
-                "pipeline.steps.poisson:reconstruct",
+                "scan2sim.pipeline.steps.poisson:reconstruct",
                 *(xyz, normal, depth - coarser, scale, params.point_weight, threads),
                 timeout=params.timeout,
             )

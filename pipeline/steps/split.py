@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from pipeline.classes import CLASSES, GROUPS, NOISE, group_of
-from pipeline.errors import DataError
-from pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.classes import CLASSES, GROUPS, NOISE, group_of
+from scan2sim.pipeline.errors import DataError
+from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 
 class SplitParams(Params):
@@ -32,7 +32,7 @@ def split(inputs: Inputs, params: SplitParams, out: Path, report: Report) -> Don
     """
     import numpy as np
 
-    from pipeline.types import PointCloud
+    from scan2sim.pipeline.types import PointCloud
 
     cloud = PointCloud.load(inputs["cloud"])
     assert cloud.label is not None

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 from pydantic import Field
 
-from pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
-    from pipeline.types import F32
+    from scan2sim.pipeline.types import F32
 
 FULL_VOXELS = 1.4  # mean distance to six neighbours on a surface whose every voxel holds a point, in voxels
 
@@ -41,7 +41,7 @@ def trim(inputs: Inputs, params: TrimParams, out: Path, report: Report) -> Done:
     import numpy as np
     from scipy.spatial import cKDTree
 
-    from pipeline.types import Mesh, PointCloud
+    from scan2sim.pipeline.types import Mesh, PointCloud
 
     mesh, cloud = Mesh.load(inputs["mesh"]), PointCloud.load(inputs["cloud"])
     if len(mesh) == 0:

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
 
-from pipeline.errors import DataError, InputError
-from pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.errors import DataError, InputError
+from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
-    from pipeline.types import F32, View
+    from scan2sim.pipeline.types import F32, View
 
 REACH = 100.0  # metres; a photo further than this from every point sees nothing of the tile
 SAMPLE = 500_000  # points that are looked for in the photos
@@ -43,8 +43,8 @@ def views(inputs: Inputs, params: ViewsParams, out: Path, report: Report) -> Don
 
     import numpy as np
 
-    from pipeline.io import views as views_io
-    from pipeline.types import PointCloud
+    from scan2sim.pipeline.io import views as views_io
+    from scan2sim.pipeline.types import PointCloud
 
     clouds = [PointCloud.load(path).xyz for name, path in inputs.items() if name.startswith("cloud")]
     points = np.concatenate(clouds)
@@ -134,7 +134,7 @@ def _sees(view: View, points: F32) -> bool:
     """Whether any of the points (N, 3) is inside the image and within reach."""
     import numpy as np
 
-    from pipeline.cameras import project
+    from scan2sim.pipeline.cameras import project
 
     T_cam_world = np.linalg.inv(view.T_world_cam)
     local = points @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from pydantic import Field
 
-from pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 
 class VisibilityParams(Params):
@@ -30,9 +30,9 @@ def visibility(inputs: Inputs, params: VisibilityParams, out: Path, report: Repo
     """
     import numpy as np
 
-    from pipeline import visibility as kernel
-    from pipeline.io import views as views_io
-    from pipeline.types import Mesh, PointCloud
+    from scan2sim.pipeline import visibility as kernel
+    from scan2sim.pipeline.io import views as views_io
+    from scan2sim.pipeline.types import Mesh, PointCloud
 
     folder = out / "depth"
     folder.mkdir()

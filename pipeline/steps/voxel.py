@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 from pydantic import Field
 
-from pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
-    from pipeline.types import F32, PointCloud
+    from scan2sim.pipeline.types import F32, PointCloud
 
 
 class VoxelParams(Params):
@@ -33,8 +33,8 @@ def voxel(inputs: Inputs, params: VoxelParams, out: Path, report: Report) -> Don
     """
     import numpy as np
 
-    from pipeline.normals import oriented_normals
-    from pipeline.types import PointCloud, Trajectory
+    from scan2sim.pipeline.normals import oriented_normals
+    from scan2sim.pipeline.types import PointCloud, Trajectory
 
     cloud = PointCloud.load(inputs["cloud"])
     n = len(cloud)
@@ -59,7 +59,7 @@ def sample(cloud: PointCloud, size: float) -> PointCloud:
 
     import numpy as np
 
-    from pipeline.border import on_grid
+    from scan2sim.pipeline.border import on_grid
 
     if len(cloud) == 0:
         return cloud

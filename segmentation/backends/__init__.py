@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from pipeline.errors import SettingError
-from pipeline.types import F32, U8
+from scan2sim.pipeline.errors import SettingError
+from scan2sim.pipeline.types import F32, U8
 
 NAMES = ("street", "segformer", "onnx")
 
@@ -58,7 +58,7 @@ def load(name: str, weights: Path | None, device: str = "auto") -> Network:
     """
     if name not in NAMES:
         raise SettingError("label.network", f"there is no {name!r}", f"Choose one of: {', '.join(NAMES)}")
-    backend = importlib.import_module(f"segmentation.backends.{name}")
+    backend = importlib.import_module(f"scan2sim.segmentation.backends.{name}")
     missing = backend.available()
     if missing:
         raise SettingError("label.network", f"{name!r} can't run here: {missing}", f"Install {missing}")

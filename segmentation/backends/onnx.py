@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.errors import InputError, SettingError
-from pipeline.types import F32, U8
-from segmentation.backends import Facts
-from segmentation.backends.segformer import MEAN, STD, numbers
+from scan2sim.pipeline.errors import InputError, SettingError
+from scan2sim.pipeline.types import F32, U8
+from scan2sim.segmentation.backends import Facts
+from scan2sim.segmentation.backends.segformer import MEAN, STD, numbers
 
 FLOATS = {"tensor(float)": "float32", "tensor(float16)": "float16"}
 CUDA = "CUDAExecutionProvider"

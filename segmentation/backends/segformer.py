@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.errors import InputError, SettingError
-from pipeline.types import F32, U8
-from segmentation.backends import Facts, torch_device
+from scan2sim.pipeline.errors import InputError, SettingError
+from scan2sim.pipeline.types import F32, U8
+from scan2sim.segmentation.backends import Facts, torch_device
 
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 """Of ImageNet's red, green and blue, 1 for white: what nearly all networks were trained with."""

@@ -8,12 +8,12 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipeline.errors import InputError
-from pipeline.types import F32, U8
-from segmentation.backends import Facts, torch_device
+from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.types import F32, U8
+from scan2sim.segmentation.backends import Facts, torch_device
 
 if TYPE_CHECKING:
-    from segmentation.network import StreetNet
+    from scan2sim.segmentation.network import StreetNet
 
 OWN = Path(__file__).resolve().parent.parent / "weights" / "street.safetensors"
 
@@ -29,7 +29,7 @@ def save(network: StreetNet, path: Path, told: dict[str, object]) -> None:
     import torch
     from safetensors.torch import save_file
 
-    from segmentation.labels import CLASSES
+    from scan2sim.segmentation.labels import CLASSES
 
     halves = {
         name: value.half() if value.is_floating_point() else value for name, value in network.state_dict().items()
@@ -54,7 +54,7 @@ class Network:
     def __init__(self, path: Path, device: str) -> None:
         from safetensors import SafetensorError, safe_open
 
-        from segmentation.network import PIXELS_A_RADIAN, StreetNet
+        from scan2sim.segmentation.network import PIXELS_A_RADIAN, StreetNet
 
         remedy = "Give weights that `scan2sim segment train` wrote, or leave `label.weights` out"
         try:

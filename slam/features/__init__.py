@@ -16,8 +16,8 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.errors import SettingError, UnavailableError
-from pipeline.types import F32, U8
+from scan2sim.pipeline.errors import SettingError, UnavailableError
+from scan2sim.pipeline.types import F32, U8
 
 
 class Found(NamedTuple):
@@ -93,7 +93,7 @@ def named(
 def _module(name: str) -> Any:
     if name not in names():
         raise SettingError("slam.features", f"there is no {name!r}", f"Choose one of: {', '.join(names())}")
-    return importlib.import_module(f"slam.features.{name}")
+    return importlib.import_module(f"scan2sim.slam.features.{name}")
 
 
 def no_weights(name: str, weights: Path | None) -> None:

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.types import U8
-from slam import weights as files
-from slam.features import Found, enlarged, reduced, unmasked
-from slam.features.superpoint import local_maxima, strongest
+from scan2sim.pipeline.types import U8
+from scan2sim.slam import weights as files
+from scan2sim.slam.features import Found, enlarged, reduced, unmasked
+from scan2sim.slam.features.superpoint import local_maxima, strongest
 
 THRESHOLD, RADIUS, TEMPERATURE = 0.2, 2, 0.1
 """Least score, pixels between features, and how sharply a peak's place is averaged: as published."""

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.types import F64, U8
-from slam.features import Found, enlarged, no_weights, reduced, unmasked
+from scan2sim.pipeline.types import F64, U8
+from scan2sim.slam.features import Found, enlarged, no_weights, reduced, unmasked
 
 THRESHOLD = 7
 """Of FAST, grey values: low, as walls and roads have little contrast."""

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.types import U8
-from slam.features import Found, enlarged, no_weights, reduced, unmasked
+from scan2sim.pipeline.types import U8
+from scan2sim.slam.features import Found, enlarged, no_weights, reduced, unmasked
 
 CONTRAST = 0.02
 """Half of Lowe's: walls and roads have little."""

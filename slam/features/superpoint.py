@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.types import U8
-from slam import weights as files
-from slam.features import Found, enlarged, reduced, unmasked
+from scan2sim.pipeline.types import U8
+from scan2sim.slam import weights as files
+from scan2sim.slam.features import Found, enlarged, reduced, unmasked
 
 CELL = 8
 """Pixels a side, of the squares that a row of the network's output is about."""

@@ -5,10 +5,10 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from pipeline.errors import SettingError
+from scan2sim.pipeline.errors import SettingError
 
 if TYPE_CHECKING:
-    from slam.graph.problem import Backend
+    from scan2sim.slam.graph.problem import Backend
 
 BACKENDS = ("lm", "adam")
 
@@ -21,4 +21,4 @@ def backend_named(name: str) -> Backend:
     """
     if name not in BACKENDS:
         raise SettingError("backend", f"there is no `{name}`", f"Choose one of {', '.join(BACKENDS)}")
-    return import_module(f"slam.graph.{name}")  # type: ignore[return-value]
+    return import_module(f"scan2sim.slam.graph.{name}")  # type: ignore[return-value]

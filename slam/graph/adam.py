@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.errors import UnavailableError
-from slam.geometry import exp_so3
-from slam.graph.problem import Graph, Solution
+from scan2sim.pipeline.errors import UnavailableError
+from scan2sim.slam.geometry import exp_so3
+from scan2sim.slam.graph.problem import Graph, Solution
 
 POSE_ITERATIONS, WINDOW_ITERATIONS = 20, 180
 RATE = 0.02

@@ -12,9 +12,9 @@ import math
 import numpy as np
 from numba import njit
 
-from pipeline.types import F64
-from slam.geometry import exp_so3
-from slam.graph.problem import Graph, Solution
+from scan2sim.pipeline.types import F64
+from scan2sim.slam.geometry import exp_so3
+from scan2sim.slam.graph.problem import Graph, Solution
 
 ITERATIONS = 8
 ENOUGH = 1e-4

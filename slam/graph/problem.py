@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.types import F64, I32
+from scan2sim.pipeline.types import F64, I32
 
 Bools = npt.NDArray[np.bool_]
 
@@ -102,7 +102,7 @@ def errors(graph: Graph, poses: F64, points: F64, shared: F64 | None = None) -> 
     """(O,) radians between every observation and the direction of its point."""
     R, t = poses[graph.camera_of, :3, :3], poses[graph.camera_of, :3, 3]
     if graph.bend.shape[1] and shared is not None:
-        from slam.geometry import exp_so3
+        from scan2sim.slam.geometry import exp_so3
 
         moved = np.einsum("osk,s->ok", graph.bend, shared)
         t = t + moved[:, :3]

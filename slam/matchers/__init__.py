@@ -14,8 +14,8 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.errors import SettingError, UnavailableError
-from slam.features import Features, Found
+from scan2sim.pipeline.errors import SettingError, UnavailableError
+from scan2sim.slam.features import Features, Found
 
 I64 = npt.NDArray[np.int64]
 Sizes = tuple[tuple[int, int], tuple[int, int]]
@@ -93,7 +93,7 @@ def check(features: Features, matcher: Matcher) -> None:
 def _module(name: str) -> Any:
     if name not in names():
         raise SettingError("slam.matcher", f"there is no {name!r}", f"Choose one of: {', '.join(names())}")
-    return importlib.import_module(f"slam.matchers.{name}")
+    return importlib.import_module(f"scan2sim.slam.matchers.{name}")
 
 
 def mutual(scores: Any, least: float) -> I64:

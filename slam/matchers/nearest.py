@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from slam.features import Found, no_weights
-from slam.matchers import I64, Sizes
+from scan2sim.slam.features import Found, no_weights
+from scan2sim.slam.matchers import I64, Sizes
 
 RATIO = 0.9
 """Of the distance to the nearest to that of the second nearest. Looser than Lowe's 0.8: what stands in neighbouring

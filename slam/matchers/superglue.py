@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from slam import weights as files
-from slam.features import Found
-from slam.matchers import I64, Sizes, mutual
+from scan2sim.slam import weights as files
+from scan2sim.slam.features import Found
+from scan2sim.slam.matchers import I64, Sizes, mutual
 
 LAYERS, HEADS, DIM = 18, 4, 256
 """Layers look in turn within a picture and across."""

@@ -7,17 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from data_samples import gps, paths
-from data_samples.drive import generate_drive, row_poses
-from data_samples.ground import HALF
-from data_samples.panorama import GAIN, Panorama, Picture
-from data_samples.photos import directions
-from data_samples.planner import PLOT
-from data_samples.scene import srgb
-from data_samples.town import Town, build
-from data_samples.traffic import Traffic
-from pipeline.errors import SettingError
-from pipeline.types import F64, Camera, Trajectory
+from scan2sim.data_samples import gps, paths
+from scan2sim.data_samples.drive import generate_drive, row_poses
+from scan2sim.data_samples.ground import HALF
+from scan2sim.data_samples.panorama import GAIN, Panorama, Picture
+from scan2sim.data_samples.photos import directions
+from scan2sim.data_samples.planner import PLOT
+from scan2sim.data_samples.scene import srgb
+from scan2sim.data_samples.town import Town, build
+from scan2sim.data_samples.traffic import Traffic
+from scan2sim.pipeline.errors import SettingError
+from scan2sim.pipeline.types import F64, Camera, Trajectory
 
 H = 128
 CAMERA = Camera("equirectangular", 2 * H, H)

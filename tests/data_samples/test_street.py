@@ -9,17 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from data_samples import photos as photo_module
-from data_samples.layout import FRAME, Style, lay_out
-from data_samples.photos import Effects, directions
-from data_samples.scanner import plan_drive, scan
-from data_samples.scene import Scene
-from data_samples.street import generate
-from pipeline.classes import CODE
-from pipeline.errors import SettingError
-from pipeline.io import clouds
-from pipeline.io.tile import read_tile
-from pipeline.types import Camera, Mesh, PointCloud, Tile
+from scan2sim.data_samples import photos as photo_module
+from scan2sim.data_samples.layout import FRAME, Style, lay_out
+from scan2sim.data_samples.photos import Effects, directions
+from scan2sim.data_samples.scanner import plan_drive, scan
+from scan2sim.data_samples.scene import Scene
+from scan2sim.data_samples.street import generate
+from scan2sim.pipeline.classes import CODE
+from scan2sim.pipeline.errors import SettingError
+from scan2sim.pipeline.io import clouds
+from scan2sim.pipeline.io.tile import read_tile
+from scan2sim.pipeline.types import Camera, Mesh, PointCloud, Tile
 
 LENGTH, POINTS, PHOTOS, WIDTH = 10.0, 20_000, 4, 320
 

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline.io import las
-from pipeline.io.tile import read_tile
-from pipeline.types import Frame, PointCloud
+from scan2sim.pipeline.io import las
+from scan2sim.pipeline.io.tile import read_tile
+from scan2sim.pipeline.types import Frame, PointCloud
 from tests.conftest import ROOT
 from tests.gazebo.checker import check_world
 
@@ -27,7 +27,7 @@ SMALL = ["--set", "unwrap.texel=0.05", "--set", "decimate.target=10000"]
 def scan2sim(*arguments: object, timeout: float = 300) -> subprocess.CompletedProcess[str]:
     """Run the command."""
     return subprocess.run(
-        [sys.executable, "-m", "flows.cli", *map(str, arguments)],
+        [sys.executable, "-m", "scan2sim.flows.cli", *map(str, arguments)],
         cwd=ROOT,
         capture_output=True,
         text=True,
@@ -293,7 +293,7 @@ def test_a_full_disk(street: Path, tmp_path: Path, megabytes: int) -> None:
 
 
 def test_ctrl_c_ends_with_a_message_and_frees_the_folder(street: Path, tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "flows.cli", "run", str(street), "--out", str(tmp_path / "out"), *SMALL]
+    command = [sys.executable, "-m", "scan2sim.flows.cli", "run", str(street), "--out", str(tmp_path / "out"), *SMALL]
     child = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     while child.poll() is None and not (tmp_path / "out" / "steps" / "poisson.terrain").exists():
         time.sleep(0.02)
@@ -311,7 +311,7 @@ def test_ctrl_c_ends_with_a_message_and_frees_the_folder(street: Path, tmp_path:
     ],
 )
 def test_kill_9_at_any_step_then_resume(street: Path, tmp_path: Path, step: str) -> None:
-    command = [sys.executable, "-m", "flows.cli", "run", str(street), "--out", str(tmp_path / "out"), *SMALL]
+    command = [sys.executable, "-m", "scan2sim.flows.cli", "run", str(street), "--out", str(tmp_path / "out"), *SMALL]
     child = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     folder = tmp_path / "out" / "steps" / step
     while child.poll() is None and not folder.exists():

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from flows.execute import execute, locked
-from flows.planning import plan
-from pipeline.errors import BusyError, DataError, StepError
-from pipeline.store import Digests, Manifest, Store, digest
+from scan2sim.flows.execute import execute, locked
+from scan2sim.flows.planning import plan
+from scan2sim.pipeline.errors import BusyError, DataError, StepError
+from scan2sim.pipeline.store import Digests, Manifest, Store, digest
 from tests.conftest import ROOT
 from tests.flows.toy import chain
 

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from flows.execute import execute
-from flows.memory import parse, share
-from flows.planning import plan
-from pipeline.errors import SettingError
-from pipeline.store import Store
+from scan2sim.flows.execute import execute
+from scan2sim.flows.memory import parse, share
+from scan2sim.flows.planning import plan
+from scan2sim.pipeline.errors import SettingError
+from scan2sim.pipeline.store import Store
 from tests.conftest import ROOT
 from tests.flows.toy import chain
 
@@ -76,7 +76,7 @@ def test_a_killed_process_gives_its_share_back(tmp_path: Path) -> None:
 def test_steps_that_do_not_fit_together_run_one_after_the_other(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("flows.execute.need", lambda *_: 3.0)
+    monkeypatch.setattr("scan2sim.flows.execute.need", lambda *_: 3.0)
     (tmp_path / "source.txt").write_text("1")
     running, most = set(), []
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from flows.prepare import read_drive, survey_of
-from pipeline.errors import InputError
-from pipeline.io.survey import read_survey
+from scan2sim.flows.prepare import read_drive, survey_of
+from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.io.survey import read_survey
 
 
 @pytest.fixture
@@ -69,9 +69,9 @@ def test_what_no_drive_says_is_told(tmp_path: Path, text: str, told: str) -> Non
 
 
 def test_two_at_once_are_told(corridor: Path, tmp_path: Path) -> None:
-    from flows.execute import locked
-    from flows.prepare import PREPARED
-    from pipeline.errors import BusyError
+    from scan2sim.flows.execute import locked
+    from scan2sim.flows.prepare import PREPARED
+    from scan2sim.pipeline.errors import BusyError
 
     with locked(tmp_path / "out" / PREPARED), pytest.raises(BusyError):
         survey_of(corridor, tmp_path / "out")

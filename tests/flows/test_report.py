@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flows.planning import Planned
-from flows.recipe import Node
-from flows.report import telling, write_report
-from pipeline.io import image
-from pipeline.step import Done, Params, Step
-from pipeline.store import Manifest, Store
-from pipeline.types import Frame, Tile
+from scan2sim.flows.planning import Planned
+from scan2sim.flows.recipe import Node
+from scan2sim.flows.report import telling, write_report
+from scan2sim.pipeline.io import image
+from scan2sim.pipeline.step import Done, Params, Step
+from scan2sim.pipeline.store import Manifest, Store
+from scan2sim.pipeline.types import Frame, Tile
 
 PART = {"psnr_db": 20.12, "psnr_gain_db": 23.4, "ssim": 0.71, "pixels": 300}
 NOTHING = {"psnr_db": None, "psnr_gain_db": None, "ssim": None, "pixels": 0}

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.io import las
-from pipeline.io.tile import read_tile
-from segmentation.score import confusion
+from scan2sim.pipeline.io import las
+from scan2sim.pipeline.io.tile import read_tile
+from scan2sim.segmentation.score import confusion
 from tests.flows.test_cli import bad, good, scan2sim
 
 pytest.importorskip("torch", reason="torch is not installed (pip install 'scan2sim[segmentation]')")
@@ -75,7 +75,7 @@ def test_bad_weights_leave_earlier_results(small_street: Path, told: tuple[Path,
 
 
 def test_pixels_are_scored_against_labels(small_street: Path, tmp_path: Path) -> None:
-    from data_samples.street import generate
+    from scan2sim.data_samples.street import generate
 
     generate(tmp_path / "tile", length=10, points=20_000, photos=4, seed=8, photo_width=320, photo_labels=True)
     (tmp_path / "set").mkdir()

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from flows.recipe import PER_CLASS, STEPS
-from flows.settings import Settings
-from pipeline.errors import SettingError
-from pipeline.steps.decimate import DECIMATE
-from pipeline.steps.split import SPLIT
-from pipeline.steps.trim import TRIM
+from scan2sim.flows.recipe import PER_CLASS, STEPS
+from scan2sim.flows.settings import Settings
+from scan2sim.pipeline.errors import SettingError
+from scan2sim.pipeline.steps.decimate import DECIMATE
+from scan2sim.pipeline.steps.split import SPLIT
+from scan2sim.pipeline.steps.trim import TRIM
 
 
 def test_defaults_are_the_missions_numbers() -> None:

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flows import survey_report
-from flows.survey_report import TileState, overview, rows, write_survey_report
-from pipeline.cells import cells, outline
-from pipeline.errors import SpaceError
-from pipeline.io import image
+from scan2sim.flows import survey_report
+from scan2sim.flows.survey_report import TileState, overview, rows, write_survey_report
+from scan2sim.pipeline.cells import cells, outline
+from scan2sim.pipeline.errors import SpaceError
+from scan2sim.pipeline.io import image
 
 FIGURES: dict[str, Any] = {
     "points": 4_000_000, "photos": 30, "coverage": 0.8, "psnr_db": 22.0, "cloud_to_mesh_m": {"terrain": 0.011},

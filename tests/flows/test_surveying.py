@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from flows.cut import Options, cut_survey
-from pipeline.classes import GROUPS, group_of
-from pipeline.io import las
-from pipeline.io.tile import read_tile
-from pipeline.types import Mesh
+from scan2sim.flows.cut import Options, cut_survey
+from scan2sim.pipeline.classes import GROUPS, group_of
+from scan2sim.pipeline.io import las
+from scan2sim.pipeline.io.tile import read_tile
+from scan2sim.pipeline.types import Mesh
 from tests.flows.test_cli import SMALL, bad, good, scan2sim
 from tests.gazebo.checker import check_world
 
@@ -115,7 +115,7 @@ def contents(out: Path) -> dict[str, str]:
 
 
 def test_two_runs_do_not_share_a_store(survey: Path, made: Path) -> None:
-    from flows.execute import locked
+    from scan2sim.flows.execute import locked
 
     with locked(made):
         bad(scan2sim("survey", survey, "--out", made, *SMALL), 8, "another run")

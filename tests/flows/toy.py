@@ -8,9 +8,9 @@ import time
 from pathlib import Path
 from typing import Literal
 
-from flows.recipe import Node, Output
-from pipeline.errors import DataError
-from pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.flows.recipe import Node, Output
+from scan2sim.pipeline.errors import DataError
+from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 
 class ToyParams(Params):

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.io import crs
-from pipeline.types import Frame
+from scan2sim.pipeline.io import crs
+from scan2sim.pipeline.types import Frame
 from tests.gazebo.checker import Refused, check_world
 from tests.pipeline import made_up
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.io import crs
-from pipeline.io.worlds import TileWorld, assemble
+from scan2sim.pipeline.io import crs
+from scan2sim.pipeline.io.worlds import TileWorld, assemble
 from tests.gazebo.checker import check_world
 from tests.pipeline import made_up
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pipeline.step import Done, silent
-from pipeline.steps.collision import COLLISION, CollisionParams
-from pipeline.steps.export import EXPORT, ExportParams
-from pipeline.types import Frame, Mesh
+from scan2sim.pipeline.step import Done, silent
+from scan2sim.pipeline.steps.collision import COLLISION, CollisionParams
+from scan2sim.pipeline.steps.export import EXPORT, ExportParams
+from scan2sim.pipeline.types import Frame, Mesh
 
 UTM = Frame("EPSG:32632", (690_000.0, 5_335_000.0, 500.0))
 HOUSE = (4.0, 2.0)  # its corner of least x and y; it measures 3 x 2 x 5 m

@@ -10,24 +10,24 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline import border
-from pipeline.border import Clipped, Gap
-from pipeline.cells import Cell
-from pipeline.classes import CODE, GROUPS, group_of
-from pipeline.io import las
-from pipeline.step import Done, Step, silent
-from pipeline.steps.clip import CLIP
-from pipeline.steps.collision import COLLISION
-from pipeline.steps.decimate import DECIMATE, simplify
-from pipeline.steps.geometry import GEOMETRY
-from pipeline.steps.islands import ISLANDS
-from pipeline.steps.join import JOIN
-from pipeline.steps.overlap import OVERLAP
-from pipeline.steps.plants import PLANTS
-from pipeline.steps.poisson import POISSON
-from pipeline.steps.trim import TRIM
-from pipeline.steps.voxel import VOXEL, sample
-from pipeline.types import Frame, Mesh, PointCloud
+from scan2sim.pipeline import border
+from scan2sim.pipeline.border import Clipped, Gap
+from scan2sim.pipeline.cells import Cell
+from scan2sim.pipeline.classes import CODE, GROUPS, group_of
+from scan2sim.pipeline.io import las
+from scan2sim.pipeline.step import Done, Step, silent
+from scan2sim.pipeline.steps.clip import CLIP
+from scan2sim.pipeline.steps.collision import COLLISION
+from scan2sim.pipeline.steps.decimate import DECIMATE, simplify
+from scan2sim.pipeline.steps.geometry import GEOMETRY
+from scan2sim.pipeline.steps.islands import ISLANDS
+from scan2sim.pipeline.steps.join import JOIN
+from scan2sim.pipeline.steps.overlap import OVERLAP
+from scan2sim.pipeline.steps.plants import PLANTS
+from scan2sim.pipeline.steps.poisson import POISSON
+from scan2sim.pipeline.steps.trim import TRIM
+from scan2sim.pipeline.steps.voxel import VOXEL, sample
+from scan2sim.pipeline.types import Frame, Mesh, PointCloud
 from tests.conftest import ROOT
 
 X, Y, Z = 500_000.0, 5_400_000.0, 200.0  # the middle of the made-up scenes

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.cameras import inside, pixel_rays, project, unproject
-from pipeline.types import Camera
+from scan2sim.pipeline.cameras import inside, pixel_rays, project, unproject
+from scan2sim.pipeline.types import Camera
 
 K = (700.0, 690.0, 639.5, 359.5)
 CAMERAS = {

@@ -16,14 +16,14 @@ import numpy as np
 import pytest
 import tomli_w
 
-from flows import cut as cutting
-from flows.cut import Options, cut_survey
-from pipeline.cutting import members, seeds
-from pipeline.errors import DataError, InputError, SettingError
-from pipeline.io import clouds, las
-from pipeline.io.survey import Survey, read_survey
-from pipeline.io.tile import read_tile, write_tile
-from pipeline.types import Camera, Frame, PointCloud, Tile, Trajectory
+from scan2sim.flows import cut as cutting
+from scan2sim.flows.cut import Options, cut_survey
+from scan2sim.pipeline.cutting import members, seeds
+from scan2sim.pipeline.errors import DataError, InputError, SettingError
+from scan2sim.pipeline.io import clouds, las
+from scan2sim.pipeline.io.survey import Survey, read_survey
+from scan2sim.pipeline.io.tile import read_tile, write_tile
+from scan2sim.pipeline.types import Camera, Frame, PointCloud, Tile, Trajectory
 
 UTM = Frame("EPSG:32632", (690_000.0, 5_335_000.0, 500.0))
 FEET = Frame("EPSG:2994", (200_000.0, 300_000.0, 30.0), 0.3048)
@@ -493,7 +493,7 @@ def test_surveys_that_are_wrong_are_named(tmp_path: Path) -> None:
 def test_memory_does_not_grow_with_the_points(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = corridor(tmp_path / "corridor", n=6_000)
     part = points(20_000)
-    monkeypatch.setattr("pipeline.io.spool.CHUNK", 20_000)
+    monkeypatch.setattr("scan2sim.pipeline.io.spool.CHUNK", 20_000)
 
     def peak(parts: int) -> int:
         monkeypatch.setattr(cutting.clouds, "chunks", lambda *_: iter([part] * parts))

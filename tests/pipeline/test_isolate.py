@@ -8,8 +8,8 @@ import time
 
 import pytest
 
-from pipeline import isolate
-from pipeline.errors import StepError
+from scan2sim.pipeline import isolate
+from scan2sim.pipeline.errors import StepError
 
 HERE = "tests.pipeline.test_isolate"
 

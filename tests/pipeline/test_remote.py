@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from flows.execute import execute
-from flows.planning import plan
-from pipeline.errors import InputError, UnavailableError
-from pipeline.io.remote import CACHE, Remote, is_remote, likeness
-from pipeline.store import Store
+from scan2sim.flows.execute import execute
+from scan2sim.flows.planning import plan
+from scan2sim.pipeline.errors import InputError, UnavailableError
+from scan2sim.pipeline.io.remote import CACHE, Remote, is_remote, likeness
+from scan2sim.pipeline.store import Store
 from tests.flows.toy import chain
 
 

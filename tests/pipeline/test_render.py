@@ -4,10 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.cameras import project
-from pipeline.errors import InputError
-from pipeline.render import Body, Renderer, look_at, pinhole
-from pipeline.types import Camera, Frame, Mesh
+from scan2sim.pipeline.cameras import project
+from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.render import Body, Renderer, look_at, pinhole
+from scan2sim.pipeline.types import Camera, Frame, Mesh
 
 
 def square(size=4.0, z=0.0):
@@ -107,7 +107,7 @@ def test_more_rays_a_pixel_filter_what_is_finer_than_a_pixel(tmp_path):
 def test_a_picture_is_the_same_in_small_pieces(tmp_path, monkeypatch):
     camera, pose = pinhole(60, 40, field=90), look_at((0, -6, 1), (0, 0, 1))  # its upper rows see nothing
     whole = Renderer([checkered(tmp_path)]).view(camera, pose, samples=3)
-    monkeypatch.setattr("pipeline.render.CHUNK", 600)
+    monkeypatch.setattr("scan2sim.pipeline.render.CHUNK", 600)
     pieces = Renderer([checkered(tmp_path)]).view(camera, pose, samples=3)
     np.testing.assert_array_equal(whole.rgb, pieces.rgb)
     np.testing.assert_array_equal(whole.face, pieces.face)

@@ -13,11 +13,11 @@ import pystac
 import pytest
 from pystac.validation.stac_validator import JsonSchemaSTACValidator
 
-from pipeline.errors import DataError, InputError
-from pipeline.io import clouds, crs, las, stac
-from pipeline.io.stac import Cloud, TileItem
-from pipeline.store import digest
-from pipeline.types import Frame, PointCloud
+from scan2sim.pipeline.errors import DataError, InputError
+from scan2sim.pipeline.io import clouds, crs, las, stac
+from scan2sim.pipeline.io.stac import Cloud, TileItem
+from scan2sim.pipeline.store import digest
+from scan2sim.pipeline.types import Frame, PointCloud
 from tests.pipeline import made_up
 
 DATE = datetime(2024, 5, 17, tzinfo=UTC)

@@ -13,14 +13,21 @@ import pytest
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
-from flows.cli import app
-from pipeline.cameras import pixel_rays
-from pipeline.errors import DataError, InputError, ScanError, SettingError
-from pipeline.io import clouds, las
-from pipeline.io import trajectory as trajectory_io
-from pipeline.io.sweeps import Pictures, camera_of_photos, import_sweeps, read_camera, read_extrinsics, read_sweep
-from pipeline.io.tile import read_tile
-from pipeline.types import F64, Camera, Frame, PointCloud, Tile, Trajectory
+from scan2sim.flows.cli import app
+from scan2sim.pipeline.cameras import pixel_rays
+from scan2sim.pipeline.errors import DataError, InputError, ScanError, SettingError
+from scan2sim.pipeline.io import clouds, las
+from scan2sim.pipeline.io import trajectory as trajectory_io
+from scan2sim.pipeline.io.sweeps import (
+    Pictures,
+    camera_of_photos,
+    import_sweeps,
+    read_camera,
+    read_extrinsics,
+    read_sweep,
+)
+from scan2sim.pipeline.io.tile import read_tile
+from scan2sim.pipeline.types import F64, Camera, Frame, PointCloud, Tile, Trajectory
 
 LOW, HIGH = np.array([-8.0, -6.0, 0.0]), np.array([30.0, 6.0, 5.0])  # the hall
 PAINT = np.array([[250, 30, 30], [30, 250, 30], [30, 30, 250], [250, 250, 30], [30, 250, 250], [250, 30, 250]])
@@ -264,7 +271,7 @@ def test_a_projected_crs_keeps_its_large_coordinates(tmp_path: Path) -> None:
 def test_thinning_keeps_a_point_a_voxel(drive: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = cloud_of(import_sweeps(**drive.asked, out=tmp_path / "whole"))[2]
     thin = cloud_of(import_sweeps(**drive.asked, out=tmp_path / "thin", voxel=0.37))[2]
-    monkeypatch.setattr("pipeline.io.sweeps.PENDING", 20_000)  # the same on the way
+    monkeypatch.setattr("scan2sim.pipeline.io.sweeps.PENDING", 20_000)  # the same on the way
     often = cloud_of(import_sweeps(**drive.asked, out=tmp_path / "often", voxel=0.37))[2]
     origin = np.floor(drive.camera.positions[0])
     cells = [np.unique(np.floor((xyz - origin) / 0.37), axis=0) for xyz in (whole, thin)]

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from pipeline.errors import DataError, InputError, SettingError, SpaceError
-from pipeline.io import crs, trajectory
-from pipeline.types import Frame, Trajectory
+from scan2sim.pipeline.errors import DataError, InputError, SettingError, SpaceError
+from scan2sim.pipeline.io import crs, trajectory
+from scan2sim.pipeline.types import Frame, Trajectory
 
 UTM = Frame("EPSG:32633", (500_000.0, 5_400_000.0, 200.0))
 FEET = Frame("EPSG:2994", (200_000.0, 250_000.0, 100.0), 0.3048)

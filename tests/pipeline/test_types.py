@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.types import Camera, Frame, Mesh, PointCloud, Trajectory
+from scan2sim.pipeline.types import Camera, Frame, Mesh, PointCloud, Trajectory
 
 FRAME = Frame("EPSG:2154", (770500.0, 6277550.0, 20.0))
 

@@ -4,9 +4,9 @@ import numpy as np
 import open3d as o3d
 import pytest
 
-from pipeline.cameras import pixel_rays, project
-from pipeline.types import Camera, Frame, Mesh, PointCloud
-from pipeline.visibility import depth_map, scene, visible
+from scan2sim.pipeline.cameras import pixel_rays, project
+from scan2sim.pipeline.types import Camera, Frame, Mesh, PointCloud
+from scan2sim.pipeline.visibility import depth_map, scene, visible
 
 CAMERAS = {
     "pinhole": Camera("pinhole", 320, 240, 200.0, 200.0, 159.5, 119.5),

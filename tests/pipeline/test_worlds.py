@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.errors import DataError, InputError
-from pipeline.io import sdf, worlds
-from pipeline.io.worlds import TileWorld, assemble
-from pipeline.types import Frame
+from scan2sim.pipeline.errors import DataError, InputError
+from scan2sim.pipeline.io import sdf, worlds
+from scan2sim.pipeline.io.worlds import TileWorld, assemble
+from scan2sim.pipeline.types import Frame
 from tests.pipeline import made_up
 
 EAST = 25.0  # metres from one tile to the next

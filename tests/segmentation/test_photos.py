@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from pipeline.errors import InputError
-from pipeline.types import Camera
-from segmentation.backends import Facts
-from segmentation.labels import CLASSES, IGNORED, LABEL_SETS, code_of_index, index_of_code, mapped
-from segmentation.photos import OVERLAP, Labeller, labels_of
+from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.types import Camera
+from scan2sim.segmentation.backends import Facts
+from scan2sim.segmentation.labels import CLASSES, IGNORED, LABEL_SETS, code_of_index, index_of_code, mapped
+from scan2sim.segmentation.photos import OVERLAP, Labeller, labels_of
 
 PINHOLE = Camera("pinhole", 640, 480, 500.0, 500.0, 319.5, 239.5)
 PANORAMA = Camera("equirectangular", 1024, 512)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from segmentation.labels import CLASSES
-from segmentation.tidy import by_height, with_feet, without_specks
+from scan2sim.segmentation.labels import CLASSES
+from scan2sim.segmentation.tidy import by_height, with_feet, without_specks
 
 BUILDING, HIGH, LOW, ROAD = (CLASSES.index(n) for n in ("building", "high_vegetation", "low_vegetation", "road"))
 

@@ -6,23 +6,23 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.classes import CODE
-from pipeline.errors import InputError
-from pipeline.io import las
-from pipeline.io import views as views_io
-from pipeline.io.tile import read_tile
-from pipeline.step import silent
-from segmentation.label import LABEL
-from segmentation.labels import CLASSES, index_of_code
-from segmentation.score import confusion
-from segmentation.segment import SEGMENT
+from scan2sim.pipeline.classes import CODE
+from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.io import las
+from scan2sim.pipeline.io import views as views_io
+from scan2sim.pipeline.io.tile import read_tile
+from scan2sim.pipeline.step import silent
+from scan2sim.segmentation.label import LABEL
+from scan2sim.segmentation.labels import CLASSES, index_of_code
+from scan2sim.segmentation.score import confusion
+from scan2sim.segmentation.segment import SEGMENT
 
 
 @pytest.fixture(scope="module")
 def labelled(tmp_path_factory):
     """A street, its cloud without classes, its photos' true labels as probabilities; and the true classes."""
-    from data_samples.street import generate
-    from pipeline.types import PointCloud
+    from scan2sim.data_samples.street import generate
+    from scan2sim.pipeline.types import PointCloud
 
     folder = tmp_path_factory.mktemp("labelled")
     tile = read_tile(
@@ -45,7 +45,7 @@ def segment(folder, out, names=("views", "labels", "path"), **params):
     files = {"views": "views.json", "labels": "labels", "path": "path.npz"}
     inputs = {"cloud": folder / "cloud.npz"} | {name: folder / files[name] for name in names}
     done = SEGMENT.run(inputs, SEGMENT.params(**params), out, silent)
-    from pipeline.types import PointCloud
+    from scan2sim.pipeline.types import PointCloud
 
     with np.load(done.files["confidence"]) as beside:
         return PointCloud.load(done.files["cloud"]).label, dict(beside), done
@@ -93,7 +93,7 @@ def test_a_network_that_knows_only_vegetation_has_it_parted_by_height(labelled, 
     (labels / "network.json").write_text(json.dumps({"tells": [c for c in CLASSES if c != "low_vegetation"]}))
     inputs = {"cloud": folder / "cloud.npz", "views": folder / "views.json", "labels": labels}
     done = SEGMENT.run(inputs, SEGMENT.params(), tmp_path, silent)
-    from pipeline.types import PointCloud
+    from scan2sim.pipeline.types import PointCloud
 
     iou = confusion(truth, PointCloud.load(done.files["cloud"]).label).iou
     assert iou["low_vegetation"] > 0.5 and iou["high_vegetation"] > 0.85
@@ -110,7 +110,7 @@ def test_photos_without_overlap_leave_it_to_shape(labelled, tmp_path):
 
 
 def test_classes_that_are_there_are_kept_and_photos_not_looked_at(labelled, tmp_path):
-    from pipeline.types import PointCloud
+    from scan2sim.pipeline.types import PointCloud
 
     folder, truth = labelled
     cloud = PointCloud.load(folder / "cloud.npz")
@@ -132,7 +132,7 @@ def test_ground_codes_and_vehicles_have_their_own_classes(labelled, tmp_path):
 
 def test_weights_that_are_no_weights_are_named(tmp_path):
     pytest.importorskip("torch")
-    from segmentation.backends import load
+    from scan2sim.segmentation.backends import load
 
     with pytest.raises(InputError, match=r"no\.safetensors"):
         load("street", tmp_path / "no.safetensors")

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.cameras import pixel_rays
-from pipeline.io.video import Encoder
-from pipeline.types import Camera, Trajectory
-from slam.geometry import exp_so3
+from scan2sim.pipeline.cameras import pixel_rays
+from scan2sim.pipeline.io.video import Encoder
+from scan2sim.pipeline.types import Camera, Trajectory
+from scan2sim.slam.geometry import exp_so3
 
 HEIGHT, FPS, SECONDS, SPEED = 128, 10.0, 3.6, 6.0
 WIDE, LOW, HIGH = 4.0, -2.0, 5.0  # metres: half a corridor's width, its floor and its ceiling

@@ -6,10 +6,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from slam.geometry import exp_so3, rigid
-from slam.gps import GpsTrack
-from slam.odometry import Odometry, OdometryParams
-from slam.tracking import Tracks
+from scan2sim.slam.geometry import exp_so3, rigid
+from scan2sim.slam.gps import GpsTrack
+from scan2sim.slam.odometry import Odometry, OdometryParams
+from scan2sim.slam.tracking import Tracks
 
 CAMERA_TO_WORLD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # looks along +x, z up
 
@@ -104,7 +104,7 @@ def run(
     times: np.ndarray, follower: Follower, *, gps: GpsTrack | None = None, warn=lambda _: None, **params
 ) -> Odometry:  # type: ignore[no-untyped-def]
     """Odometry over a drive."""
-    from pipeline.types import Camera
+    from scan2sim.pipeline.types import Camera
 
     odometry = Odometry(
         Camera("equirectangular", 2048, 1024), OdometryParams(**params), tracker=follower, gps=gps, warn=warn

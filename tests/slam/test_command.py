@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-import slam.track
-from flows.cli import app
-from pipeline.errors import InputError, ScanError
-from pipeline.io import trajectory as trajectory_io
-from slam.odometry import Odometry, OdometryParams
-from slam.track import track
-from slam.video import open_video
+import scan2sim.slam.track as tracking
+from scan2sim.flows.cli import app
+from scan2sim.pipeline.errors import InputError, ScanError
+from scan2sim.pipeline.io import trajectory as trajectory_io
+from scan2sim.slam.odometry import Odometry, OdometryParams
+from scan2sim.slam.track import track
+from scan2sim.slam.video import open_video
 
 
 def command(*arguments):
@@ -61,7 +61,7 @@ def test_evaluate_prints_the_missions_errors(done, corridor, tmp_path):
 
 
 def test_an_interrupted_run_goes_on_and_ends_the_same(corridor, tmp_path, monkeypatch):
-    monkeypatch.setattr(slam.track, "KEEP_EVERY", 0.0)
+    monkeypatch.setattr(tracking, "KEEP_EVERY", 0.0)
     video, state = open_video(corridor.folder / "video.mp4"), tmp_path / "state"
     params = OdometryParams.model_validate({"features": 300})
 

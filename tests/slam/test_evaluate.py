@@ -11,10 +11,10 @@ import trimesh
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from pipeline.errors import DataError
-from pipeline.types import F64, Trajectory
-from slam.evaluate import evaluate, local, plot, umeyama, way, z_up
-from slam.gps import GpsTrack
+from scan2sim.pipeline.errors import DataError
+from scan2sim.pipeline.types import F64, Trajectory
+from scan2sim.slam.evaluate import evaluate, local, plot, umeyama, way, z_up
+from scan2sim.slam.gps import GpsTrack
 
 
 def yaw(degrees: float | F64) -> F64:

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.errors import InputError, SettingError, UnavailableError
-from slam import features, matchers, weights
-from slam.features import Found
+from scan2sim.pipeline.errors import InputError, SettingError, UnavailableError
+from scan2sim.slam import features, matchers, weights
+from scan2sim.slam.features import Found
 
 SIZE = (240, 320)
 
@@ -63,13 +63,13 @@ def loaded(name: str, folder: Path, real_data: Path | None) -> features.Features
     if features.missing(name):
         pytest.skip(f"{name} needs {features.missing(name)}")
     if name == "superpoint":
-        from slam.features.superpoint import MODEL
+        from scan2sim.slam.features.superpoint import MODEL
 
         return features.named(name, saved(folder / "superpoint_v1.pth", MODEL), count=500, device="cpu")
     if name == "aliked":
         file = real_data / "weights" / "aliked" / "aliked-t16.pth" if real_data else None
         if file is None or not file.is_file():
-            from slam.features.aliked import MODELS
+            from scan2sim.slam.features.aliked import MODELS
 
             file = saved(folder / "aliked.pth", MODELS[1])
         return features.named(name, file, count=500, device="cpu")
@@ -171,7 +171,7 @@ def test_aliked_with_real_weights_sees_a_turned_picture(real_data: Path) -> None
 
 def test_deformed_convolution_is_a_plain_one_without_shifts() -> None:
     torch = pytest.importorskip("torch")
-    from slam.features.aliked import deformed
+    from scan2sim.slam.features.aliked import deformed
 
     x, kernel = torch.randn(1, 5, 9, 13), torch.randn(7, 5, 3, 3)
     plain = torch.nn.functional.conv2d(x, kernel, padding=1)
@@ -186,7 +186,7 @@ def test_deformed_convolution_is_a_plain_one_without_shifts() -> None:
 
 def test_superpoint_agrees_with_transformers(tmp_path: Path) -> None:
     torch, hf = pytest.importorskip("torch"), pytest.importorskip("transformers")
-    from slam.features.superpoint import MODEL
+    from scan2sim.slam.features.superpoint import MODEL
 
     tensors = random_weights(MODEL)
     torch.save(tensors, tmp_path / "superpoint_v1.pth")
@@ -247,7 +247,7 @@ def agree(ours: Any, a: Found, b: Found, theirs: Any, share: Any) -> None:
 
 def test_superglue_agrees_with_transformers(tmp_path: Path) -> None:
     torch, hf = pytest.importorskip("torch"), pytest.importorskip("transformers")
-    from slam.matchers.superglue import MODEL
+    from scan2sim.slam.matchers.superglue import MODEL
 
     theirs = hf.SuperGlueForKeypointMatching(hf.SuperGlueConfig(matching_threshold=0.0)).eval()
     state = {k: v for k, v in theirs.state_dict().items() if not k.startswith("keypoint_detector")}
@@ -322,7 +322,7 @@ def test_lightglue_agrees_with_transformers(tmp_path: Path) -> None:
 
 def test_lightglue_for_aliked_takes_128_numbers(tmp_path: Path) -> None:
     pytest.importorskip("torch")
-    from slam.matchers.lightglue import _ALIKED
+    from scan2sim.slam.matchers.lightglue import _ALIKED
 
     ours = matchers.named("lightglue", saved(tmp_path / "aliked_lightglue.pth", _ALIKED), device="cpu")
     assert (ours.takes, ours.dimension) == ("aliked", 128)
@@ -347,8 +347,8 @@ class Bomb:
 
 def test_weights_of_the_wrong_model_name_both(tmp_path: Path) -> None:
     pytest.importorskip("torch")
-    from slam.features import aliked, superpoint
-    from slam.matchers import lightglue, superglue
+    from scan2sim.slam.features import aliked, superpoint
+    from scan2sim.slam.matchers import lightglue, superglue
 
     point, glue = saved(tmp_path / "p.pth", superpoint.MODEL), saved(tmp_path / "g.pth", superglue.MODEL)
     light, ali = saved(tmp_path / "l.pth", lightglue._SUPERPOINT), saved(tmp_path / "a.pth", aliked.MODELS[0])
@@ -365,7 +365,7 @@ def test_weights_of_the_wrong_model_name_both(tmp_path: Path) -> None:
 
 def test_weights_of_another_shape_or_unknown(tmp_path: Path) -> None:
     torch = pytest.importorskip("torch")
-    from slam.features.superpoint import MODEL
+    from scan2sim.slam.features.superpoint import MODEL
 
     file = tmp_path / "w.pth"
     tensors = random_weights(MODEL)
@@ -387,7 +387,7 @@ def test_damaged_missing_and_dangerous_files(tmp_path: Path) -> None:
     torch = pytest.importorskip("torch")
     from safetensors.torch import save_file
 
-    from slam.features.superpoint import MODEL
+    from scan2sim.slam.features.superpoint import MODEL
 
     with pytest.raises(SettingError, match="comes without weights. Give Magic Leap's superpoint_v1.pth"):
         features.named("superpoint")
@@ -415,7 +415,7 @@ def test_what_is_told_of_weights_and_files_that_change(tmp_path: Path) -> None:
     torch = pytest.importorskip("torch")
     import hashlib
 
-    from slam.features.superpoint import MODEL
+    from scan2sim.slam.features.superpoint import MODEL
 
     file = saved(tmp_path / "superpoint_v1.pth", MODEL)
     backend = features.named("superpoint", file, device="cpu")

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from pyproj import Geod, Transformer
 
-from pipeline.errors import InputError
-from pipeline.types import Frame
-from slam import gps
-from slam.gps import GpsTrack, gpmf_fixes, noise, read_gps, smooth, without_jumps
+from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.types import Frame
+from scan2sim.slam import gps
+from scan2sim.slam.gps import GpsTrack, gpmf_fixes, noise, read_gps, smooth, without_jumps
 
 START = datetime(2023, 6, 1, 23, 59, 58, tzinfo=UTC).timestamp()  # midnight comes after two seconds
 LAT, LON = 49.2, 16.6  # Brno, UTM 33

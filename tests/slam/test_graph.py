@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slam.geometry import exp_so3
-from slam.graph import BACKENDS, backend_named, lm
-from slam.graph.problem import Chord, Factor, Graph, errors
+from scan2sim.slam.geometry import exp_so3
+from scan2sim.slam.graph import BACKENDS, backend_named, lm
+from scan2sim.slam.graph.problem import Chord, Factor, Graph, errors
 
 
 def street(cameras=8, points=120, noise=5e-4, seed=0):

@@ -4,8 +4,8 @@ import itertools
 
 import numpy as np
 
-from slam.geometry import exp_so3, inverse, rigid
-from slam.loops import alike, pose_graph, thumbnail
+from scan2sim.slam.geometry import exp_so3, inverse, rigid
+from scan2sim.slam.loops import alike, pose_graph, thumbnail
 
 
 def ring(n=80, radius=30.0):

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.errors import SettingError
-from pipeline.types import F64, U8, Camera
-from slam import features, matchers
-from slam.charts import Charts
-from slam.features import Found
-from slam.geometry import exp_so3
-from slam.matching import MatchingTracker
+from scan2sim.pipeline.errors import SettingError
+from scan2sim.pipeline.types import F64, U8, Camera
+from scan2sim.slam import features, matchers
+from scan2sim.slam.charts import Charts
+from scan2sim.slam.features import Found
+from scan2sim.slam.geometry import exp_so3
+from scan2sim.slam.matching import MatchingTracker
 
 SPHERE = Camera("equirectangular", 512, 256)
 NUMBER = 400
@@ -25,7 +25,7 @@ def seen(camera: Camera, R: F64, seed: int = 0) -> U8:
     """(H, W) what a camera, turned by R (3, 3) to the world, sees of noise that fills the world."""
     from scipy.ndimage import map_coordinates
 
-    from pipeline.cameras import pixel_rays
+    from scan2sim.pipeline.cameras import pixel_rays
 
     rays = pixel_rays(camera).reshape(-1, 3) @ R.T
     rng = np.random.default_rng(seed)
@@ -110,7 +110,7 @@ def test_tracks_go_on_across_seam_and_poles(axis: tuple[float, float, float], st
 def test_real_panoramas_have_no_special_places(real_data: Path) -> None:
     import cv2
 
-    from pipeline.cameras import pixel_rays, project
+    from scan2sim.pipeline.cameras import pixel_rays, project
 
     file = real_data / "pano360" / "R0010118_20180720134544.JPG"
     if not file.is_file():
@@ -200,8 +200,8 @@ def test_a_matcher_made_for_other_features_is_refused() -> None:
 
 def test_superpoint_and_superglue_run_together(tmp_path: Path) -> None:
     pytest.importorskip("torch")
-    from slam.features.superpoint import MODEL
-    from slam.matchers.superglue import MODEL as GLUE
+    from scan2sim.slam.features.superpoint import MODEL
+    from scan2sim.slam.matchers.superglue import MODEL as GLUE
     from tests.slam.test_features import saved
 
     found = features.named("superpoint", saved(tmp_path / "superpoint_v1.pth", MODEL), count=100, device="cpu")

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from slam.evaluate import umeyama
-from slam.finish import finish
+from scan2sim.slam.evaluate import umeyama
+from scan2sim.slam.finish import finish
 from tests.slam.made_up import Follower, drive, gps_of, run, scatter
 
 

@@ -9,12 +9,12 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pipeline.cameras import inside, project
-from pipeline.errors import DataError
-from pipeline.io import trajectory as trajectory_io
-from pipeline.io.colmap import camera_of
-from pipeline.types import Camera, Frame, Trajectory
-from slam.output import SparseMap, write, write_colmap
+from scan2sim.pipeline.cameras import inside, project
+from scan2sim.pipeline.errors import DataError
+from scan2sim.pipeline.io import trajectory as trajectory_io
+from scan2sim.pipeline.io.colmap import camera_of
+from scan2sim.pipeline.types import Camera, Frame, Trajectory
+from scan2sim.slam.output import SparseMap, write, write_colmap
 
 UTM = Frame("EPSG:32633", (500_000.0, 5_400_000.0, 200.0))
 CAMERAS = {

@@ -13,13 +13,13 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.errors import InputError, SettingError
-from pipeline.types import Camera, Trajectory
-from slam import study as study_module
-from slam.gps import GpsTrack
-from slam.odometry import OdometryParams
-from slam.study import Cell, Result, Source, measure, study
-from slam.video import open_video
+from scan2sim.pipeline.errors import InputError, SettingError
+from scan2sim.pipeline.types import Camera, Trajectory
+from scan2sim.slam import study as study_module
+from scan2sim.slam.gps import GpsTrack
+from scan2sim.slam.odometry import OdometryParams
+from scan2sim.slam.study import Cell, Result, Source, measure, study
+from scan2sim.slam.video import open_video
 from tests.slam.conftest import Drive
 
 PARAMS = OdometryParams.model_validate({})

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from pipeline.cameras import pixel_rays, project
-from pipeline.types import Camera
-from slam.charts import Charts
-from slam.geometry import exp_so3, relative_pose, rigid
-from slam.tracking import Tracker
+from scan2sim.pipeline.cameras import pixel_rays, project
+from scan2sim.pipeline.types import Camera
+from scan2sim.slam.charts import Charts
+from scan2sim.slam.geometry import exp_so3, relative_pose, rigid
+from scan2sim.slam.tracking import Tracker
 
 CAMERA = Camera("equirectangular", 768, 384)
 

@@ -8,11 +8,11 @@ import av
 import numpy as np
 import pytest
 
-from pipeline.types import Camera
-from slam.odometry import Odometry, OdometryParams
-from slam.track import track
-from slam.video import open_video
-from slam.view import KNOWN, PATH, UNSURE, WIDTH, Recorder
+from scan2sim.pipeline.types import Camera
+from scan2sim.slam.odometry import Odometry, OdometryParams
+from scan2sim.slam.track import track
+from scan2sim.slam.video import open_video
+from scan2sim.slam.view import KNOWN, PATH, UNSURE, WIDTH, Recorder
 from tests.slam.conftest import FPS, Drive
 from tests.slam.made_up import Follower, drive, gps_of, scatter
 

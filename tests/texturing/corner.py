@@ -8,16 +8,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pipeline.io import views as views_io
-from pipeline.render import Body, Renderer, look_at, pinhole
-from pipeline.step import silent
-from pipeline.types import Camera, Frame, Mesh, PointCloud, View
-from pipeline.visibility import depth_map, scene
-from texturing.agreement import AGREEMENT
-from texturing.choose import CHOOSE
-from texturing.exposure import EXPOSURE
-from texturing.texture import TextureParams, texture
-from texturing.unwrap import UnwrapParams, unwrap
+from scan2sim.pipeline.io import views as views_io
+from scan2sim.pipeline.render import Body, Renderer, look_at, pinhole
+from scan2sim.pipeline.step import silent
+from scan2sim.pipeline.types import Camera, Frame, Mesh, PointCloud, View
+from scan2sim.pipeline.visibility import depth_map, scene
+from scan2sim.texturing.agreement import AGREEMENT
+from scan2sim.texturing.choose import CHOOSE
+from scan2sim.texturing.exposure import EXPOSURE
+from scan2sim.texturing.texture import TextureParams, texture
+from scan2sim.texturing.unwrap import UnwrapParams, unwrap
 
 
 def grid(corner, along, up, n=12):
@@ -59,7 +59,7 @@ def paint(xyz):
 
 def photograph(camera, pose, meshes=(GROUND, BOX), gain=1.0):
     """(H, W, 3) uint8: the paint as a camera sees it."""
-    from pipeline.cameras import pixel_rays
+    from scan2sim.pipeline.cameras import pixel_rays
 
     image = Renderer([Body(mesh) for mesh in meshes]).view(camera, pose)
     hit = pose[:3, 3] + (pixel_rays(camera) @ pose[:3, :3].T) * np.where(image.hit, image.range, 0)[..., None]

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.render import look_at
+from scan2sim.pipeline.render import look_at
 from tests.texturing.corner import CAMERAS, photograph, points
 from tests.texturing.test_texture import from_above
 
@@ -16,8 +16,8 @@ POSES = [look_at((-4, y, 1.8), (0, y / 2, 0.6)) for y in (-3.0, -1.5, 0.0, 1.5, 
 
 def grainy(pose):
     """A photo of the corner with a fine pattern on its ground: something to tell sharpness and displacement by."""
-    from pipeline.cameras import pixel_rays
-    from pipeline.render import Body, Renderer
+    from scan2sim.pipeline.cameras import pixel_rays
+    from scan2sim.pipeline.render import Body, Renderer
     from tests.texturing.corner import BOX, GROUND
 
     image = Renderer([Body(GROUND), Body(BOX)]).view(CAMERA, pose)

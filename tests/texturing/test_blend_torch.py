@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from pipeline.errors import InputError
-from pipeline.io import image
+from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.io import image
 from tests.texturing.corner import CAMERAS, POSES, photograph, points
 
 pytest.importorskip("torch", reason="torch is not installed (pip install 'scan2sim[gpu]')")

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.render import Image
-from texturing.evaluate import BAND_NAMES, BANDS, HeldOut, error_picture, errors, figures, psnr, score, tally
+from scan2sim.pipeline.render import Image
+from scan2sim.texturing.evaluate import BAND_NAMES, BANDS, HeldOut, error_picture, errors, figures, psnr, score, tally
 
 
 @pytest.fixture

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from pipeline.errors import InputError
-from pipeline.io import views as views_io
-from pipeline.step import silent
-from pipeline.visibility import depth_map, scene
+from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.io import views as views_io
+from scan2sim.pipeline.step import silent
+from scan2sim.pipeline.visibility import depth_map, scene
+from scan2sim.texturing.exposure import ExposureParams, exposure
+from scan2sim.texturing.photos import Exposures, camera_of
 from tests.texturing.corner import CAMERAS, POSES, photograph
-from texturing.exposure import ExposureParams, exposure
-from texturing.photos import Exposures, camera_of
 
 STOPS = [0.5, -0.7, 0.2, 0.0]
 

@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from texturing.labels import adjacent, label
+from scan2sim.texturing.labels import adjacent, label
 
 
 def energy(labels, view, cost, pairs, price):

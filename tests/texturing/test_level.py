@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from pipeline.errors import InputError
-from pipeline.io import image, textured
-from pipeline.step import silent
-from pipeline.types import Frame, Mesh
-from texturing import blend, fill
-from texturing.border_colours import GRID, border_step, changes, fade, meet, rim
-from texturing.level import LEVEL, LevelParams, level
+from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.io import image, textured
+from scan2sim.pipeline.step import silent
+from scan2sim.pipeline.types import Frame, Mesh
+from scan2sim.texturing import blend, fill
+from scan2sim.texturing.border_colours import GRID, border_step, changes, fade, meet, rim
+from scan2sim.texturing.level import LEVEL, LevelParams, level
 
 YS = np.append(np.arange(-3, 3, 0.3), 3)
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from pipeline.types import Mesh
+from scan2sim.pipeline.types import Mesh
+from scan2sim.texturing import photo_charts
 from tests.texturing.corner import BOX, GROUND, join
-from texturing import photo_charts
 
 CENTRES = np.array([[-4.0, -2.0, 1.8], [-4.0, 2.0, 1.8]])
 

@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.io import image, las
-from pipeline.render import look_at
-from pipeline.step import silent
-from pipeline.types import Frame, PointCloud
+from scan2sim.pipeline.io import image, las
+from scan2sim.pipeline.render import look_at
+from scan2sim.pipeline.step import silent
+from scan2sim.pipeline.types import Frame, PointCloud
+from scan2sim.texturing.score import ScoreParams, score
 from tests.texturing.corner import CAMERAS, POSES, Street, paint, points
-from texturing.score import ScoreParams, score
 
 
 def inputs_of(street):

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline.io import views as views_io
-from pipeline.render import Renderer, look_at, textured
-from pipeline.types import Frame, Mesh
+from scan2sim.pipeline.io import views as views_io
+from scan2sim.pipeline.render import Renderer, look_at, textured
+from scan2sim.pipeline.types import Frame, Mesh
 from tests.texturing.corner import BOX, CAMERAS, GROUND, POSES, paint, photograph, points
 
 LOW, HIGH = (-5, -5, 0), (5, 5, 3)

@@ -5,11 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from pipeline.step import silent
-from pipeline.types import Frame, Mesh
-from texturing import unwrap as unwrap_module
-from texturing.atlas import manifold
-from texturing.unwrap import UNWRAP, UnwrapParams, unwrap
+from scan2sim.pipeline.step import silent
+from scan2sim.pipeline.types import Frame, Mesh
+from scan2sim.texturing import unwrap as unwrap_module
+from scan2sim.texturing.atlas import manifold
+from scan2sim.texturing.unwrap import UNWRAP, UnwrapParams, unwrap
 
 
 def hills(n=24, cell=0.25, seed=0):

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from flows.execute import check_version, versions
-from pipeline.errors import UnavailableError, exit_code
+from scan2sim.flows.execute import check_version, versions
+from scan2sim.pipeline.errors import UnavailableError, exit_code
 from tests.conftest import ROOT
 from tests.flows.prefect.conftest import Server, free_port, kill, on, processes, serving, wait_for
 from tests.flows.prefect.toy_steps import planned
@@ -62,7 +62,7 @@ def test_all_deployments_and_automations_are_taken(server: Server) -> None:
             assert made["work_pool_name"] == pool
             assert set(made["job_variables"]) <= set(known)
             assert made["job_variables"]["env"]["PREFECT_FLOWS_HEARTBEAT_FREQUENCY"] == "30"
-            assert made["entrypoint"] == f"flows.{name}.{name}" and not made["pull_steps"]
+            assert made["entrypoint"] == f"scan2sim.flows.{name}.{name}" and not made["pull_steps"]
             assert not set(made["parameters"]) - set(made["parameter_openapi_schema"]["properties"])
     nightly = server.deployment("reprocess", "reprocess")
     assert nightly["parameters"]["source"] == "/data/drive" and nightly["parameters"]["out"] == "/data/worlds"
@@ -99,7 +99,7 @@ def test_a_server_that_is_away_is_named(tmp_path: Path) -> None:
     url = f"http://127.0.0.1:{free_port()}/api"
     command = ["survey", "data_samples/tile", "--out", str(tmp_path / "out"), "--runner", "dask"]
     run = subprocess.run(
-        [sys.executable, "-m", "flows.cli", *command],
+        [sys.executable, "-m", "scan2sim.flows.cli", *command],
         env=os.environ | {"PREFECT_API_URL": url, "PREFECT_HOME": str(tmp_path)},
         cwd=ROOT, capture_output=True, text=True,
     )  # fmt: skip

@@ -13,10 +13,10 @@ from typing import Any
 
 import pytest
 
-from flows.dispatch import dispatch
-from flows.execute import run_apart
-from flows.planning import Planned
-from pipeline.store import Store
+from scan2sim.flows.dispatch import dispatch
+from scan2sim.flows.execute import run_apart
+from scan2sim.flows.planning import Planned
+from scan2sim.pipeline.store import Store
 from tests.conftest import ROOT
 from tests.flows.prefect.conftest import Server, environment, kill, on, processes, wait_for
 from tests.flows.prefect.toy_steps import STEPS, planned
@@ -133,7 +133,17 @@ def test_a_killed_server_is_started_again_and_so_is_the_survey(survey: Survey, s
 def test_ctrl_c_ends_a_run_and_the_server_that_it_started(tmp_path: Path) -> None:
     """The terminal interrupts the server as well: Prefect can't be told any more."""
     out, log = tmp_path / "out", tmp_path / "log"
-    command = [sys.executable, "-m", "flows.cli", "survey", "data_samples/tile", "--out", str(out), "--runner", "dask"]
+    command = [
+        sys.executable,
+        "-m",
+        "scan2sim.flows.cli",
+        "survey",
+        "data_samples/tile",
+        "--out",
+        str(out),
+        "--runner",
+        "dask",
+    ]
     with open(log, "w") as file:
         process = subprocess.Popen(
             command, env=environment(tmp_path), cwd=ROOT, stdout=file, stderr=file, start_new_session=True

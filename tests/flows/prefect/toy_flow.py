@@ -6,21 +6,21 @@ import sys
 from pathlib import Path
 from unittest.mock import patch
 
-import flows.prefect_settings  # noqa: F401  # isort: skip
+import scan2sim.flows.prefect_settings  # noqa: F401  # isort: skip
 from prefect import flow
 from prefect.states import Completed, State
 
-from flows.execute import locked, versions
-from flows.tile import by_tasks
-from pipeline.errors import BusyError
-from pipeline.store import Store
+from scan2sim.flows.execute import locked, versions
+from scan2sim.flows.tile import by_tasks
+from scan2sim.pipeline.errors import BusyError
+from scan2sim.pipeline.store import Store
 from tests.flows.prefect.toy_steps import STEPS, planned
 
 
 def toy_tiles(folder: str, tiles: int, gate: str | None, runner: str, pretend: str | None) -> int:
     """All tiles; returns the sum of what came out."""
     failures: dict = {}
-    with patch("flows.tile.versions", lambda: versions() | ({"scan2sim": pretend} if pretend else {})):
+    with patch("scan2sim.flows.tile.versions", lambda: versions() | ({"scan2sim": pretend} if pretend else {})):
         run = by_tasks(runner, 2)
     done = run(planned(Path(folder), tiles, gate and Path(gate)), Store(Path(folder) / "steps"), failures)
     for error in failures.values():

@@ -7,10 +7,10 @@ import os
 import time
 from pathlib import Path
 
-from flows.planning import Planned, plan
-from flows.recipe import Node, Output
-from pipeline.step import Done, Inputs, Report, Step
-from pipeline.store import Store
+from scan2sim.flows.planning import Planned, plan
+from scan2sim.flows.recipe import Node, Output
+from scan2sim.pipeline.step import Done, Inputs, Report, Step
+from scan2sim.pipeline.store import Store
 from tests.flows.toy import ToyParams, toy
 
 STEPS = ("first", "second", "third")

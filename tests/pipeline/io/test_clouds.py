@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.errors import InputError
-from pipeline.io import clouds, las
-from pipeline.types import Frame, PointCloud
+from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.io import clouds, las
+from scan2sim.pipeline.types import Frame, PointCloud
 
 FRAME = Frame("EPSG:32632", (458_852.0, 5_428_637.0, 100.0))
 

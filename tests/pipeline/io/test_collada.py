@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.io import collada as dae
-from pipeline.io import textured
+from scan2sim.pipeline.io import collada as dae
+from scan2sim.pipeline.io import textured
 from tests.pipeline import made_up
 
 

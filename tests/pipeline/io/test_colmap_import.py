@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.cameras import project
-from pipeline.errors import InputError, SettingError
-from pipeline.io import clouds
-from pipeline.io.colmap import camera_of, import_colmap
-from pipeline.io.tile import read_tile
+from scan2sim.pipeline.cameras import project
+from scan2sim.pipeline.errors import InputError, SettingError
+from scan2sim.pipeline.io import clouds
+from scan2sim.pipeline.io.colmap import camera_of, import_colmap
+from scan2sim.pipeline.io.tile import read_tile
 
 pycolmap = pytest.importorskip("pycolmap")
 

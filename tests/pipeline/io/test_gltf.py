@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pipeline.io import gltf, textured
+from scan2sim.pipeline.io import gltf, textured
 from tests.pipeline import made_up
 
 

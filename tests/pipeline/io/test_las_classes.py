@@ -12,11 +12,11 @@ import pytest
 from laspy.vlrs.known import ExtraBytesStruct
 from pyproj import CRS
 
-from pipeline.classes import CLASSES
-from pipeline.errors import DataError, InputError, SpaceError, UnavailableError
-from pipeline.io import las, las_classes
-from pipeline.io.las_classes import write_classified
-from pipeline.types import U8, Frame
+from scan2sim.pipeline.classes import CLASSES
+from scan2sim.pipeline.errors import DataError, InputError, SpaceError, UnavailableError
+from scan2sim.pipeline.io import las, las_classes
+from scan2sim.pipeline.io.las_classes import write_classified
+from scan2sim.pipeline.types import U8, Frame
 
 N = 1000
 FRAME = Frame("EPSG:25832", (500_000.0, 5_400_000.0, 100.0))

@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.errors import InputError, SettingError
-from pipeline.io import clouds, las
-from pipeline.io.las_csv import import_las
-from pipeline.io.tile import read_tile
-from pipeline.types import Frame, PointCloud
+from scan2sim.pipeline.errors import InputError, SettingError
+from scan2sim.pipeline.io import clouds, las
+from scan2sim.pipeline.io.las_csv import import_las
+from scan2sim.pipeline.io.tile import read_tile
+from scan2sim.pipeline.types import Frame, PointCloud
 
 CAMERA = "model,width,height,fx,cx,cy,k1"
 VALUES = "opencv,64,48,50,31,23,-0.1"

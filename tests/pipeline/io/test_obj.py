@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.io import obj, textured
+from scan2sim.pipeline.io import obj, textured
 from tests.pipeline import made_up
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.io import sdf
-from pipeline.types import Frame
+from scan2sim.pipeline.io import sdf
+from scan2sim.pipeline.types import Frame
 from tests.pipeline import made_up
 
 

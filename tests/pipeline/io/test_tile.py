@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import tomli_w
 
-from pipeline.errors import InputError
-from pipeline.io import clouds, las
-from pipeline.io.tile import read_tile, write_tile
-from pipeline.types import Camera, Frame, PointCloud
+from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.io import clouds, las
+from scan2sim.pipeline.io.tile import read_tile, write_tile
+from scan2sim.pipeline.types import Camera, Frame, PointCloud
 
 FT_CRS = "EPSG:2994"  # Oregon Lambert, international feet
 

@@ -9,21 +9,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline import isolate
-from pipeline.classes import CODE
-from pipeline.errors import DataError, StepError
-from pipeline.io import las
-from pipeline.step import Done, Step, silent
-from pipeline.steps.decimate import DECIMATE, simplify
-from pipeline.steps.geometry import distances
-from pipeline.steps.ingest import INGEST
-from pipeline.steps.islands import ISLANDS
-from pipeline.steps.plants import PLANTS
-from pipeline.steps.poisson import POISSON, octree
-from pipeline.steps.split import SPLIT
-from pipeline.steps.trim import TRIM
-from pipeline.steps.voxel import VOXEL, sample
-from pipeline.types import Frame, Mesh, PointCloud, Trajectory
+from scan2sim.pipeline import isolate
+from scan2sim.pipeline.classes import CODE
+from scan2sim.pipeline.errors import DataError, StepError
+from scan2sim.pipeline.io import las
+from scan2sim.pipeline.step import Done, Step, silent
+from scan2sim.pipeline.steps.decimate import DECIMATE, simplify
+from scan2sim.pipeline.steps.geometry import distances
+from scan2sim.pipeline.steps.ingest import INGEST
+from scan2sim.pipeline.steps.islands import ISLANDS
+from scan2sim.pipeline.steps.plants import PLANTS
+from scan2sim.pipeline.steps.poisson import POISSON, octree
+from scan2sim.pipeline.steps.split import SPLIT
+from scan2sim.pipeline.steps.trim import TRIM
+from scan2sim.pipeline.steps.voxel import VOXEL, sample
+from scan2sim.pipeline.types import Frame, Mesh, PointCloud, Trajectory
 
 FRAME = Frame("EPSG:32633", (500000.0, 5400000.0, 200.0))
 

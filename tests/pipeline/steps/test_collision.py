@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.errors import DataError
-from pipeline.step import Done, silent
-from pipeline.steps.collision import COLLISION, CollisionParams
-from pipeline.types import Mesh
+from scan2sim.pipeline.errors import DataError
+from scan2sim.pipeline.step import Done, silent
+from scan2sim.pipeline.steps.collision import COLLISION, CollisionParams
+from scan2sim.pipeline.types import Mesh
 from tests.pipeline import made_up
 
 

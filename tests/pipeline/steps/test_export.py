@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline.errors import DataError, InputError, SettingError
-from pipeline.step import silent
-from pipeline.steps.export import EXPORT, ExportParams
-from pipeline.types import Frame, Mesh
+from scan2sim.pipeline.errors import DataError, InputError, SettingError
+from scan2sim.pipeline.step import silent
+from scan2sim.pipeline.steps.export import EXPORT, ExportParams
+from scan2sim.pipeline.types import Frame, Mesh
 from tests.pipeline import made_up
 
 

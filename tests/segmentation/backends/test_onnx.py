@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.errors import InputError, SettingError
-from segmentation.backends import load
+from scan2sim.pipeline.errors import InputError, SettingError
+from scan2sim.segmentation.backends import load
 
 pytest.importorskip("onnxruntime", reason="runs the networks")
 onnx = pytest.importorskip("onnx", reason="makes the networks")

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.errors import InputError, SettingError
-from segmentation.backends import load
-from segmentation.labels import CLASSES, mapped
+from scan2sim.pipeline.errors import InputError, SettingError
+from scan2sim.segmentation.backends import load
+from scan2sim.segmentation.labels import CLASSES, mapped
 
 torch = pytest.importorskip("torch", reason="SegFormer runs on torch")
 transformers = pytest.importorskip("transformers", reason="SegFormer is transformers'")

@@ -6,15 +6,15 @@ import pickle
 import numpy as np
 import pytest
 
-from pipeline.errors import DataError, InputError, SettingError
+from scan2sim.pipeline.errors import DataError, InputError, SettingError
 
 torch = pytest.importorskip("torch", reason="torch is not installed (pip install 'scan2sim[segmentation]')")
 safetensors = pytest.importorskip("safetensors.torch", reason="safetensors is not installed")
 
-from segmentation.backends import load  # noqa: E402
-from segmentation.backends.street import OWN, save  # noqa: E402
-from segmentation.labels import CLASSES  # noqa: E402
-from segmentation.network import StreetNet  # noqa: E402
+from scan2sim.segmentation.backends import load  # noqa: E402
+from scan2sim.segmentation.backends.street import OWN, save  # noqa: E402
+from scan2sim.segmentation.labels import CLASSES  # noqa: E402
+from scan2sim.segmentation.network import StreetNet  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +89,7 @@ def colourful(folder, n=6):
 
 
 def test_training_learns_and_repeats(tmp_path):
-    from segmentation.train import Recipe, train
+    from scan2sim.segmentation.train import Recipe, train
 
     folder = colourful(tmp_path / "set")
     recipe = Recipe(steps=60, batch=4, crop=(64, 96), held_out=0.2, rate=5e-3)
@@ -101,7 +101,7 @@ def test_training_learns_and_repeats(tmp_path):
 
 
 def test_a_folder_without_labels_is_named(tmp_path):
-    from segmentation.train import Recipe, train
+    from scan2sim.segmentation.train import Recipe, train
 
     with pytest.raises(DataError, match="images"):
         train(tmp_path, Recipe(steps=1))
