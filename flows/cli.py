@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 import typer
 from typer.core import TyperGroup
 
+from scan2sim import __version__
 from scan2sim.pipeline.errors import INTERRUPTED, ScanError, exit_code, from_os_error
 
 app = typer.Typer(
@@ -62,9 +63,7 @@ Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a tile tha
 
 def _version(wanted: bool) -> None:
     if wanted:
-        from importlib.metadata import version
-
-        typer.echo(f"scan2sim {version('scan2sim')}")
+        typer.echo(f"scan2sim {__version__}")
         raise typer.Exit
 
 

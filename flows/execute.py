@@ -21,6 +21,7 @@ from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import Any, Literal
 
+from scan2sim import __version__
 from scan2sim.flows.memory import need, share
 from scan2sim.flows.planning import Planned
 from scan2sim.flows.recipe import Node
@@ -266,8 +267,8 @@ def locked(folder: Path) -> Iterator[None]:
 @cache
 def versions() -> Mapping[str, str]:
     """Versions of Python, the project and what it computes with, for the report."""
-    names = ("scan2sim", "numpy", "open3d-cpu", "open3d", "xatlas", "pyfqmr", "laspy", "opencv-python-headless")
-    found = {"python": sys.version.split()[0]}
+    names = ("numpy", "open3d-cpu", "open3d", "xatlas", "pyfqmr", "laspy", "opencv-python-headless")
+    found = {"python": sys.version.split()[0], "scan2sim": __version__}
     for name in names:
         try:
             found[name] = importlib.metadata.version(name)

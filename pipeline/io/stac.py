@@ -8,7 +8,6 @@ it: STAC 1.0.0, the cloud as first asset, a path that begins with `./`, and boun
 from __future__ import annotations
 
 import functools
-import importlib.metadata
 import json
 import os
 import shutil
@@ -20,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from scan2sim import __version__
 from scan2sim.pipeline.errors import DataError, from_os_error
 from scan2sim.pipeline.io import las
 from scan2sim.pipeline.io.clouds import Header
@@ -193,7 +193,7 @@ def _item(tile: TileItem) -> pystac.Item:
         geometry,
         bbox,
         start,
-        {"processing:software": {"scan2sim": _version()}, "processing:lineage": tile.lineage},
+        {"processing:software": {"scan2sim": __version__}, "processing:lineage": tile.lineage},
         start_datetime=start,
         end_datetime=end,
         stac_extensions=[PROCESSING],
@@ -345,10 +345,3 @@ def _media_type(path: Path) -> str:
 
 def _encoding(path: Path) -> str:
     return ENCODINGS.get(path.suffix.lower(), "unknown")
-
-
-def _version() -> str:
-    try:
-        return importlib.metadata.version("scan2sim")
-    except importlib.metadata.PackageNotFoundError:
-        return "unknown"
