@@ -403,7 +403,7 @@ def import_sweeps_and_poses(
     time_offset: Annotated[float, typer.Option(help="Seconds to add to times of sweeps and photos.")] = 0.0,
     photos: Annotated[Path | None, typer.Option(help="Folder of photos: they colour the points.")] = None,
     photo_times: Annotated[Path | None, typer.Option(help="Of photos, likewise.")] = None,
-    camera: Annotated[str, typer.Option(help="auto, pinhole, equirectangular, or a TOML with [[cameras]].")] = "auto",
+    camera: Annotated[str, typer.Option(help="auto, pinhole, equirectangular, or a TOML like a tile's.")] = "auto",
     focal: Annotated[float | None, typer.Option(help="Pixels, of a pinhole camera.")] = None,
     centre: Annotated[tuple[float, float] | None, typer.Option(help="Pixels; default: the middle.")] = None,
     mask: Annotated[Path | None, typer.Option(help="Of all photos: 0 where the car itself is seen.")] = None,

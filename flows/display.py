@@ -12,6 +12,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.table import Column
 
 from scan2sim.flows.execute import Event
 from scan2sim.flows.recipe import Node
@@ -24,9 +25,11 @@ def _progress() -> Progress:
     return Progress(
         SpinnerColumn(),
         TextColumn("{task.description:<22}"),
-        BarColumn(bar_width=28),
+        BarColumn(bar_width=28, table_column=Column(no_wrap=True)),
         TimeElapsedColumn(),
-        TextColumn("[dim]{task.fields[message]}", markup=True),
+        # what is left of the line, so that long messages on narrow terminals take none of the bar's room
+        TextColumn("[dim]{task.fields[message]}", table_column=Column(ratio=1, no_wrap=True, overflow="ellipsis")),
+        expand=True,
         console=console,
         transient=True,
         disable=not console.is_terminal,

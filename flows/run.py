@@ -12,6 +12,7 @@ from pathlib import Path
 
 from rich.markup import escape
 
+from scan2sim.flows import gazebo
 from scan2sim.flows.display import RunDisplay, console
 from scan2sim.flows.execute import Event, Executor, execute, locked, versions
 from scan2sim.flows.planning import Planned, plan
@@ -64,7 +65,7 @@ def run_tile(
             report = write_report(tile, planned, done, store, out, seconds=time.perf_counter() - began)
         store.sweep({p.node.label: p.key for p in planned})
     show_warnings(done)
-    console.print(f"World:  {out / 'world'}\nReport: {report}", highlight=False, soft_wrap=True, markup=False)
+    show_results(out / "world" / f"{tile.name}.sdf", report)
     if missing == 0:
         console.print(
             f"[dim]nothing to do: all is as the tile and the settings say ({time.perf_counter() - began:.1f} s)"
@@ -95,6 +96,12 @@ def execute_shown(
         for line in told + [f"warning: {text}" for text in manifest.warnings]:
             log.write(f"{label}: {line}")
     return done
+
+
+def show_results(world: Path, report: Path) -> None:
+    """Where the world and the report are, and how to open them, on the screen."""
+    told = [*gazebo.lines(world), f"Report: {report}"]
+    console.print("\n".join(told), highlight=False, soft_wrap=True, markup=False)
 
 
 def show_warnings(done: dict[str, Manifest]) -> None:

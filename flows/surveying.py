@@ -17,7 +17,7 @@ from scan2sim.flows.memory import parse
 from scan2sim.flows.planning import Planned, plan
 from scan2sim.flows.prepare import survey_of
 from scan2sim.flows.recipe import survey_recipe
-from scan2sim.flows.run import STORE, Log, default_jobs, execute_shown
+from scan2sim.flows.run import STORE, Log, default_jobs, execute_shown, show_results
 from scan2sim.flows.settings import Settings
 from scan2sim.pipeline.errors import ScanError, SettingError, SpaceError, StepError, UnavailableError
 from scan2sim.pipeline.io.remote import Remote, is_remote, likeness
@@ -101,7 +101,7 @@ def make_survey(place: str | Path, target: str | Path, settings: Settings, run: 
             files = (path.relative_to(out) for path in sorted(out.rglob("*")) if path.is_file())
             results.push_all(file.as_posix() for file in files if file.parts[0] not in (STORE, ".lock"))
     kept = all(one.kept for one in made)
-    console.print(f"Report: {report}", highlight=False, soft_wrap=True, markup=False)
+    show_results(out / "world" / f"{survey.name}.sdf", report)
     if kept and not failed:
         console.print(f"[dim]nothing to do: all is as the survey says ({time.perf_counter() - began:.1f} s)")
     if failed:

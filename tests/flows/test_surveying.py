@@ -86,7 +86,8 @@ def test_gazebo_loads_all_tiles_as_one_world(made: Path) -> None:
 
 def test_an_unchanged_survey_is_left_as_it_is(survey: Path, made: Path) -> None:
     before = {path: path.stat().st_mtime_ns for path in (made / "steps").rglob("manifest.json")}
-    assert "nothing to do" in good(scan2sim("survey", survey, "--out", made, *SMALL))
+    said = good(scan2sim("survey", survey, "--out", made, *SMALL))
+    assert "nothing to do" in said and f"World:  {made / 'world'}" in said and f"Report: {made / 'survey.html'}" in said
     assert {path: path.stat().st_mtime_ns for path in (made / "steps").rglob("manifest.json")} == before
     assert {tile["state"] for tile in told(made)["tiles"].values()} == {"kept"}
 
