@@ -17,13 +17,14 @@ from scan2sim.slam.features import Found
 SIZE = (240, 320)
 
 
-@pytest.fixture(autouse=True, scope="module")
-def one_thread() -> None:
+@pytest.fixture(autouse=True)
+def one_thread_and_seed() -> None:
     """Tests run side by side; threads of torch that wait for each other would only slow them down."""
     if weights.missing() is None:
         import torch
 
         torch.set_num_threads(1)
+        torch.manual_seed(3)
 
 
 def picture(seed: int = 0, height: int = SIZE[0] + 32, width: int = SIZE[1] + 32) -> Any:
