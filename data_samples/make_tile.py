@@ -5,13 +5,12 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+from scan2sim.data_samples import SMALL
 from scan2sim.data_samples.photos import Effects
 from scan2sim.data_samples.street import generate
 
-TILE = Path(__file__).parent / "tile"
 
-
-def make(out: Path = TILE) -> Path:
+def make(out: Path = SMALL) -> Path:
     """Write the tile that `data_samples/README.md` describes; returns its `tile.toml`."""
     return generate(
         out,
@@ -28,4 +27,4 @@ def make(out: Path = TILE) -> Path:
 
 
 if __name__ == "__main__":
-    print(make(Path(sys.argv[1]) if len(sys.argv) > 1 else TILE))
+    print(make(Path(sys.argv[1]) if len(sys.argv) > 1 else SMALL))

@@ -173,18 +173,29 @@ def inspect(path: Annotated[Path, typer.Argument(help="A cloud, a tile, a mesh, 
 @app.command()
 def sample(
     out: Annotated[Path, typer.Argument(help="The tile's folder.")],
+    small: Annotated[bool, typer.Option("--small", help="The street of 26 m that comes along, at once.")] = False,
     length: Annotated[float, typer.Option(help="Metres of road.")] = 100.0,
     points: Annotated[float, typer.Option(help="Points of the cloud.")] = 9e6,
     photos: Annotated[int, typer.Option(help="Photos in all.")] = 40,
     seed: Annotated[int, typer.Option(help="Another seed, another street.")] = 0,
+    overwrite: Overwrite = False,
 ) -> None:
     """Generate a synthetic street with its ground truth."""
-    from scan2sim.data_samples.street import generate
     from scan2sim.flows.display import progress
+    from scan2sim.pipeline.io.importing import tile_folder
 
-    with progress("street") as report:
-        path = generate(out, length=length, points=points, photos=photos, seed=seed, report=report)
-    typer.echo(f"Tile: {path}")
+    with progress("street") as report, tile_folder(out, overwrite) as folder:
+        if small:
+            import shutil
+
+            from scan2sim.data_samples import SMALL
+
+            shutil.copytree(SMALL, folder, dirs_exist_ok=True)
+        else:
+            from scan2sim.data_samples.street import generate
+
+            generate(folder, length=length, points=points, photos=photos, seed=seed, report=report)
+    typer.echo(f"Tile: {out / 'tile.toml'}")
 
 
 @segments.command("tile")

@@ -103,9 +103,8 @@ def choose_views(
     report: Report,
 ) -> tuple[Choice, float]:
     """The choice for all faces, and the share of the edges' length that is a seam."""
-    import numpy as np
 
-    from scan2sim.texturing.labels import adjacent, label
+    from scan2sim.texturing.labels import label
     from scan2sim.texturing.select import Candidates
 
     best = Candidates(mesh.corners, mesh.face_normal, params.views_per_face)
@@ -116,15 +115,23 @@ def choose_views(
             mask=mask(i, views[i]), factor=sharpness(i),
         )  # fmt: skip
     report(0.7, "seams")
-    pairs, edge = adjacent(mesh.faces)
-    length = np.linalg.norm(mesh.vertices[edge[:, 0]] - mesh.vertices[edge[:, 1]], axis=1)
-    price = (params.smoothness * length / max(float(np.median(length)) if len(length) else 1.0, 1e-9)).astype(
-        np.float32
-    )
-    chosen = label(best.view, best.quality, pairs, np.minimum(price, 4 * params.smoothness).astype(np.float32))
+    pairs, length, price = seams(mesh, params.smoothness)
+    chosen = label(best.view, best.quality, pairs, price)
     apart = (chosen[pairs[:, 0]] != chosen[pairs[:, 1]]) & (chosen[pairs] >= 0).all(axis=1)
     share = float(length[apart].sum() / max(float(length.sum()), 1e-9))
     return Choice(best.view, best.quality, chosen), round(share, 4)
 
 
-CHOOSE = Step("choose", 1, choose, ChooseParams)
+def seams(mesh: Mesh, smoothness: float) -> tuple[I32, F32, F32]:
+    """Neighbouring faces (E, 2), the lengths (E,) of their edges in metres, and what a seam there costs (E,)."""
+    import numpy as np
+
+    from scan2sim.texturing.labels import adjacent
+
+    pairs, edge = adjacent(mesh.faces)
+    length = np.linalg.norm(mesh.vertices[edge[:, 0]] - mesh.vertices[edge[:, 1]], axis=1)
+    median = max(float(np.median(length)) if len(length) else 1.0, 1e-9)
+    return pairs, length, (smoothness * np.minimum(length / median, 4)).astype(np.float32)
+
+
+CHOOSE = Step("choose", 2, choose, ChooseParams)
