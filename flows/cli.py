@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -371,9 +372,12 @@ def import_colmap_model(
     typer.echo(f"Tile: {path}")
 
 
-@imports.command("las")
-def import_las_files(
-    clouds: Annotated[list[Path], typer.Argument(help="LAS, LAZ, COPC or PLY files.")],
+@imports.command("las", hidden=True)  # what it was called when it read LAS and PLY alone
+@imports.command("clouds")
+def import_plain_clouds(
+    clouds: Annotated[
+        list[Path], typer.Argument(help="LAS, LAZ, COPC, PLY, E57, PCD, XYZ, CSV files, or an ept.json.")
+    ],
     out: TileOut,
     photos: Annotated[Path | None, typer.Option(help="CSV of photos and poses (docs/formats.md).")] = None,
     cameras: Annotated[Path | None, typer.Option(help="CSV of cameras, where the photos' lacks them.")] = None,
@@ -389,12 +393,13 @@ def import_las_files(
     from scan2sim.flows.display import progress
     from scan2sim.pipeline.io.las_csv import import_las
 
+    told: list[str] = []
     with progress("import") as report:
         path = import_las(
             clouds, out, photos=photos, cameras=cameras, images=images, crs=crs, units=units, trajectory=trajectory,
-            name=name, link=link, overwrite=overwrite, report=report,
+            name=name, link=link, overwrite=overwrite, warn=told.append, report=report,
         )  # fmt: skip
-    typer.echo(f"Tile: {path}")
+    _imported(path, told)
 
 
 @imports.command("sweeps")
@@ -454,7 +459,11 @@ def import_sweeps_and_poses(
             deskew="kitti" if deskew == "kitti" else "none", period=period, voxel=voxel, keep_unsure=keep_unsure,
             crs=crs or "local", name=name, link=link, overwrite=overwrite, warn=told.append, report=report,
         )  # fmt: skip
-    for warning in told:
+    _imported(path, told)
+
+
+def _imported(path: Path, warnings: Sequence[str] = ()) -> None:
+    for warning in warnings:
         typer.secho(f"warning: {warning}", fg="yellow", err=True)
     typer.echo(f"Tile: {path}")
 

@@ -32,9 +32,13 @@ def inspect_path(path: Path) -> None:
 
 
 def _reader(path: Path) -> Callable[[Path], tuple[str, Facts]]:
+    from scan2sim.pipeline.io import clouds
+
     if not path.exists():
         raise InputError(path, "is missing", "Mend the name")
     if path.is_dir():
+        if (path / "ept.json").is_file():
+            return lambda p: _cloud(p / "ept.json")
         if (path / "tile.toml").is_file():
             return _tile
         if (path / "world").is_dir():
@@ -43,9 +47,11 @@ def _reader(path: Path) -> Callable[[Path], tuple[str, Facts]]:
             return lambda p: _world(_sdf(p))
         raise InputError(path, "holds neither tile.toml nor a world", "Name a cloud, a tile, a mesh or a world")
     readers = {
-        ".toml": _tile, ".las": _cloud, ".laz": _cloud, ".sdf": _world, ".npz": _result,
+        **dict.fromkeys(clouds.FORMATS, _cloud), ".toml": _tile, ".sdf": _world, ".npz": _result,
         ".obj": _mesh, ".dae": _mesh, ".glb": _mesh, ".ply": _ply,
     }  # fmt: skip
+    if path.name in readers:
+        return readers[path.name]
     if path.suffix.lower() not in readers:
         raise InputError(path, f"is of no known kind ({path.suffix or 'no suffix'})", f"Known: {' '.join(readers)}")
     return readers[path.suffix.lower()]
@@ -76,6 +82,7 @@ def _cloud(path: Path) -> tuple[str, Facts]:
         ("extent", _bounds(header.low, header.high)),
         ("density", f"{header.count / area:,.1f} per square unit of its bounding box"),
         ("colours", "yes" if cloud.rgb is not None else "no"),
+        *(("assumed", note) for note in header.notes),
     ]
     if cloud.time is not None and len(cloud):
         facts.append(("GPS time", f"{cloud.time.min():.3f} to {cloud.time.max():.3f} s"))

@@ -1,45 +1,79 @@
-"""Point cloud files: LAS, LAZ and COPC through laspy, PLY through trimesh."""
+"""Point cloud files: one module a format, found by its name; each says whether it can run here.
+
+A format's module has `read_header(path) -> (count, low, high, crs[, notes])`, `read(path, frame)` and
+`chunks(path, frame, size)`, and, where it needs more than the project's own dependencies, `available()`: what to
+install, or None.
+"""
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-import numpy as np
-
-from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.io import las, ply
+from scan2sim.pipeline.errors import InputError, UnavailableError
 from scan2sim.pipeline.types import F64, Frame, PointCloud
+
+CHUNK = 2_000_000
+FORMATS = {
+    ".las": "las", ".laz": "las", ".ply": "ply", ".e57": "e57", ".pcd": "pcd",
+    ".xyz": "xyz", ".csv": "xyz", ".txt": "xyz", ".asc": "xyz", "ept.json": "ept",
+}  # fmt: skip
+"""Suffixes (and the one name) of cloud files, and the modules of `pipeline.io` that read them."""
+AS_THEY_ARE = (".las", ".laz", ".ply")
+"""What is taken into a tile as it is; clouds of other formats become LAZ there (`scan2sim import clouds`)."""
+KNOWN = "LAS, LAZ, COPC, PLY, E57, PCD, XYZ (.xyz .csv .txt .asc) or EPT (its ept.json)"
 
 
 @dataclass(frozen=True)
 class Header:
-    """What a cloud file says of itself: number of points, bounds (CRS units, float64), CRS as WKT or None."""
+    """What a cloud file says of itself.
+
+    Attributes:
+        count: number of points.
+        low, high: (3,) bounds, CRS units, float64.
+        crs: as WKT, or None.
+        notes: what had to be assumed to read it, for the user.
+    """
 
     count: int
     low: F64
     high: F64
     crs: str | None
+    notes: tuple[str, ...] = ()
 
 
-READERS = {".las": las, ".laz": las, ".ply": ply}
+def known(path: Path) -> bool:
+    """Whether a file's name is that of a cloud."""
+    return path.suffix.lower() in FORMATS or path.name in FORMATS
 
 
-def _reader(path: Path):  # type: ignore[no-untyped-def]  # a module
-    try:
-        return READERS[path.suffix.lower()]
-    except KeyError:
-        raise InputError(
-            path, f"is no known cloud format ({path.suffix or 'no suffix'})", "Use LAS, LAZ, COPC or PLY"
-        ) from None
+def missing(suffix: str) -> str | None:
+    """What to install so that a format (a key of `FORMATS`) can be read here, or None."""
+    module = importlib.import_module(f"scan2sim.pipeline.io.{FORMATS[suffix]}")
+    found: str | None = module.available() if hasattr(module, "available") else None
+    return found
+
+
+def _reader(path: Path) -> Any:
+    key = path.name if path.name in FORMATS else path.suffix.lower()
+    if key not in FORMATS:
+        raise InputError(path, f"is no known cloud format ({path.suffix or 'no suffix'})", f"Use {KNOWN}")
+    if path.is_dir():
+        raise InputError(path, "is a folder, not a cloud", "Name a file")
+    lacking = missing(key)
+    if lacking:
+        raise UnavailableError(path, f"needs {lacking}", f"pip install '{lacking}'")
+    return importlib.import_module(f"scan2sim.pipeline.io.{FORMATS[key]}")
 
 
 def read_header(path: Path) -> Header:
     """Number of points, bounds and CRS, without reading the points where the format allows it.
 
     Raises:
-        InputError: missing, truncated, or of an unknown format.
+        InputError: missing, truncated, or of an unknown format. UnavailableError: its library isn't installed.
     """
     return Header(*_reader(path).read_header(path))
 
@@ -48,12 +82,13 @@ def read(path: Path, frame: Frame) -> PointCloud:
     """Read a cloud into `frame`'s local coordinates.
 
     Raises:
-        InputError: missing, truncated, or of an unknown format.
+        InputError: missing, truncated, or of an unknown format. UnavailableError: its library isn't installed.
     """
-    return _reader(path).read(path, frame)
+    cloud: PointCloud = _reader(path).read(path, frame)
+    return cloud
 
 
-def chunks(path: Path, frame: Frame, size: int = las.CHUNK) -> Iterator[PointCloud]:
+def chunks(path: Path, frame: Frame, size: int = CHUNK) -> Iterator[PointCloud]:
     """A cloud's points in their order, `size` at a time; a PLY file's all at once.
 
     Args:
@@ -63,10 +98,6 @@ def chunks(path: Path, frame: Frame, size: int = las.CHUNK) -> Iterator[PointClo
 
     Raises:
         InputError: missing, truncated (on reaching the end), or of an unknown format.
+        UnavailableError: its library isn't installed.
     """
-    if _reader(path) is las:
-        yield from las.chunks(path, frame, size)
-    else:
-        header = read_header(path)
-        x, y, z = np.floor((header.low + header.high) / 2 * frame.unit).tolist()
-        yield read(path, replace(frame, origin=(x, y, z)))
+    yield from _reader(path).chunks(path, frame, size)

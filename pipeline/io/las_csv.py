@@ -1,4 +1,4 @@
-"""Plain clouds (LAS, LAZ, COPC, PLY) with a CSV of posed photos as a tile.
+"""Plain clouds (of any format of `pipeline.io.clouds`) with a CSV of posed photos as a tile.
 
 The photos' CSV has a heading, one row a photo, columns in any order, commas between them:
 
@@ -23,7 +23,7 @@ is (0, 0).
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
@@ -32,10 +32,11 @@ import numpy as np
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.io import clouds as cloud_io
 from scan2sim.pipeline.io import crs as crs_io
+from scan2sim.pipeline.io import las
 from scan2sim.pipeline.io.importing import place, tile_folder
 from scan2sim.pipeline.io.tile import read_tile, tile_name, write_tile
 from scan2sim.pipeline.step import Report, silent
-from scan2sim.pipeline.types import F64, Camera, CameraModel
+from scan2sim.pipeline.types import F64, Camera, CameraModel, Frame
 
 Row = Mapping[str, str]
 MATRIX = tuple(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3))
@@ -58,12 +59,14 @@ def import_las(
     link: bool = False,
     overwrite: bool = False,
     name: str | None = None,
+    warn: Callable[[str], None] = lambda _: None,
     report: Report = silent,
 ) -> Path:
     """Make a tile of clouds and, optionally, posed photos.
 
     Args:
-        clouds: LAS, LAZ, COPC or PLY files in one CRS.
+        clouds: files in one CRS. LAS, LAZ and PLY files are taken as they are; of others, a LAZ file is made, whose
+            coordinates are whole millimetres.
         out: the tile's folder to make.
         photos: CSV of posed photos, as above.
         cameras: CSV of cameras, where the photos' rows don't hold them.
@@ -72,24 +75,30 @@ def import_las(
         units: "m", "ft" or "us-ft", where the CRS doesn't say it.
         trajectory: CSV of the scanner's path: a heading, then time,x,y,z a line.
         link: link to clouds and photos instead of copying them.
+        warn: receives what was assumed of clouds that don't say it.
 
     Returns:
         Path of the `tile.toml`.
 
     Raises:
         InputError: a file is missing or wrong, or there is no CRS. SettingError: `out` is not empty.
+        UnavailableError: a format's library isn't installed.
     """
     headers = [cloud_io.read_header(Path(cloud)) for cloud in clouds]
     if crs is None and any(h.crs is None for h in headers):
         bare = next(cloud for cloud, h in zip(clouds, headers, strict=True) if h.crs is None)
         raise InputError(bare, "has no CRS", "Name it: a code as EPSG:32633, or `local` for no georeference")
-    known, _ = crs_io.common(Path("tile.toml"), crs, units, clouds, headers)
+    known, unit = crs_io.common(Path("tile.toml"), crs, units, clouds, headers)
+    for cloud, header in zip(clouds, headers, strict=True):
+        for note in header.notes:
+            warn(f"{cloud}: {note}")
     shots, rigs = read_photos(photos, cameras) if photos else ([], {})
     base = images or (photos.parent if photos else Path())
     with tile_folder(out, overwrite) as folder:
+        files = []
         for i, cloud in enumerate(clouds):
             report(0.5 * i / len(clouds), f"cloud {Path(cloud).name}")
-            place(Path(cloud), folder, Path(cloud).name, link)
+            files.append(_take(Path(cloud), folder, Frame(known, unit=unit), link))
         for i, shot in enumerate(shots):
             report(0.5 + 0.5 * i / len(shots), f"photo {shot['file']}")
             for key, where in (("file", "photos"), ("mask", "masks")):
@@ -99,7 +108,7 @@ def import_las(
             folder,
             name=tile_name(name or Path(out).name),
             crs=_short(known),
-            clouds=[Path(cloud).name for cloud in clouds],
+            clouds=files,
             cameras=rigs,
             photos=shots,
             trajectory=place(trajectory, folder, "trajectory.csv", link) if trajectory else None,
@@ -108,6 +117,17 @@ def import_las(
         read_tile(folder)  # what it refuses is refused here, before the tile appears
     report(1.0, "done")
     return Path(out) / "tile.toml"
+
+
+def _take(cloud: Path, folder: Path, frame: Frame, link: bool) -> str:
+    """The name in the tile of a cloud that was copied or linked there, or written anew as LAZ."""
+    if cloud.suffix.lower() in cloud_io.AS_THEY_ARE:
+        return place(cloud, folder, cloud.name, link)
+    name = f"{cloud.resolve().parent.name if cloud.name == 'ept.json' else cloud.stem}.laz"
+    if (folder / name).exists():
+        raise InputError(cloud, f"is the second cloud to be called {name} in the tile", "Rename one of them")
+    las.write_parts(folder / name, cloud_io.chunks(cloud, frame))
+    return name
 
 
 def read_photos(photos: Path, cameras: Path | None = None) -> tuple[list[dict[str, Any]], dict[str, Camera]]:

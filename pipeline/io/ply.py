@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -49,3 +51,10 @@ def read(path: Path, frame: Frame) -> PointCloud:
         (np.asarray(data[n]).ravel().astype(np.uint8) for n in ("classification", "class", "label") if n in names), None
     )
     return PointCloud(frame, xyz, rgb, label=label)
+
+
+def chunks(path: Path, frame: Frame, size: int) -> Iterator[PointCloud]:
+    """All points at once: PLY is read as a whole."""
+    _, low, high, _ = read_header(path)
+    x, y, z = np.floor((low + high) / 2 * frame.unit).tolist()
+    yield read(path, replace(frame, origin=(x, y, z)))

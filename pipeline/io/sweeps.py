@@ -22,12 +22,14 @@ import numpy.typing as npt
 from pydantic import ValidationError
 
 from scan2sim.pipeline.errors import DataError, InputError, SettingError
+from scan2sim.pipeline.io import clouds as cloud_io
 from scan2sim.pipeline.io import crs as crs_io
 from scan2sim.pipeline.io import las
 from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.io.image import read_rgb
 from scan2sim.pipeline.io.importing import place, tile_folder
 from scan2sim.pipeline.io.merging import borrow_colours, colour, interpolate, phase_of, read_bin, thin
+from scan2sim.pipeline.io.points import sixteen_bits
 from scan2sim.pipeline.io.tile import DISTORTION_LENGTHS, CameraEntry, read_tile, tile_name, write_tile
 from scan2sim.pipeline.step import Report, silent
 from scan2sim.pipeline.types import F32, F64, U8, Camera, Frame, PointCloud, Trajectory
@@ -524,18 +526,18 @@ def read_sweep(path: Path) -> tuple[F32, npt.NDArray[np.uint16], U8 | None]:
     if kind == ".bin":
         xyz, reflectance = read_bin(path)
         return xyz, _sixteen_bits(reflectance), None
-    if kind in (".las", ".laz"):
-        cloud = las.read(path, Frame())
+    if kind == ".ply":
+        xyz, levels, rgb = _read_open3d(path)
+    else:
+        cloud = cloud_io.read(path, Frame())
         xyz, rgb = cloud.xyz, cloud.rgb
         levels = np.zeros(len(xyz), np.uint16) if cloud.intensity is None else cloud.intensity
-    else:
-        xyz, levels, rgb = _read_open3d(path)
     finite = np.isfinite(xyz).all(axis=1)
     return xyz[finite], levels[finite], None if rgb is None else rgb[finite]
 
 
 def _read_open3d(path: Path) -> tuple[F32, npt.NDArray[np.uint16], U8 | None]:
-    """PCD and PLY, with their intensities, which trimesh doesn't read."""
+    """PLY, with its intensities, which trimesh doesn't read."""
     import open3d as o3d
 
     remedy = "Copy it again, or write it as .bin or .laz"
@@ -557,10 +559,8 @@ def _read_open3d(path: Path) -> tuple[F32, npt.NDArray[np.uint16], U8 | None]:
 
 def _sixteen_bits(levels: npt.NDArray[Any]) -> npt.NDArray[np.uint16]:
     """Intensities in 0 to 1, in 0 to 255, or larger, to 0 to 65535."""
-    values = np.nan_to_num(levels.astype(np.float64))
-    top = values.max(initial=0)
-    factor = 65535 if top <= 1 else 257 if top <= 255 else 1
-    return np.clip(np.rint(values * factor), 0, 65535).astype(np.uint16)
+    scaled = sixteen_bits(levels, float(np.nan_to_num(levels).max(initial=0)))
+    return np.zeros(len(levels), np.uint16) if scaled is None else scaled
 
 
 class _Merged:

@@ -4,7 +4,7 @@
 name = "my_street"
 crs = "EPSG:32633"          # code or WKT; "local" without georeference; default: the clouds' own
 units = "m"                 # "ft", "us-ft"; default: as the CRS says, else metres
-clouds = ["cloud.laz"]      # LAS, LAZ, COPC, PLY; coordinates in that CRS and unit
+clouds = ["cloud.laz"]      # LAS, LAZ, COPC, PLY, E57, PCD, XYZ, CSV; coordinates in that CRS and unit
 trajectory = "path.csv"     # optional: the scanner's path, time,x,y,z or with rotations (.csv, .tum)
 
 [[cameras]]
@@ -118,7 +118,7 @@ def read_tile(path: Path) -> Tile:
     """
     path = path / "tile.toml" if path.is_dir() else path
     spec = _parse(path)
-    clouds = tuple(_existing(path, name, "clouds") for name in spec.clouds)
+    clouds = tuple(_cloud(path, name) for name in spec.clouds)
     headers = [cloud_io.read_header(cloud) for cloud in clouds]
     crs, unit = crs_io.common(path, spec.crs, spec.units, clouds, headers)
     low = np.min([h.low for h in headers], axis=0) * unit
@@ -206,6 +206,13 @@ def _existing(tile: Path, name: str, field: str) -> Path:
     path = tile.parent / name
     if not path.is_file():
         raise InputError(path, f"is missing (named under `{field}` of {tile.name})", "Put it there, or mend the name")
+    return path
+
+
+def _cloud(tile: Path, name: str) -> Path:
+    path = _existing(tile, name, "clouds")
+    if path.name == "ept.json":  # whose points are in other files: a change of them would go unnoticed
+        raise InputError(path, "is an index of many files", "`scan2sim import clouds` makes one LAZ file of it")
     return path
 
 

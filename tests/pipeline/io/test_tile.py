@@ -94,7 +94,7 @@ def test_what_write_tile_writes_read_tile_reads(tmp_path: Path) -> None:
         ({"clouds": ["none.laz"]}, r"none\.laz: is missing.*Put it there, or mend the name"),
         ({"clouds": ["bare.laz"]}, r'bare\.laz: has no CRS, and the tile names none.*crs = "local"'),
         ({"clouds": ["cloud.laz", "lambert.laz"]}, r"lambert\.laz: is in EPSG:2154, but cloud\.laz is in EPSG:32632"),
-        ({"clouds": ["cloud.xyz"]}, r"cloud\.xyz: is no known cloud format.*LAS, LAZ, COPC or PLY"),
+        ({"clouds": ["cloud.shp"]}, r"cloud\.shp: is no known cloud format.*LAS, LAZ, COPC, PLY"),
         ({"clouds": ["text.laz"]}, r"text\.laz: is no readable LAS file.*again"),
         ({"trajectory": "bad.csv"}, r"bad\.csv: is no trajectory.*time,x,y,z"),
     ],
@@ -102,7 +102,7 @@ def test_what_write_tile_writes_read_tile_reads(tmp_path: Path) -> None:
 def test_bad_tiles_are_refused_by_name(tmp_path: Path, changes: dict, message: str) -> None:
     cloud(tmp_path / "bare.laz", crs="local")
     cloud(tmp_path / "lambert.laz", crs="EPSG:2154")
-    (tmp_path / "cloud.xyz").write_text("0 0 0")
+    (tmp_path / "cloud.shp").write_text("0 0 0")
     (tmp_path / "text.laz").write_text("no cloud")
     (tmp_path / "bad.csv").write_text("time,x,y,z\n1,2\n")
     with pytest.raises(InputError, match=message):

@@ -1,0 +1,429 @@
+"""One contract for all cloud formats: what other programs would write is read back as it was."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from scan2sim.flows.cli import app
+from scan2sim.pipeline.errors import InputError, ScanError, UnavailableError
+from scan2sim.pipeline.io import clouds, las
+from scan2sim.pipeline.io.las_csv import import_las
+from scan2sim.pipeline.io.tile import read_tile, write_tile
+from scan2sim.pipeline.types import Frame, PointCloud
+from tests.pipeline.io.test_clouds import FRAME, made, write_ply
+
+N = 1000
+
+
+def write_las(path: Path, cloud: PointCloud) -> None:
+    las.write(path, cloud)
+
+
+def write_copc(path: Path, cloud: PointCloud) -> None:
+    copclib = pytest.importorskip("copclib", reason="COPC files are written by copclib")
+    from pyproj import CRS
+
+    xyz = cloud.frame.to_crs(cloud.xyz)
+    low = xyz.min(axis=0)
+    config = copclib.CopcConfigWriter(7, [0.001] * 3, np.floor(low).tolist(), CRS(cloud.frame.crs).to_wkt("WKT1_GDAL"))
+    header = config.las_header
+    header.min, header.max = copclib.Vector3(*low), copclib.Vector3(*xyz.max(axis=0))
+    writer = copclib.FileWriter(str(path), config)
+    half = len(cloud) // 2  # in the root node, and below it
+    middle = low + header.Span() / 2
+    for key, some in (((0, 0, 0, 0), np.arange(half)), ((1, 0, 0, 0), np.arange(half, len(cloud)))):
+        points = copclib.Points(header)
+        for i in some:
+            point = points.CreatePoint()
+            point.x, point.y, point.z = xyz[i]
+            point.red, point.green, point.blue = (int(v) * 257 for v in cloud.rgb[i])
+            point.classification, point.intensity = int(cloud.label[i]), int(cloud.intensity[i])
+            point.gps_time = cloud.time[i]
+            points.AddPoint(point)
+        writer.AddNode(copclib.VoxelKey(*key), points)
+    assert (middle > low).all()
+    writer.Close()
+
+
+def write_e57(path: Path, cloud: PointCloud) -> None:
+    """Two scans, each in axes of its own; single precision, as pye57 writes."""
+    pye57 = pytest.importorskip("pye57", reason="E57 files are written by pye57")
+    from scipy.spatial.transform import Rotation
+
+    file = pye57.E57(str(path), mode="w")
+    for some, angle in ((slice(0, 400), 0.3), (slice(400, None), -1.2)):
+        part, turn = cloud.take(some), Rotation.from_rotvec([0.1, angle, 0.2])
+        at = np.array(cloud.frame.origin) + [3.0, 2.0, 1.0]
+        own = turn.inv().apply(part.frame.to_crs(part.xyz) - at)
+        x, y, z, w = turn.as_quat()
+        data = {f"cartesian{axis}": own[:, i] for i, axis in enumerate("XYZ")}
+        data |= {f"color{name}": part.rgb[:, i] for i, name in enumerate(("Red", "Green", "Blue"))}
+        data["intensity"] = part.intensity / 65535.0
+        limits = type("Limits", (), {"intensityMinimum": 0.0, "intensityMaximum": 1.0})()
+        for axis, low, high in zip("xyz", own.min(axis=0), own.max(axis=0), strict=True):
+            setattr(limits, f"{axis}Minimum", low), setattr(limits, f"{axis}Maximum", high)
+        file.write_scan_raw(data, rotation=np.array([w, x, y, z]), translation=at, scan_header=limits)
+    file.close()
+
+
+def pcd(data: str, double: bool = True) -> Callable[[Path, PointCloud], None]:
+    def write(path: Path, cloud: PointCloud) -> None:
+        places = [(axis, "<f8" if double else "<f4") for axis in "xyz"]
+        row = np.dtype([*places, ("rgb", "<u4"), ("_", "V3"), ("label", "u1"), ("intensity", "<u2")])
+        rows = np.zeros(len(cloud), row)
+        for i, axis in enumerate("xyz"):
+            rows[axis] = cloud.frame.to_crs(cloud.xyz)[:, i] if double else cloud.xyz[:, i]
+        red, green, blue = cloud.rgb.astype(np.uint32).T
+        rows["rgb"] = red << 16 | green << 8 | blue
+        rows["label"], rows["intensity"] = cloud.label, cloud.intensity
+        write_pcd(path, rows, data)
+
+    return write
+
+
+def write_pcd(path: Path, rows: np.ndarray, data: str, count: int | None = None) -> None:
+    kinds = {"f": "F", "u": "U", "i": "I", "V": "U"}
+    names = rows.dtype.names
+    types = [rows.dtype[name] for name in names]
+    n = len(rows) if count is None else count
+    head = "\n".join(
+        [
+            "# .PCD v0.7 - Point Cloud Data file format",
+            "VERSION 0.7",
+            f"FIELDS {' '.join(names)}",
+            f"SIZE {' '.join('1' if t.kind == 'V' else str(t.itemsize) for t in types)}",
+            f"TYPE {' '.join(kinds[t.kind] for t in types)}",
+            f"COUNT {' '.join(str(t.itemsize) if t.kind == 'V' else '1' for t in types)}",
+            f"WIDTH {n}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {n}\nDATA {data}\n",
+        ]
+    )
+    if data == "ascii":
+        cells = {name: rows[name].tolist() for name in names}
+        cells |= {name: ["0 0 0"] * len(rows) for name in names if name == "_"}
+        lines = [" ".join(str(cells[name][i]) for name in names) for i in range(len(rows))]
+        path.write_text(head + "\n".join(lines) + "\n")
+    elif data == "binary":
+        path.write_bytes(head.encode() + rows.tobytes())
+    else:
+        plain = b"".join(rows[name].tobytes() for name in names)
+        packed = lzf(plain)
+        path.write_bytes(head.encode() + struct.pack("<II", len(packed), len(plain)) + packed)
+
+
+def lzf(plain: bytes) -> bytes:
+    """Lehmann's LZF, greedy: back references of three bytes and more, found by a table of triples."""
+    out, literal, seen, i = bytearray(), bytearray(), {}, 0
+
+    def flush() -> None:
+        for at in range(0, len(literal), 32):
+            some = literal[at : at + 32]
+            out.append(len(some) - 1)
+            out.extend(some)
+        literal.clear()
+
+    while i < len(plain):
+        triple = plain[i : i + 3]
+        back = i - seen.get(triple, i)
+        seen[triple] = i
+        if len(triple) == 3 and 0 < back <= 8192:
+            length = 3
+            while length < 264 and i + length < len(plain) and plain[i + length] == plain[i - back + length]:
+                length += 1
+            flush()
+            short = length - 2
+            out.append(min(short, 7) << 5 | (back - 1) >> 8)
+            if short >= 7:
+                out.append(short - 7)
+            out.append((back - 1) & 255)
+            i += length
+        else:
+            literal.append(plain[i])
+            i += 1
+    flush()
+    return bytes(out)
+
+
+def text(delimiter: str, heading: str | None, wide: bool = False) -> Callable[[Path, PointCloud], None]:
+    def write(path: Path, cloud: PointCloud) -> None:
+        rows = [heading] if heading else []
+        colours = cloud.rgb.astype(int) * (257 if wide else 1)
+        for place, rgb, intensity, label in zip(
+            cloud.frame.to_crs(cloud.xyz), colours, cloud.intensity, cloud.label, strict=True
+        ):
+            rows.append(delimiter.join([*(f"{v:.4f}" for v in place), *map(str, rgb), str(intensity), str(label)]))
+        path.write_text("\n".join(rows) + "\n")
+
+    return write
+
+
+def ept(kind: str) -> Callable[[Path, PointCloud], None]:
+    """An octree of a root and two nodes, the second of which is in a hierarchy file of its own."""
+
+    def write(path: Path, cloud: PointCloud) -> None:
+        from pyproj import CRS
+
+        places = {"type": "signed", "size": 4, "scale": 0.001}
+        schema = [
+            *({"name": axis, "offset": float(o), **places} for axis, o in zip("XYZ", FRAME.origin, strict=True)),
+            *({"name": name, "type": "unsigned", "size": 2} for name in ("Intensity", "Red", "Green", "Blue")),
+            {"name": "Classification", "type": "unsigned", "size": 1},
+            {"name": "GpsTime", "type": "float", "size": 8},
+        ]
+        for folder in ("ept-data", "ept-hierarchy"):
+            (path.parent / folder).mkdir(parents=True)
+        nodes = {"0-0-0-0": slice(0, 300), "1-0-0-0": slice(300, 700), "1-1-0-1": slice(700, None)}
+        for key, some in nodes.items():
+            part = cloud.take(some)
+            file = path.parent / "ept-data" / key
+            if kind == "laszip":
+                las.write(file.with_suffix(".laz"), part)
+                continue
+            sizes = {"signed": "i", "unsigned": "u", "float": "f"}
+            rows = np.zeros(len(part), [(d["name"], f"<{sizes[d['type']]}{d['size']}") for d in schema])
+            for i, axis in enumerate("XYZ"):
+                rows[axis] = np.rint(part.xyz[:, i].astype(float) / 0.001)
+            for i, name in enumerate(("Red", "Green", "Blue")):
+                rows[name] = part.rgb[:, i].astype(np.uint16) * 257
+            rows["Intensity"], rows["Classification"], rows["GpsTime"] = part.intensity, part.label, part.time
+            if kind == "binary":
+                file.with_suffix(".bin").write_bytes(rows.tobytes())
+            else:
+                zstandard = pytest.importorskip("zstandard", reason="zstd tiles are written by zstandard")
+                file.with_suffix(".zst").write_bytes(zstandard.ZstdCompressor().compress(rows.tobytes()))
+        first, second = {"0-0-0-0": 300, "1-0-0-0": 400, "1-1-0-1": -1}, {"1-1-0-1": len(cloud) - 700}
+        (path.parent / "ept-hierarchy" / "0-0-0-0.json").write_text(json.dumps(first))
+        (path.parent / "ept-hierarchy" / "1-1-0-1.json").write_text(json.dumps(second))
+        srs = {"authority": "EPSG", "horizontal": "32632", "wkt": CRS(FRAME.crs).to_wkt()}
+        info = {"version": "1.1.0", "dataType": kind, "hierarchyType": "json", "points": len(cloud), "span": 128}
+        path.write_text(json.dumps(info | {"schema": schema, "srs": srs}))
+
+    return write
+
+
+@dataclass(frozen=True)
+class Format:
+    """A file, who writes it, and what it keeps: metres of precision, attributes, the CRS."""
+
+    file: str
+    write: Callable[[Path, PointCloud], None]
+    precision: float = 6e-4
+    keeps: tuple[str, ...] = ("rgb", "label", "time", "intensity")
+    crs: bool = False
+
+
+MOST = ("rgb", "label", "intensity")
+FORMATS = {
+    "las": Format("c.las", write_las, crs=True),
+    "laz": Format("c.laz", write_las, crs=True),
+    "copc": Format("c.copc.laz", write_copc, crs=True),
+    "ply": Format("c.ply", lambda p, c: write_ply(p, c, "binary_little_endian", "class"), 1e-5, ("rgb", "label")),
+    "e57": Format("c.e57", write_e57, 2e-5, ("rgb", "intensity")),
+    "pcd ascii": Format("c.pcd", pcd("ascii"), 1e-5, MOST),
+    "pcd binary": Format("c.pcd", pcd("binary"), 1e-5, MOST),
+    "pcd binary_compressed": Format("c.PCD", pcd("binary_compressed"), 1e-5, MOST),
+    "xyz": Format("c.xyz", text(" ", None), 1e-4, MOST),
+    "txt": Format("c.txt", text("\t", "//X\tY\tZ\tR\tG\tB\tIntensity\tClassification"), 1e-4, MOST),
+    "csv": Format("c.csv", text(",", "x,y,z,red,green,blue,intensity,class"), 1e-4, MOST),
+    "csv of 16 bits": Format("c.csv", text(";", '"X";"Y";"Z";"r";"g";"b";"i";"label"', wide=True), 1e-4, MOST),
+    "ept laszip": Format("town/ept.json", ept("laszip"), crs=True),
+    "ept binary": Format("town/ept.json", ept("binary"), crs=True),
+    "ept zstandard": Format("town/ept.json", ept("zstandard"), crs=True),
+}  # fmt: skip
+
+
+@pytest.fixture(params=FORMATS)
+def written(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[Format, Path, PointCloud]:
+    form, cloud = FORMATS[request.param], made(N)
+    form.write(tmp_path / form.file, cloud)
+    return form, tmp_path / form.file, cloud
+
+
+def same(form: Format, read: PointCloud, cloud: PointCloud, precision: float) -> None:
+    """Points come in the order of writing in all formats here."""
+    assert len(read) == len(cloud)
+    error = read.frame.to_crs(read.xyz) - cloud.frame.to_crs(cloud.xyz)
+    assert np.abs(error).max() < precision
+    for name in ("rgb", "label", "time", "intensity"):
+        values = getattr(read, name)
+        if name in form.keeps:
+            assert np.array_equal(values, getattr(cloud, name)), name
+        else:
+            assert values is None or not values.any(), f"{name} was not in the file"
+
+
+def test_a_cloud_comes_back(written: tuple[Format, Path, PointCloud]) -> None:
+    form, path, cloud = written
+    header = clouds.read_header(path)
+    assert header.count == N and (header.crs is not None) == form.crs
+    assert not form.crs or "UTM zone 32N" in header.crs
+    places = cloud.frame.to_crs(cloud.xyz)
+    assert np.abs(header.low - places.min(axis=0)).max() < 2e-3
+    assert np.abs(header.high - places.max(axis=0)).max() < 2e-3
+    same(form, clouds.read(path, FRAME), cloud, form.precision)
+
+
+def test_a_cloud_comes_back_in_parts(written: tuple[Format, Path, PointCloud]) -> None:
+    """As a survey is cut: each part in a frame near it, colours and intensities by one rule for all."""
+    form, path, cloud = written
+    parts = list(clouds.chunks(path, Frame(FRAME.crs), 128))
+    assert len(parts) > 5 or form.file.endswith(".ply")
+    moved = [replace(p, frame=FRAME, xyz=FRAME.to_local(p.frame.to_crs(p.xyz)).astype(np.float32)) for p in parts]
+    same(form, PointCloud.join(moved), cloud, form.precision)
+    assert all(np.abs(part.xyz).max() < 200 for part in parts)
+
+
+def test_a_cloud_is_inspected_and_imported(written: tuple[Format, Path, PointCloud]) -> None:
+    form, path, cloud = written
+    shown = CliRunner().invoke(app, ["inspect", str(path)])
+    assert shown.exit_code == 0 and "1,000" in shown.output
+    out = path.parent / "tile"
+    crs = [] if form.crs else ["--crs", FRAME.crs]
+    done = CliRunner().invoke(app, ["import", "clouds", str(path), "--out", str(out), *crs])
+    assert done.exit_code == 0, done.output
+    tile = read_tile(out)
+    assert tile.frame.crs == FRAME.crs and tile.clouds[0].suffix in (".las", ".laz", ".ply")
+    same(form, clouds.read(tile.clouds[0], tile.frame), cloud, form.precision + 6e-4)
+
+
+def test_a_tile_names_a_cloud(written: tuple[Format, Path, PointCloud]) -> None:
+    form, path, cloud = written
+    write_tile(path.parent, name="t", crs=FRAME.crs, clouds=[path.name], cameras={})
+    if path.name == "ept.json":
+        with pytest.raises(InputError, match="import clouds"):
+            read_tile(path.parent)
+    else:
+        tile = read_tile(path.parent)
+        same(form, clouds.read(tile.clouds[0], tile.frame), cloud, form.precision)
+
+
+def test_a_cut_file_is_refused(written: tuple[Format, Path, PointCloud]) -> None:
+    """Whatever is missing at the end: never a traceback, never less than all points."""
+    _, start, _ = written
+    path = sorted((start.parent / "ept-data").iterdir())[1] if start.name == "ept.json" else start
+    whole = path.read_bytes()
+    for share in (0.02, 0.1, 0.5, 0.9, 0.999):
+        path.write_bytes(whole[: int(len(whole) * share)])
+        try:
+            read = clouds.read(start, FRAME)
+        except ScanError as error:
+            assert error.remedy
+        else:  # a text says nothing of its length; a COPC file's hierarchy stands behind all points
+            assert len(read) == N or path.suffix in (".xyz", ".txt", ".csv")
+
+
+def test_every_format_says_what_it_needs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("scan2sim.pipeline.io.e57.find_spec", lambda _: None)
+    (tmp_path / "c.e57").write_bytes(b"")
+    with pytest.raises(UnavailableError, match=r"c\.e57: needs scan2sim\[e57\].*pip install"):
+        clouds.read_header(tmp_path / "c.e57")
+    assert {suffix for suffix in clouds.FORMATS if clouds.missing(suffix)} == {".e57"}
+
+
+# --- what each has of its own
+
+
+@pytest.mark.parametrize("data", ["binary", "binary_compressed", "ascii"])
+@pytest.mark.parametrize("count", [10**15, 2000, -1, 0])
+def test_a_pcd_header_that_lies_is_refused(tmp_path: Path, data: str, count: int) -> None:
+    rows = np.ones(1000, [("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
+    write_pcd(tmp_path / "c.pcd", rows, data, count)
+    with pytest.raises(InputError, match=r"c\.pcd: is "):
+        clouds.read(tmp_path / "c.pcd", Frame())
+
+
+def test_beams_without_return_are_left_out(tmp_path: Path) -> None:
+    rows = np.ones(1000, [("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
+    rows["y"][:900] = np.nan
+    write_pcd(tmp_path / "c.pcd", rows, "binary_compressed")
+    assert clouds.read_header(tmp_path / "c.pcd").count == len(clouds.read(tmp_path / "c.pcd", Frame())) == 100
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_pcd_files_of_open3d(tmp_path: Path, compressed: bool) -> None:
+    o3d = pytest.importorskip("open3d")
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.random.default_rng(0).uniform(-9, 9, (500, 3))))
+    cloud.colors = o3d.utility.Vector3dVector(np.random.default_rng(1).integers(0, 256, (500, 3)) / 255)
+    assert o3d.io.write_point_cloud(str(tmp_path / "c.pcd"), cloud, compressed=compressed)
+    read = clouds.read(tmp_path / "c.pcd", Frame())
+    assert np.abs(read.xyz - np.asarray(cloud.points)).max() < 1e-5
+    assert np.array_equal(read.rgb, np.rint(np.asarray(cloud.colors) * 255))
+
+
+@pytest.mark.parametrize(
+    ("lines", "note"),
+    [
+        ("1 2 3\n4 5 6", "3 columns taken as x y z"),
+        ("# a remark\n1,2,3,0.5\n4,5,6,0.25", "4 columns taken as x y z intensity"),
+        ("1;2;3;0.5;6\n4;5;6;0.25;2", "5 columns taken as x y z intensity class"),
+        ("z,y,x,range\n3,2,1,9\n6,5,4,9", "z y x; not read: range"),
+        ("\ufeffX Y Z Scalar_Intensity\n1 2 3 7\n4 5 6 8", "x y z intensity"),
+    ],
+)
+def test_columns_are_sniffed_and_what_was_assumed_is_told(tmp_path: Path, lines: str, note: str) -> None:
+    (tmp_path / "c.txt").write_text(lines)
+    assert note in clouds.read_header(tmp_path / "c.txt").notes[0]
+    assert clouds.read(tmp_path / "c.txt", Frame()).xyz.tolist() == [[1, 2, 3], [4, 5, 6]]
+    told: list[str] = []
+    import_las([tmp_path / "c.txt"], tmp_path / "tile", crs="local", warn=told.append)
+    assert len(told) == 1 and note in told[0]
+
+
+@pytest.mark.parametrize(
+    ("lines", "cause"),
+    [
+        ("", "holds no points"),
+        ("1 2\n", "2 columns and no heading"),
+        ("1 2 3 4 5 6 7 8 9 10\n", "10 columns and no heading"),
+        ("x y z\n", "is no cloud: its first line is 'x y z'"),
+        ("1,5;2,5;3,5\n", "writes decimals with a comma"),
+        ("1 2 3\n4 5\n", "is no cloud of 3 columns"),
+        ("1 2 3\n4 five 6\n", "is no cloud of 3 columns"),
+        ("x,y,height,z\n1,2,3,4\n", "names z twice"),
+        ("1 2 3 1 300\n", "class 300, which is no LAS code"),
+        ("nan nan nan\n", "no points with finite coordinates"),
+        ("hello\nworld\n", "is no cloud"),
+    ],
+)
+def test_a_text_that_is_no_cloud_is_refused(tmp_path: Path, lines: str, cause: str) -> None:
+    (tmp_path / "c.xyz").write_text(lines)
+    with pytest.raises(InputError, match=cause):
+        clouds.read(tmp_path / "c.xyz", Frame())
+
+
+def test_a_line_that_never_ends_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("scan2sim.pipeline.io.text.BLOCK", 1 << 10)
+    (tmp_path / "c.xyz").write_text("1 2 " + "3" * 5000)
+    with pytest.raises(InputError, match="line of more than|is no cloud"):
+        clouds.read(tmp_path / "c.xyz", Frame())
+
+
+@pytest.mark.parametrize(
+    ("file", "body", "cause"),
+    [
+        ("ept-hierarchy/0-0-0-0.json", '{"0-0-0-0": -1}', "leads to 0-0-0-0 a second time"),
+        ("ept-hierarchy/0-0-0-0.json", '{"../../x": 5}', "is no node of an octree"),
+        ("ept-hierarchy/0-0-0-0.json", '{"0-0-0-0": 1000000000000}', "is of .* bytes"),
+        ("ept-hierarchy/0-0-0-0.json", '{"3-0-0-0": 5}', "is missing"),
+        ("ept-hierarchy/0-0-0-0.json", "[" * 100_000, "is no readable JSON"),
+        ("ept.json", "{}", "has the dataType"),
+        ("ept.json", '{"dataType": "binary", "schema": [{"name": "X"}]}', "its schema describes no points"),
+    ],
+)
+def test_a_broken_ept_is_refused(tmp_path: Path, file: str, body: str, cause: str) -> None:
+    ept("binary")(tmp_path / "ept.json", made(N))
+    (tmp_path / file).write_text(body)
+    with pytest.raises(InputError, match=cause):
+        clouds.read(tmp_path / "ept.json", FRAME)
+
+
+def test_the_old_name_of_the_command_still_works(tmp_path: Path) -> None:
+    write_las(tmp_path / "c.laz", made(10))
+    assert CliRunner().invoke(app, ["import", "las", str(tmp_path / "c.laz"), "-o", str(tmp_path / "t")]).exit_code == 0
