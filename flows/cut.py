@@ -7,7 +7,6 @@ becomes a `cloud.laz`. Memory depends neither on the survey's length nor on a ti
 from __future__ import annotations
 
 import os
-import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -24,7 +23,7 @@ from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.io.importing import place, tile_folder
 from scan2sim.pipeline.io.spool import QUANTUM, Spool
 from scan2sim.pipeline.io.survey import read_survey, write_survey
-from scan2sim.pipeline.io.tile import TileFile, read_tile, tile_name, write_tile
+from scan2sim.pipeline.io.tile import TileFile, read_spec, read_tile, tile_name, write_tile
 from scan2sim.pipeline.step import Report, silent
 from scan2sim.pipeline.steps.ingest import MIN_POINTS
 from scan2sim.pipeline.types import F64, Tile, Trajectory
@@ -80,6 +79,7 @@ class Corridor:
         spec: what its `tile.toml` says; `spec.photos` are in the order of `tile.views`.
         low, high: (3,) corners of its clouds, CRS coordinates.
         counts: points of each cloud, as its header says.
+        notes: what is wrong with the clouds' headers.
     """
 
     tile: Tile
@@ -87,17 +87,19 @@ class Corridor:
     low: F64
     high: F64
     counts: tuple[int, ...]
+    notes: tuple[str, ...] = ()
 
     @classmethod
     def read(cls, path: Path) -> Corridor:
         """Read a tile; one that was cut itself is refused."""
         tile = read_tile(path)
-        spec = TileFile.model_validate(tomllib.loads(tile.path.read_text(encoding="utf-8")))
+        spec = read_spec(tile.path)
         if spec.cell:
             raise InputError(tile.path, "was cut from a survey already", "Cut what it was cut from")
         headers = [clouds.read_header(cloud) for cloud in tile.clouds]
         low, high = np.min([h.low for h in headers], axis=0), np.max([h.high for h in headers], axis=0)
-        return cls(tile, spec, low, high, tuple(h.count for h in headers))
+        notes = tuple(f"{c.name}: {note}" for c, h in zip(tile.clouds, headers, strict=True) for note in h.notes)
+        return cls(tile, spec, low, high, tuple(h.count for h in headers), notes)
 
 
 def cut_survey(
@@ -138,6 +140,8 @@ def cut_survey(
     final = (Path.cwd() / out).parent.resolve() / out.name
     if any(source.resolve().is_relative_to(final) for source in (tile.path, *tile.clouds)):
         raise SettingError(out, f"holds the corridor {tile.path}", "Name another folder")
+    for note in corridor.notes:
+        warn(note)
     missing = [view.photo for view in tile.views if not view.photo.is_file()]
     if missing:
         warn(

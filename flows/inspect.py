@@ -12,6 +12,7 @@ from rich.table import Table
 
 from scan2sim.flows.display import console
 from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.io import files
 
 Facts = list[tuple[str, str]]
 
@@ -34,8 +35,6 @@ def inspect_path(path: Path) -> None:
 def _reader(path: Path) -> Callable[[Path], tuple[str, Facts]]:
     from scan2sim.pipeline.io import clouds
 
-    if not path.exists():
-        raise InputError(path, "is missing", "Mend the name")
     if path.is_dir():
         if (path / "ept.json").is_file():
             return lambda p: _cloud(p / "ept.json")
@@ -46,6 +45,7 @@ def _reader(path: Path) -> Callable[[Path], tuple[str, Facts]]:
         if any(path.glob("*.sdf")):
             return lambda p: _world(_sdf(p))
         raise InputError(path, "holds neither tile.toml nor a world", "Name a cloud, a tile, a mesh or a world")
+    files.check(path, "Mend the name")
     readers = {
         **dict.fromkeys(clouds.FORMATS, _cloud), ".toml": _tile, ".sdf": _world, ".npz": _result,
         ".obj": _mesh, ".dae": _mesh, ".glb": _mesh, ".ply": _ply,
@@ -82,7 +82,7 @@ def _cloud(path: Path) -> tuple[str, Facts]:
         ("extent", _bounds(header.low, header.high)),
         ("density", f"{header.count / area:,.1f} per square unit of its bounding box"),
         ("colours", "yes" if cloud.rgb is not None else "no"),
-        *(("assumed", note) for note in header.notes),
+        *(("beware", note) for note in header.notes),
     ]
     if cloud.time is not None and len(cloud):
         facts.append(("GPS time", f"{cloud.time.min():.3f} to {cloud.time.max():.3f} s"))
@@ -151,7 +151,7 @@ def _result(path: Path) -> tuple[str, Facts]:
     try:
         with np.load(path) as data:
             facts = [(name, f"{data[name].shape} {data[name].dtype}") for name in data.files]
-    except (OSError, ValueError) as error:
+    except Exception as error:  # a damaged archive raises whatever zipfile, zlib and numpy come upon
         raise InputError(path, f"can't be read ({error})", "Run the step that makes it again") from None
     return "kept result", facts
 

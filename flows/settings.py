@@ -7,7 +7,6 @@ In a file: `[decimate]` and `[decimate.building]`.
 from __future__ import annotations
 
 import difflib
-import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,7 +14,8 @@ from typing import Any, TypeVar
 from pydantic import ValidationError
 
 from scan2sim.pipeline.classes import GROUPS
-from scan2sim.pipeline.errors import SettingError
+from scan2sim.pipeline.errors import InputError, SettingError
+from scan2sim.pipeline.io import toml
 from scan2sim.pipeline.step import Params, Step
 
 P = TypeVar("P", bound=Params)
@@ -37,9 +37,9 @@ class Settings:
         values: dict[str, Any] = {}
         if file is not None:
             try:
-                values = tomllib.loads(file.read_text(encoding="utf-8"))
-            except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-                raise SettingError(file, f"can't be read as TOML ({error})", "Mend it, or leave --config out") from None
+                values = toml.table(file)
+            except InputError as error:
+                raise SettingError(file, error.cause, "Mend it, or leave --config out") from None
         for text in assignments:
             path, equals, value = text.partition("=")
             parts = path.strip().split(".")
@@ -102,8 +102,8 @@ class Settings:
 def _value(text: str) -> Any:
     """A TOML value where it is one, else the text itself."""
     try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+        return toml.parse(f"value = {text}")["value"]
+    except ValueError:
         return text
 
 

@@ -61,6 +61,8 @@ class Manifest:
 def digest(path: Path) -> str:
     """SHA-256 of a source file; "missing" where it isn't there (the step says what that means)."""
     try:
+        if path.exists() and not path.is_file():
+            return "missing"  # a folder, or a pipe, which would be waited on for ever
         with open(path, "rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except FileNotFoundError:

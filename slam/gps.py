@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scan2sim.pipeline.errors import InputError, UnavailableError, from_os_error
+from scan2sim.pipeline.io import files
 from scan2sim.pipeline.types import F64, Frame
 
 MAX_SPEED = 70.0
@@ -88,10 +89,11 @@ def read_gps(path: Path) -> GpsTrack:
     reader = FORMATS.get(path.suffix.lower())
     if reader is None:
         raise InputError(path, "is no known GPS format", f"Give one of {', '.join(FORMATS)}")
-    if not path.is_file():
-        raise InputError(path, "is missing", "Put it there, or mend the name")
+    files.check(path)
     try:
         return reader(path)
+    except csv.Error as error:
+        raise InputError(path, f"is no readable CSV ({error})", "Export it again") from None
     except OSError as error:
         raise from_os_error(error, path) from error
 
@@ -200,7 +202,7 @@ def read_gopro(path: Path) -> GpsTrack:
         raise InputError(path, "has no GoPro telemetry", "Use the file as the camera wrote it, or give a GPX")
     try:
         parts = [gpmf_fixes(data) for _, _, data in packets]
-    except (ValueError, struct.error) as error:
+    except (ValueError, struct.error, KeyError, IndexError) as error:  # types and fields that there aren't
         raise InputError(path, f"has damaged GoPro telemetry ({error})", "Copy it from the camera again") from None
     key = "GPS9" if any("GPS9" in part for part in parts) else "GPS5"
     found = [(*packet[:2], part[key]) for packet, part in zip(packets, parts, strict=True) if key in part]

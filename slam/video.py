@@ -141,12 +141,12 @@ def _folder(path: Path, fps: float, times: Path | None) -> Video:
 
 
 def _read(path: Path) -> U8:
-    import cv2
+    from scan2sim.pipeline.io.image import read_levels
 
-    grey = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE) if path.stat().st_size else None
+    grey = read_levels(path)
     if grey is None:
         raise InputError(path, "is no readable picture", "Copy it again, or take it out of the folder")
-    return grey  # type: ignore[return-value]
+    return grey
 
 
 def _of_folder(video: Video) -> Iterator[Frame]:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from scan2sim.pipeline.errors import InputError, UnavailableError
+from scan2sim.pipeline.io import files
 from scan2sim.pipeline.types import F64, Frame, PointCloud
 
 CHUNK = 2_000_000
@@ -29,13 +30,13 @@ KNOWN = "LAS, LAZ, COPC, PLY, E57, PCD, XYZ (.xyz .csv .txt .asc) or EPT (its ep
 
 @dataclass(frozen=True)
 class Header:
-    """What a cloud file says of itself.
+    """What is known of a cloud file.
 
     Attributes:
         count: number of points.
         low, high: (3,) bounds, CRS units, float64.
         crs: as WKT, or None.
-        notes: what had to be assumed to read it, for the user.
+        notes: what had to be assumed to read it, and what is wrong with it, for the user.
     """
 
     count: int
@@ -61,8 +62,7 @@ def _reader(path: Path) -> Any:
     key = path.name if path.name in FORMATS else path.suffix.lower()
     if key not in FORMATS:
         raise InputError(path, f"is no known cloud format ({path.suffix or 'no suffix'})", f"Use {KNOWN}")
-    if path.is_dir():
-        raise InputError(path, "is a folder, not a cloud", "Name a file")
+    files.check(path)
     lacking = missing(key)
     if lacking:
         raise UnavailableError(path, f"needs {lacking}", f"pip install '{lacking}'")
@@ -89,7 +89,7 @@ def read(path: Path, frame: Frame) -> PointCloud:
 
 
 def chunks(path: Path, frame: Frame, size: int = CHUNK) -> Iterator[PointCloud]:
-    """A cloud's points in their order, `size` at a time; a PLY file's all at once.
+    """A cloud's points in their order, `size` at a time.
 
     Args:
         path: of the cloud.

@@ -4,21 +4,79 @@ from __future__ import annotations
 
 import errno
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.io import files
 from scan2sim.pipeline.types import U8, View
+
+MAX_PIXELS = 2**29
+"""Of a photo: 32,768 x 16,384. What says it has more is taken for a decompression bomb."""
+AGAIN = "Copy it again, or leave it out"
+
+
+def size_of(path: Path) -> tuple[int, int]:
+    """Width and height of a photo, pixels, as its header says.
+
+    Raises:
+        InputError: it is missing, no file, no image, or larger than `MAX_PIXELS`.
+    """
+    files.check(path)
+    with _opened(path) as image:
+        width, height = image.size
+    if width * height > MAX_PIXELS:
+        told = f"is of {width:,} x {height:,} pixels, more than {MAX_PIXELS:,}"
+        raise InputError(path, told, "Give a smaller one")
+    return width, height
+
+
+def check_decodes(path: Path) -> None:
+    """Decode a photo; a JPEG at an eighth, which tells enough.
+
+    Raises:
+        InputError: it can't be.
+    """
+    with _opened(path) as image:
+        image.draft(None, (image.size[0] // 8, image.size[1] // 8))
+        image.load()
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    from PIL import Image
+
+    Image.MAX_IMAGE_PIXELS = None  # `MAX_PIXELS` is the limit: Pillow's own is below what 360 cameras make
+    try:
+        with Image.open(path) as image:
+            yield image
+    except Exception as error:  # its decoders raise whatever the damage leads to
+        raise InputError(path, f"can't be read ({error})", AGAIN) from None
 
 
 def read_rgb(path: Path) -> U8 | None:
     """(H, W, 3) RGB, the camera's orientation flag ignored (poses and sizes are of the pixels); None if unreadable."""
+    image = _decoded(path, "IMREAD_COLOR")
+    return None if image is None else np.ascontiguousarray(image[..., ::-1])
+
+
+def read_levels(path: Path) -> U8 | None:
+    """(H, W) grey levels, orientation ignored likewise; None if unreadable."""
+    return _decoded(path, "IMREAD_GRAYSCALE")
+
+
+def _decoded(path: Path, how: str) -> Any:
     import cv2
 
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    return None if image is None else np.ascontiguousarray(image[..., ::-1])
+    try:
+        size_of(path)
+        return cv2.imread(str(path), getattr(cv2, how) | cv2.IMREAD_IGNORE_ORIENTATION)
+    except (InputError, cv2.error):
+        return None
 
 
 def read_grey(path: Path) -> U8:
@@ -27,12 +85,10 @@ def read_grey(path: Path) -> U8:
     Raises:
         InputError: it can't be read.
     """
-    import cv2
-
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    image = read_levels(path)
     if image is None:
         raise InputError(path, "can't be read as an image", "Delete the folder it is in, and run again")
-    return np.asarray(image, np.uint8)
+    return image
 
 
 def write(path: Path, image: U8, *, quality: int = 90, compression: int = 2) -> None:
@@ -64,7 +120,5 @@ def copy(source: Path, path: Path, *, quality: int = 90) -> None:
 
 def read_mask(view: View) -> U8 | None:
     """The view's mask (H, W), 0 where its photo must not be used; None if it can't be read or is of another size."""
-    import cv2
-
-    mask: Any = cv2.imread(str(view.mask), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    mask = read_levels(view.mask) if view.mask else None
     return mask if mask is not None and mask.shape == (view.camera.height, view.camera.width) else None

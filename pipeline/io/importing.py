@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 from scan2sim.pipeline.errors import InputError, SettingError, from_os_error
+from scan2sim.pipeline.io import files
 
 
 @contextmanager
@@ -60,8 +61,7 @@ def place(source: Path, folder: Path, name: str, link: bool = False) -> str:
         InputError: the source is missing, or another file has already taken the name.
     """
     target = folder / name
-    if not source.is_file():
-        raise InputError(source, "is missing", "Put it there, or leave out what names it")
+    files.check(source, "Put it there, or leave out what names it")
     if target.exists() or target.is_symlink():
         raise InputError(source, f"is the second file to be called {name} in the tile", "Rename one of them")
     target.parent.mkdir(parents=True, exist_ok=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import struct
+import functools
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from datetime import date
@@ -13,34 +13,90 @@ from typing import Any
 import numpy as np
 
 from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.io import files, las_header
+from scan2sim.pipeline.io.las_header import truncated
 from scan2sim.pipeline.types import F64, Frame, PointCloud
 
 CHUNK = 2_000_000
 DAY = date(2000, 1, 1)
 """Of creation, in every header: the same points are the same bytes on every day."""
 FEW = 50_000
-"""Points at a time, where the first ones mostly tell all."""
+"""Points at a time, where the first ones mostly tell all; also those of most LAZ files' chunks."""
+PLACES, AT_EACH = 24, 500
+"""Where in a file, and how many points there, are held against its header's bounds."""
+SLACK = 0.1
+"""CRS units that points may be outside of their header's bounds, which writers round."""
+WIDE = 100.0
+"""CRS units by which bounds may be more than twice as wide as a sample of the points."""
+SOFTWARE = "scan2sim"
+"""Who wrote a file, in its header: codes of 64 and up are of `pipeline.classes` then."""
 
 
-def _open(path: Path) -> Any:
+def _open(path: Path, **options: Any) -> Any:
     import laspy
-    from laspy.errors import LaspyException
 
+    las_header.check(files.check(path))
     try:
-        return laspy.open(path)
-    except FileNotFoundError:
-        raise InputError(path, "is missing", "Put it there, or mend the name") from None
-    except (LaspyException, ValueError, struct.error, OSError) as error:
-        raise InputError(path, f"is no readable LAS file ({error})", "Copy or export it again") from None
+        return laspy.open(path, **options)
+    except Exception as error:  # laspy's and the decompressors' parsers raise whatever the damage leads to
+        raise InputError(path, f"is no readable LAS file ({error})", las_header.AGAIN) from None
 
 
-def read_header(path: Path) -> tuple[int, F64, F64, str | None]:
-    """Number of points, low and high corner (CRS units), CRS as WKT or None."""
+def read_header(path: Path) -> tuple[int, F64, F64, str | None, tuple[str, ...]]:
+    """Number of points, low and high corner (CRS units), CRS as WKT or None, and what is wrong with the header.
+
+    The corners are the header's where a sample of the points bears them out, else those of all points.
+    """
     with _open(path) as reader:
         header = reader.header
         if header.point_count == 0:
             raise InputError(path, "holds no points", "Leave it out of the tile")
-        return header.point_count, np.array(header.mins), np.array(header.maxs), _crs(path, header)
+        notes, crs = las_header.check(path), _crs(path, header)
+        low, high = np.array(header.mins), np.array(header.maxs)
+    if not _borne_out(path, low, high):
+        stated = low, high
+        stat = path.stat()
+        low, high = _bounds(path, stat.st_size, stat.st_mtime_ns)
+        if not all(np.allclose(a, b, rtol=0, atol=SLACK) for a, b in zip(stated, (low, high), strict=True)):
+            notes = (*notes, "its header's bounding box is not that of its points, which is taken")
+    return header.point_count, low, high, crs, notes
+
+
+def _borne_out(path: Path, low: F64, high: F64) -> bool:
+    """Whether the header's corners may be relied on: a sample of the points is within, and not far within."""
+    from laspy import LazBackend
+
+    if not (np.isfinite(low).all() and np.isfinite(high).all()):
+        return False
+    places = []
+    with _open(path, laz_backend=LazBackend.Lazrs) as reader:  # decompresses what it is asked for, not whole chunks
+        last = reader.header.point_count - AT_EACH
+        if last < FEW:  # all are quickly read
+            return False
+        at = np.linspace(0, last, PLACES).astype(int)
+        if reader.header.are_points_compressed:
+            at = np.unique(at // FEW * FEW)
+        try:
+            for first in at.tolist():
+                reader.seek(first)
+                places.append(_places(reader.read_points(AT_EACH)))
+        except Exception:  # no table of chunks, or damage, which reading all of it will name
+            return False
+    sample = np.concatenate(places)
+    least, most = sample.min(axis=0), sample.max(axis=0)
+    within = (least >= low - SLACK).all() and (most <= high + SLACK).all()
+    return bool(within and (high - low <= 2 * (most - least) + WIDE).all())
+
+
+@functools.lru_cache(maxsize=256)
+def _bounds(path: Path, size: int, changed: int) -> tuple[F64, F64]:
+    """Low and high corner of all points of a file of that size and time of change."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    with _open(path) as reader:
+        for part in _parts(path, reader, CHUNK):
+            places = _places(part)
+            low, high = np.minimum(low, places.min(axis=0)), np.maximum(high, places.max(axis=0))
+    return low, high
 
 
 def read(path: Path, frame: Frame) -> PointCloud:
@@ -48,11 +104,14 @@ def read(path: Path, frame: Frame) -> PointCloud:
     with _open(path) as reader:
         n = reader.header.point_count
         names = set(reader.header.point_format.dimension_names)
-        xyz = np.empty((n, 3), np.float32)
-        label = np.empty(n, np.uint8)
-        intensity = np.empty(n, np.uint16)
-        time = np.empty(n, np.float64) if "gps_time" in names else None
-        rgb = np.empty((n, 3), np.uint16) if "red" in names else None
+        try:
+            xyz = np.empty((n, 3), np.float32)
+            label = np.empty(n, np.uint8)
+            intensity = np.empty(n, np.uint16)
+            time = np.empty(n, np.float64) if "gps_time" in names else None
+            rgb = np.empty((n, 3), np.uint16) if "red" in names else None
+        except (MemoryError, ValueError):
+            raise InputError(path, f"says that it holds {n:,} points: more than fit here", "Cut it first") from None
         at = 0
         for part in _parts(path, reader, CHUNK):
             here = slice(at, at + len(part))
@@ -119,7 +178,7 @@ def _header(cloud: PointCloud, scale: float) -> Any:
     from laspy.vlrs.known import WktCoordinateSystemVlr
 
     header = laspy.LasHeader(point_format=6 if cloud.rgb is None else 7, version="1.4")
-    header.creation_date = DAY
+    header.creation_date, header.generating_software = DAY, SOFTWARE
     header.scales = np.full(3, scale / cloud.frame.unit)
     header.offsets = np.floor(cloud.frame.to_crs(np.zeros(3)))
     if cloud.frame.crs != "local":
@@ -154,9 +213,9 @@ def _parts(path: Path, reader: Any, size: int) -> Iterator[Any]:
             yield part
             at += len(part)
     except Exception as error:  # the decompressors raise their own kinds, a panic among them
-        raise _truncated(path, at, n, str(error)) from None
+        raise truncated(path, at, n, str(error)) from None
     if at < n:
-        raise _truncated(path, at, n, "end of file")
+        raise truncated(path, at, n, "end of file")
 
 
 def _places(part: Any) -> F64:
@@ -199,7 +258,3 @@ def _crs(path: Path, header: Any) -> str | None:
             path, f"its CRS can't be read ({error})", "Set `crs` in its header, or write it again"
         ) from None
     return crs.to_wkt() if crs is not None else None
-
-
-def _truncated(path: Path, at: int, n: int, cause: str) -> InputError:
-    return InputError(path, f"is truncated or damaged: {at:,} of {n:,} points can be read ({cause})", "Copy it again")

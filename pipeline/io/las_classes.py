@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ import numpy as np
 
 from scan2sim.pipeline.classes import CLASSES
 from scan2sim.pipeline.errors import DataError, SpaceError, UnavailableError, from_os_error
-from scan2sim.pipeline.io.las import CHUNK, _open, _truncated
+from scan2sim.pipeline.io.las import CHUNK, _open, _parts
 from scan2sim.pipeline.types import U8
 
 ADDED = {"confidence": "255: sure", "told_from": "1 photos 2 shape 3 own"}
@@ -92,8 +91,10 @@ def _copy(source: Path, reader: Any, out: Path, code: U8, added: tuple[U8, U8]) 
     channel = None
     with out.open("wb") as file:
         writer = LasWriter(file, header, do_compress=True, closefd=False, encoding_errors="ignore")
-        for at, part in _chunks(source, reader):
+        at = 0
+        for part in _parts(source, reader, CHUNK):
             here = slice(at, at + len(part))
+            at += len(part)
             points = PackedPointRecord.zeros(len(part), writer.header.point_format)
             for name in same:
                 points.array[name] = part.array[name]
@@ -123,19 +124,6 @@ def _copy(source: Path, reader: Any, out: Path, code: U8, added: tuple[U8, U8]) 
         if evlrs and _is_waveforms(evlrs[0]):
             writer.header.start_of_waveform_data_packet_record = writer.header.start_of_first_evlr
         writer.close()
-
-
-def _chunks(source: Path, reader: Any) -> Iterator[tuple[int, Any]]:
-    """Chunks of points and the index of their first."""
-    at, n = 0, reader.header.point_count
-    try:
-        for part in reader.chunk_iterator(CHUNK):
-            yield at, part
-            at += len(part)
-    except Exception as error:  # the decompressors raise their own kinds
-        raise _truncated(source, at, n, str(error)) from None
-    if at < n:
-        raise _truncated(source, at, n, "end of file")
 
 
 def _header(old: Any, structs: list[Any]) -> Any:

@@ -32,7 +32,7 @@ import numpy as np
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.io import clouds as cloud_io
 from scan2sim.pipeline.io import crs as crs_io
-from scan2sim.pipeline.io import las
+from scan2sim.pipeline.io import files, las
 from scan2sim.pipeline.io.importing import place, tile_folder
 from scan2sim.pipeline.io.tile import read_tile, tile_name, write_tile
 from scan2sim.pipeline.step import Report, silent
@@ -165,14 +165,13 @@ def read_photos(photos: Path, cameras: Path | None = None) -> tuple[list[dict[st
 
 
 def _rows(path: Path, known: Sequence[str], needed: Sequence[str]) -> list[Row]:
+    files.check(path)
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
             reader = csv.DictReader(file, skipinitialspace=True, restval="")
             names = [name.strip() for name in reader.fieldnames or ()]
             reader.fieldnames = names
             rows: list[Row] = [{k: v.strip() for k, v in row.items() if isinstance(v, str)} for row in reader]
-    except FileNotFoundError:
-        raise InputError(path, "is missing", "Put it there, or mend the name") from None
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(path, f"is no CSV ({error})", "Export it again, as UTF-8 with commas") from None
     for name in needed:

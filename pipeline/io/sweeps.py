@@ -11,7 +11,6 @@ other sweeps have drawn sharply.
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +23,7 @@ from pydantic import ValidationError
 from scan2sim.pipeline.errors import DataError, InputError, SettingError
 from scan2sim.pipeline.io import clouds as cloud_io
 from scan2sim.pipeline.io import crs as crs_io
-from scan2sim.pipeline.io import las
+from scan2sim.pipeline.io import las, toml
 from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.io.image import read_rgb
 from scan2sim.pipeline.io.importing import place, tile_folder
@@ -224,16 +223,13 @@ def read_camera(path: Path, width: int, height: int) -> Camera:
     path = path / "tile.toml" if path.is_dir() else path
     remedy = "Write [[cameras]] with id, model, size, focal, centre as in a tile.toml (docs/formats.md)"
     try:
-        entries = tomllib.loads(path.read_text(encoding="utf-8")).get("cameras", [])
-        cameras = [CameraEntry.model_validate(entry) for entry in entries]
-    except FileNotFoundError:
-        raise InputError(path, "is missing", "Put it there, or mend the name") from None
+        cameras = [CameraEntry.model_validate(entry) for entry in toml.table(path).get("cameras", [])]
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
         raise InputError(path, f"field `cameras.{where}`: {first['msg']}", remedy) from None
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, AttributeError, TypeError) as error:
-        raise InputError(path, f"is no readable TOML ({error})", remedy) from None
+    except TypeError:
+        raise InputError(path, "its `cameras` are no tables", remedy) from None
     for c in cameras:
         if c.size == (width, height):
             if c.model != "equirectangular" and not min(c.focal) > 0:
@@ -526,35 +522,11 @@ def read_sweep(path: Path) -> tuple[F32, npt.NDArray[np.uint16], U8 | None]:
     if kind == ".bin":
         xyz, reflectance = read_bin(path)
         return xyz, _sixteen_bits(reflectance), None
-    if kind == ".ply":
-        xyz, levels, rgb = _read_open3d(path)
-    else:
-        cloud = cloud_io.read(path, Frame())
-        xyz, rgb = cloud.xyz, cloud.rgb
-        levels = np.zeros(len(xyz), np.uint16) if cloud.intensity is None else cloud.intensity
+    cloud = cloud_io.read(path, Frame())
+    xyz, rgb = cloud.xyz, cloud.rgb
+    levels = np.zeros(len(xyz), np.uint16) if cloud.intensity is None else cloud.intensity
     finite = np.isfinite(xyz).all(axis=1)
     return xyz[finite], levels[finite], None if rgb is None else rgb[finite]
-
-
-def _read_open3d(path: Path) -> tuple[F32, npt.NDArray[np.uint16], U8 | None]:
-    """PLY, with its intensities, which trimesh doesn't read."""
-    import open3d as o3d
-
-    remedy = "Copy it again, or write it as .bin or .laz"
-    try:
-        with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-            cloud = o3d.t.io.read_point_cloud(str(path))
-        points = {key: cloud.point[key].numpy() for key in cloud.point}
-    except RuntimeError as error:
-        raise InputError(path, f"is no readable cloud ({str(error).strip()[:120]})", remedy) from None
-    if len(points.get("positions", ())) == 0:
-        raise InputError(path, "is no readable cloud, or holds no points", remedy)
-    xyz = np.ascontiguousarray(points["positions"], np.float32)
-    levels = next((points[key].ravel() for key in ("intensity", "intensities", "reflectivity") if key in points), None)
-    rgb = points.get("colors")
-    if rgb is not None:
-        rgb = rgb if rgb.dtype == np.uint8 else np.rint(255 * np.clip(rgb, 0, 1)).astype(np.uint8)
-    return xyz, np.zeros(len(xyz), np.uint16) if levels is None else _sixteen_bits(levels), rgb
 
 
 def _sixteen_bits(levels: npt.NDArray[Any]) -> npt.NDArray[np.uint16]:

@@ -43,7 +43,7 @@ from scan2sim.pipeline.cells import Cell
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.io import clouds as cloud_io
 from scan2sim.pipeline.io import crs as crs_io
-from scan2sim.pipeline.io import toml
+from scan2sim.pipeline.io import files, toml
 from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.types import Camera, CameraModel, Frame, Tile, Trajectory, View
 
@@ -117,7 +117,7 @@ def read_tile(path: Path) -> Tile:
         InputError: naming the file, the field and what was expected.
     """
     path = path / "tile.toml" if path.is_dir() else path
-    spec = _parse(path)
+    spec = read_spec(path)
     clouds = tuple(_cloud(path, name) for name in spec.clouds)
     headers = [cloud_io.read_header(cloud) for cloud in clouds]
     crs, unit = crs_io.common(path, spec.crs, spec.units, clouds, headers)
@@ -188,7 +188,7 @@ def sources_of(path: Path) -> list[Path]:
     Raises:
         InputError: it can't be read.
     """
-    spec = _parse(path)
+    spec = read_spec(path)
     return [path, *(path.parent / name for name in (*spec.clouds, *([spec.trajectory] if spec.trajectory else [])))]
 
 
@@ -197,15 +197,21 @@ def tile_name(text: str) -> str:
     return "".join(c if c.isascii() and c.isalnum() else "_" for c in text).strip("_") or "tile"
 
 
-def _parse(path: Path) -> TileFile:
+def read_spec(path: Path) -> TileFile:
+    """What a `tile.toml` says; what it names is not looked at.
+
+    Raises:
+        InputError: it is missing, or not as it should be.
+    """
     absent = ("there is no tile here", "Name a tile.toml or its folder; `scan2sim import` makes one from your files")
     return toml.read(path, TileFile, absent=absent, fields="docs/formats.md lists the fields of a tile")
 
 
 def _existing(tile: Path, name: str, field: str) -> Path:
     path = tile.parent / name
-    if not path.is_file():
-        raise InputError(path, f"is missing (named under `{field}` of {tile.name})", "Put it there, or mend the name")
+    cause = files.problem(path)
+    if cause is not None:
+        raise InputError(path, f"{cause} (named under `{field}` of {tile.name})", files.PUT_THERE)
     return path
 
 

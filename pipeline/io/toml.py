@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
 from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.io import files
 
 M = TypeVar("M", bound=BaseModel)
+LARGEST = 64_000_000
+"""Bytes of a file: a hundred thousand photos have room."""
 
 
 def read(path: Path, model: type[M], *, absent: tuple[str, str], fields: str) -> M:
@@ -24,14 +27,37 @@ def read(path: Path, model: type[M], *, absent: tuple[str, str], fields: str) ->
         InputError: it is missing, not TOML, or says something that the model refuses.
     """
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(path, *absent) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(path, f"is not valid TOML ({error})", "Mend the line that the message names") from None
-    try:
-        return model.model_validate(data)
+        return model.model_validate(table(path, absent))
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
         raise InputError(path, f"field `{where}`: {first['msg']}", fields) from None
+
+
+def table(path: Path, absent: tuple[str, str] = ("is missing", files.PUT_THERE)) -> dict[str, Any]:
+    """What a file says, unchecked; a byte order mark, as Windows' editors write it, is no part of it.
+
+    Raises:
+        InputError: it is missing (`absent` are cause and remedy then), no file, or not TOML.
+    """
+    cause = files.problem(path)
+    if cause is not None:
+        raise InputError(path, *(absent if cause == "is missing" else (cause, absent[1])))
+    if path.stat().st_size > LARGEST:
+        raise InputError(path, f"is of {path.stat().st_size:,} bytes, more than {LARGEST:,}", "Name another file")
+    try:
+        return parse(path.read_text(encoding="utf-8-sig"))
+    except ValueError as error:
+        raise InputError(path, f"is not valid TOML ({error})", "Mend the line that the message names") from None
+
+
+def parse(text: str) -> dict[str, Any]:
+    """What TOML text says.
+
+    Raises:
+        ValueError: it isn't TOML, nested too deep, or has a number of thousands of digits.
+    """
+    try:
+        return tomllib.loads(text)
+    except RecursionError:
+        raise ValueError("arrays or tables in one another, too deep to read") from None

@@ -8,6 +8,8 @@ from scan2sim.pipeline.errors import DataError
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 MIN_POINTS = 1000
+WIDEST = 5000.0
+"""Metres that a tile's points may reach: float32 keeps half a millimetre there, and surfaces fit into memory."""
 
 
 class IngestParams(Params):
@@ -25,7 +27,7 @@ def ingest(inputs: Inputs, params: IngestParams, out: Path, report: Report) -> D
     become grey and "unclassified" where they lack.
 
     Raises:
-        DataError: fewer than 1000 points in all.
+        DataError: fewer than 1000 points in all, or points that are further apart than 5 km.
     """
     import numpy as np
 
@@ -37,6 +39,7 @@ def ingest(inputs: Inputs, params: IngestParams, out: Path, report: Report) -> D
     warnings = []
     for i, name in enumerate(sorted(inputs)):
         report(i / len(inputs), f"reading {inputs[name].name}")
+        warnings += [f"{inputs[name].name}: {note}" for note in clouds.read_header(inputs[name]).notes]
         cloud = clouds.read(inputs[name], frame)
         finite = np.atleast_1d(np.isfinite(cloud.xyz).all(axis=1))
         if not finite.all():
@@ -47,9 +50,17 @@ def ingest(inputs: Inputs, params: IngestParams, out: Path, report: Report) -> D
     if len(cloud) < MIN_POINTS:
         names = ", ".join(str(path) for path in inputs.values())
         raise DataError(names, f"only {len(cloud):,} points in all", f"A tile needs {MIN_POINTS:,} points or more")
+    low, high = cloud.xyz.min(axis=0), cloud.xyz.max(axis=0)
+    if (high - low).max() > WIDEST:
+        most = np.ptp(np.percentile(cloud.xyz, (1, 99), axis=0), axis=0).max()
+        raise DataError(
+            ", ".join(str(path) for path in inputs.values()),
+            f"points are up to {(high - low).max() / 1000:,.1f} km apart (98 % of them within {most:,.0f} m), "
+            f"a tile has room for {WIDEST / 1000:g} km",
+            "Remove stray points and check the CRS's unit, or cut it with `scan2sim tile`",
+        )
     report(0.9, "writing")
     cloud.save(out / "cloud.npz")
-    low, high = cloud.xyz.min(axis=0), cloud.xyz.max(axis=0)
     facts = {
         "points": len(cloud),
         "extent_m": (high - low).round(2).tolist(),
@@ -60,4 +71,4 @@ def ingest(inputs: Inputs, params: IngestParams, out: Path, report: Report) -> D
     return Done({"cloud": out / "cloud.npz"}, facts, warnings)
 
 
-INGEST = Step("ingest", 1, ingest, IngestParams)
+INGEST = Step("ingest", 2, ingest, IngestParams)

@@ -107,24 +107,22 @@ def _problem(view: View) -> str | None:
     Raises:
         InputError: it opens, but is not of its camera's size.
     """
-    from PIL import Image, UnidentifiedImageError
+    from scan2sim.pipeline.io import image
 
+    wanted = view.camera.width, view.camera.height
     for path in (view.photo, view.mask):
         if path is None:
             continue
         try:
-            with Image.open(path) as image:
-                size = image.size
-                image.draft(None, (size[0] // 8, size[1] // 8))  # a JPEG is decoded at an eighth, which tells enough
-                image.load()
-        except FileNotFoundError:
-            return f"{path} is missing"
-        except (UnidentifiedImageError, OSError) as error:
-            return f"{path} can't be read ({error})"
-        if size != (view.camera.width, view.camera.height):
+            size = image.size_of(path)
+            if size == wanted:
+                image.check_decodes(path)
+        except InputError as error:
+            return f"{path} {error.cause}"
+        if size != wanted:
             raise InputError(
                 path,
-                f"is {size[0]} x {size[1]} pixels, but its camera {view.camera.width} x {view.camera.height}",
+                f"is {size[0]} x {size[1]} pixels, but its camera {wanted[0]} x {wanted[1]}",
                 "Mend the camera's `size` (and focal, centre), or resize the photo",
             )
     return None

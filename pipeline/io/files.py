@@ -1,0 +1,32 @@
+"""What may be opened as a file: no folder, and no pipe or device, which would be waited on for ever."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from scan2sim.pipeline.errors import InputError
+
+PUT_THERE = "Put it there, or mend the name"
+
+
+def problem(path: Path) -> str | None:
+    """Why a path can't be read as a file ("is missing", "is a folder", ...); None if it can."""
+    if path.is_file():
+        return None
+    if path.is_dir():
+        return "is a folder, not a file"
+    if path.exists():
+        return "is a pipe or device, not a file"
+    return "is missing"
+
+
+def check(path: Path, remedy: str = PUT_THERE) -> Path:
+    """`path`, which is a file.
+
+    Raises:
+        InputError: it is none.
+    """
+    cause = problem(path)
+    if cause is not None:
+        raise InputError(path, cause, remedy)
+    return path

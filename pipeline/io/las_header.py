@@ -1,0 +1,119 @@
+"""What a LAS header says, held against the file: laspy believes it, and would count to 2^63.
+
+LAS 1.4 R15 (ASPRS) gives the offsets, LAZ's chunk table the number of compressed points.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from pathlib import Path
+from typing import BinaryIO
+
+from scan2sim.pipeline.errors import InputError
+
+AGAIN = "Copy or export it again"
+HEADERS = {0: 227, 1: 227, 2: 227, 3: 235, 4: 375, 5: 393}
+"""Bytes of a header, by minor version."""
+RECORDS = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)
+"""Bytes of a point, by format."""
+VLR, EVLR = 54, 60
+"""Bytes of the head of a record."""
+COMPRESSED = 0xC0
+"""Bits of the point format that LAZ sets."""
+VARIABLE = 0xFFFFFFFF
+"""Points a chunk, where the chunk table says it for each, as in COPC files."""
+
+
+def check(path: Path) -> tuple[str, ...]:
+    """Refuse a header that the file doesn't bear out; returns what else is wrong with it.
+
+    Raises:
+        InputError: no LAS file, or truncated, or one whose counts and offsets lead out of it.
+    """
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        head = file.read(HEADERS[5]).ljust(HEADERS[5], b"\0")
+        if head[:4] != b"LASF" or size < HEADERS[0]:
+            raise _bad(path, "it doesn't begin as one")
+        minor, known = head[25], struct.unpack_from("<HIIBHI", head, 94)
+        header_size, start, vlrs, kind, record, count = known
+        if head[24] != 1 or minor not in HEADERS:
+            raise _bad(path, f"of version {head[24]}.{minor}")
+        if header_size < HEADERS[minor] or not header_size <= start <= size:
+            raise _bad(path, f"{header_size:,} bytes of header, points from byte {start:,} on, {size:,} bytes in all")
+        compressed, kind = bool(kind & COMPRESSED), kind & ~COMPRESSED
+        if kind >= len(RECORDS) or record < RECORDS[kind]:
+            raise _bad(path, f"points of format {kind} and {record} bytes")
+        scales, offsets = struct.unpack_from("<3d", head, 131), struct.unpack_from("<3d", head, 155)
+        if not all(map(math.isfinite, (*scales, *offsets))) or 0 in scales:
+            raise _bad(path, f"coordinates are scaled by {scales} and moved by {offsets}")
+        chunk = _walk(path, file, header_size, vlrs, VLR, start)
+        end = size
+        if minor >= 4:
+            extended, number, count = struct.unpack_from("<QIQ", head, 235)
+            if number:
+                _walk(path, file, extended, number, EVLR, size)
+                end = extended if extended >= start else size
+        if minor == 3:
+            end = struct.unpack_from("<Q", head, 227)[0] or size
+        if compressed:
+            return _compressed(path, file, start, size, record, count, chunk)
+        there = (size - start) // record
+        if there < count:
+            raise truncated(path, there, count, "end of file")
+        return _left_over(count, (end - start) // record)
+
+
+def truncated(path: Path, at: int, count: int, cause: str) -> InputError:
+    """Of points that are counted, but not there."""
+    return InputError(path, f"is truncated or damaged: {at:,} of {count:,} points can be read ({cause})", AGAIN)
+
+
+def _bad(path: Path, cause: str) -> InputError:
+    return InputError(path, f"is no readable LAS file ({cause})", AGAIN)
+
+
+def _left_over(count: int, there: int) -> tuple[str, ...]:
+    more = f"its header counts {count:,} points, but there are {there:,} or more: the rest is left out"
+    return (more,) if there > count else ()
+
+
+def _walk(path: Path, file: BinaryIO, at: int, number: int, head: int, end: int) -> int | None:
+    """Go through records that must end before byte `end`; the points a chunk, if one of them tells of LAZ's."""
+    chunk = None
+    for i in range(number):
+        file.seek(at)
+        about = file.read(head)
+        length = struct.unpack_from("<H" if head == VLR else "<Q", about, 20)[0] if len(about) == head else 0
+        if len(about) < head or at + head + length > end:
+            raise _bad(path, f"{number:,} records are named, but the {i + 1}. reaches beyond their end")
+        if about[2:18].startswith(b"laszip encoded") and head == VLR:
+            body = file.read(min(length, 16)).ljust(16, b"\0")
+            chunk = struct.unpack_from("<I", body, 12)[0]
+        at += head + length
+    return chunk
+
+
+def _compressed(
+    path: Path, file: BinaryIO, start: int, size: int, record: int, count: int, chunk: int | None
+) -> tuple[str, ...]:
+    """Hold the number of points against LAZ's table of chunks, each of which begins with a whole point."""
+    if not chunk:
+        raise _bad(path, "nothing in it tells how its points are compressed")
+    file.seek(start)
+    table = struct.unpack("<q", file.read(8).ljust(8, b"\xff"))[0]
+    if table == -1:  # written to a stream: the last bytes tell
+        file.seek(size - 8)
+        table = struct.unpack("<q", file.read(8))[0]
+    if not start + 8 <= table <= size - 8:
+        raise truncated(path, 0, count, "its table of chunks lies beyond its end")
+    file.seek(table)
+    chunks = struct.unpack("<II", file.read(8))[1]
+    if chunks * RECORDS[0] > table - start:
+        raise truncated(path, 0, count, f"{chunks:,} chunks in {table - start:,} bytes")
+    if chunk == VARIABLE:
+        return ()
+    if count > chunks * chunk:
+        raise truncated(path, chunks * chunk, count, "end of chunks")
+    return _left_over(count, (chunks - 1) * chunk + 1) if chunks else ()

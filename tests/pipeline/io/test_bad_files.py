@@ -1,0 +1,169 @@
+"""Files that lie: what is made of them, or said about them (docs/formats.md, "What bad input gets")."""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from scan2sim.flows.inspect import inspect_path
+from scan2sim.pipeline.errors import DataError, InputError
+from scan2sim.pipeline.io import clouds, image, las
+from scan2sim.pipeline.io.tile import read_tile
+from scan2sim.pipeline.step import silent
+from scan2sim.pipeline.steps.ingest import IngestParams, ingest
+from scan2sim.pipeline.types import Frame, PointCloud
+
+FRAME = Frame("local", (700_000.0, 5_400_000.0, 100.0))
+SIZES = {"bounds": "<6d", "count": "<Q", "vlrs": "<I", "extended": "<QI", "scale": "<d"}
+PLACES = {"bounds": 179, "count": 247, "vlrs": 100, "extended": 235, "scale": 131}
+
+
+def made(path: Path, n: int = 3000, reach: float = 20.0) -> Path:
+    rng = np.random.default_rng(0)
+    xyz = rng.uniform(0, reach, (n, 3)).astype(np.float32)
+    las.write(path, PointCloud(FRAME, xyz, label=np.full(n, 2, np.uint8)))
+    return path
+
+
+def patch(path: Path, field: str, *values: float) -> Path:
+    body = bytearray(path.read_bytes())
+    struct.pack_into(SIZES[field], body, PLACES[field], *values)
+    path.write_bytes(body)
+    return path
+
+
+@pytest.mark.parametrize("n", [3000, 120_000])  # all points are looked at, or some
+@pytest.mark.parametrize("bounds", [[0.0] * 6, [1e7, 0.0] * 3, [float("nan")] * 6])
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_the_origin_is_the_points_whatever_the_header_says(
+    tmp_path: Path, suffix: str, bounds: list[float], n: int
+) -> None:
+    path = patch(made(tmp_path / f"c{suffix}", n), "bounds", *bounds)
+    (tmp_path / "tile.toml").write_text(f'name = "t"\ncrs = "local"\nclouds = ["{path.name}"]\n')
+    tile = read_tile(tmp_path)
+    assert np.abs(np.subtract(tile.frame.origin, (700_010, 5_400_010, 100))).max() <= 1
+    params = IngestParams(crs=tile.frame.crs, origin=tile.frame.origin, unit=tile.frame.unit)
+    done = ingest({"cloud.0000": path}, params, tmp_path, silent)
+    assert done.facts["points"] == n
+    assert "its header's bounding box is not that of its points" in done.warnings[0]
+
+
+def test_a_true_header_is_believed(tmp_path: Path) -> None:
+    assert clouds.read_header(made(tmp_path / "c.laz", 120_000)).notes == ()
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+@pytest.mark.parametrize(
+    ("field", "values"),
+    [("count", [2**63]), ("count", [10**12]), ("vlrs", [2**32 - 1]), ("extended", [400, 2**31]), ("scale", [0.0])],
+)
+def test_a_las_header_must_fit_into_its_file(tmp_path: Path, suffix: str, field: str, values: list[float]) -> None:
+    path = patch(made(tmp_path / f"c{suffix}"), field, *values)
+    with pytest.raises(InputError, match=r"(truncated|no readable LAS file).*again"):
+        clouds.read_header(path)
+
+
+def test_points_that_a_las_header_does_not_count_are_told_of(tmp_path: Path) -> None:
+    path = patch(made(tmp_path / "c.las"), "count", 12)
+    assert "counts 12 points, but there are 3,000" in clouds.read_header(path).notes[0]
+
+
+def test_points_over_a_thousand_kilometres_are_no_tile(tmp_path: Path) -> None:
+    path = made(tmp_path / "c.las", reach=1e6)
+    with pytest.raises(DataError, match=r"999\.\d km apart.*room for 5 km.*scan2sim tile"):
+        ingest({"cloud.0000": path}, IngestParams(origin=FRAME.origin), tmp_path, silent)
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
+@pytest.mark.parametrize("count", [10**15, 301, 299, -1])
+def test_a_ply_holds_what_its_header_says(tmp_path: Path, form: str, count: int) -> None:
+    with pytest.raises(InputError, match=r"(its header says .* vertices, there are 300|below 0).*again"):
+        clouds.read_header(ply(tmp_path, form, count))
+
+
+@pytest.mark.parametrize("cut", np.linspace(0, 0.995, 40).tolist())
+def test_a_cut_ascii_ply_is_refused(tmp_path: Path, cut: float) -> None:
+    path = ply(tmp_path, "ascii", 300)
+    path.write_bytes(path.read_bytes()[: int(cut * path.stat().st_size)])
+    with pytest.raises(InputError, match=r"c\.ply: is (no readable PLY cloud|truncated)"):
+        clouds.read(path, Frame())
+
+
+def ply(folder: Path, form: str, count: int) -> Path:
+    head = f"ply\nformat {form} 1.0\nelement vertex {count}\n" + "".join(f"property float {k}\n" for k in "xyz")
+    rows = np.arange(900, dtype=np.float32).reshape(300, 3)
+    body = "".join(f"{x} {y} {z}\n" for x, y, z in rows).encode() if form == "ascii" else rows.tobytes()
+    (folder / "c.ply").write_bytes(f"{head}end_header\n".encode() + body)
+    return folder / "c.ply"
+
+
+def pipe(folder: Path, name: str) -> Path:
+    os.mkfifo(folder / name)
+    return folder / name
+
+
+def test_pipes_and_folders_are_no_files(tmp_path: Path) -> None:
+    made(tmp_path / "c.las")
+    with pytest.raises(InputError, match="pipe"):
+        clouds.read_header(pipe(tmp_path, "p.laz"))
+    (tmp_path / "tile.toml").write_text('name = "t"\ncrs = "local"\nclouds = ["p.laz"]\n')
+    with pytest.raises(InputError, match=r"pipe or device.*named under `clouds`"):
+        read_tile(tmp_path)
+    (tmp_path / "tile.toml").unlink()
+    with pytest.raises(InputError, match="pipe"):
+        read_tile(pipe(tmp_path, "tile.toml"))
+    with pytest.raises(InputError, match="folder"):
+        image.size_of(tmp_path)
+    assert image.read_rgb(pipe(tmp_path, "p.jpg")) is None
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "x = " + "[" * 1000 + "]" * 1000,
+        "x = " + "9" * 6000,
+        'name = "t"\nclouds = ["c.las"]\ncrs = "' + "x" * 70_000_000,
+    ],
+    ids=["nested", "digits", "large"],
+)
+def test_toml_that_would_exhaust_the_reader(tmp_path: Path, text: str) -> None:
+    (tmp_path / "tile.toml").write_text(text)
+    with pytest.raises(InputError, match=r"tile\.toml: is (not valid TOML|of .* bytes)"):
+        read_tile(tmp_path)
+
+
+def test_a_byte_order_mark_is_no_part_of_a_tile(tmp_path: Path) -> None:
+    made(tmp_path / "c.las")
+    (tmp_path / "tile.toml").write_text('\ufeffname = "t"\ncrs = "local"\nclouds = ["c.las"]\n', encoding="utf-8")
+    assert read_tile(tmp_path).name == "t"
+
+
+def test_a_large_panorama_is_read_and_a_bomb_is_not(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "p.jpg"), np.zeros((9600, 19_200), np.uint8))
+    assert image.size_of(tmp_path / "p.jpg") == (19_200, 9600)
+    image.check_decodes(tmp_path / "p.jpg")
+
+    def chunk(kind: bytes, body: bytes) -> bytes:
+        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+    head, body = struct.pack(">IIBBBBB", 60_000, 60_000, 8, 2, 0, 0, 0), zlib.compress(bytes(1000))
+    parts = chunk(b"IHDR", head) + chunk(b"IDAT", body) + chunk(b"IEND", b"")
+    (tmp_path / "bomb.png").write_bytes(b"\x89PNG\r\n\x1a\n" + parts)
+    with pytest.raises(InputError, match="60,000 x 60,000 pixels, more than 536,870,912"):
+        image.size_of(tmp_path / "bomb.png")
+    assert image.read_rgb(tmp_path / "bomb.png") is None
+
+
+@pytest.mark.parametrize("kept", [0.1, 0.5, 0.9, 0.99])
+def test_a_truncated_result_is_no_surprise_to_inspect(tmp_path: Path, kept: float) -> None:
+    np.savez(tmp_path / "r.npz", a=np.arange(1000), b=np.zeros((3, 4)))
+    data = (tmp_path / "r.npz").read_bytes()
+    (tmp_path / "r.npz").write_bytes(data[: int(kept * len(data))])
+    with pytest.raises(InputError, match=r"r\.npz: can't be read"):
+        inspect_path(tmp_path / "r.npz")
