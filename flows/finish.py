@@ -18,13 +18,13 @@ from scan2sim.flows.settings import Settings
 from scan2sim.flows.survey_report import TileState, write_survey_report
 from scan2sim.pipeline.cells import outline
 from scan2sim.pipeline.errors import ScanError
-from scan2sim.pipeline.io import clouds, stac, worlds
+from scan2sim.pipeline.io import clouds, geotiff, stac, worlds
 from scan2sim.pipeline.io.survey import Survey
 from scan2sim.pipeline.store import Digests, Manifest, Store
 from scan2sim.pipeline.types import Tile
 
 TILES, PICTURE = "tiles", "picture.jpg"
-SHOWN = {"export", "exposure", "pictures", "score"}
+SHOWN = {"export", "rasters", "exposure", "pictures", "score"}
 """Steps whose files, not just figures, are shown."""
 
 
@@ -84,10 +84,10 @@ def _finish_tile(one: Made, store: Store, out: Path, settings: Settings) -> None
     store.sweep(keys)
 
 
-def _together(survey: Survey, whole: Sequence[Made], out: Path, digests: Digests) -> None:
-    """The world of all tiles, the STAC catalogue and the virtual point cloud."""
+def _together(survey: Survey, done: Sequence[Made], out: Path, digests: Digests) -> None:
+    """The world of all tiles, the STAC catalogue, the virtual point cloud and rasters."""
     tiles, items = [], []
-    for one in whole:
+    for one in done:
         assert one.tile is not None
         place = out / TILES / one.name
         tiles.append(worlds.TileWorld(one.name, place / "world", one.tile.frame))
@@ -99,12 +99,17 @@ def _together(survey: Survey, whole: Sequence[Made], out: Path, digests: Digests
                 one.name, one.tile.frame, sources, scanned,
                 None if times is None or not np.isfinite(times).all() else (float(times[0]), float(times[-1])),
                 _there(place / "world" / f"{one.name}.sdf"), _there(place / "world" / f"{one.name}.glb"),
-                _there(place / "report.html"), _there(place / PICTURE),
+                _there(place / "report.html"), _there(place / PICTURE), geotiff.find(place / "rasters", one.name),
             )
         )  # fmt: skip
     worlds.assemble(out, survey.name, tiles)
     stac.write(out, survey.name, f"{len(tiles)} tiles of {survey.name}, made by scan2sim", items)
     stac.write_vpc(out / f"{survey.name}.vpc", items)
+    for kind in geotiff.KINDS:
+        whole = out / f"{survey.name}_{kind}.vrt"
+        whole.unlink(missing_ok=True)
+        if found := [item.rasters[kind] for item in items if kind in item.rasters]:
+            geotiff.write_vrt(whole, found)
 
 
 def _there(path: Path) -> Path | None:

@@ -9,6 +9,8 @@ from typing import Any
 
 from scan2sim.flows.settings import Settings
 from scan2sim.pipeline.classes import GROUPS
+from scan2sim.pipeline.errors import UnavailableError
+from scan2sim.pipeline.io import geotiff
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.step import Params, Step
 from scan2sim.pipeline.steps.clip import CLIP
@@ -24,6 +26,7 @@ from scan2sim.pipeline.steps.path import PATH
 from scan2sim.pipeline.steps.pictures import PICTURES
 from scan2sim.pipeline.steps.plants import PLANTS
 from scan2sim.pipeline.steps.poisson import POISSON
+from scan2sim.pipeline.steps.rasters import RASTERS
 from scan2sim.pipeline.steps.split import SPLIT
 from scan2sim.pipeline.steps.trim import TRIM
 from scan2sim.pipeline.steps.views import VIEWS
@@ -43,8 +46,8 @@ from scan2sim.texturing.unwrap import UNWRAP
 
 STEPS: tuple[Step, ...] = (
     INGEST, PATH, VIEWS, LABEL, SEGMENT, OVERLAP, SPLIT, VOXEL, POISSON, TRIM, ISLANDS, CLIP, JOIN, DECIMATE, PLANTS,
-    UNWRAP, VISIBILITY, EXPOSURE, AGREEMENT, CHOOSE, TEXTURE, LEVEL, COLLISION, EXPORT, GEOMETRY, SCORE, PICTURES,
-    BORDERS,
+    UNWRAP, VISIBILITY, EXPOSURE, AGREEMENT, CHOOSE, TEXTURE, LEVEL, COLLISION, EXPORT, RASTERS, GEOMETRY, SCORE,
+    PICTURES, BORDERS,
 )  # fmt: skip
 PER_CLASS: tuple[Step, ...] = (VOXEL, POISSON, TRIM, ISLANDS, CLIP, JOIN, DECIMATE, CHOOSE, UNWRAP, TEXTURE, LEVEL)
 
@@ -161,13 +164,15 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
         add(UNWRAP, mesh | by_photo, group)
         unwrapped = {name: at(f"unwrap.{group}", name) for name in ("mesh", "pages")}
         add(TEXTURE, {**unwrapped, **choice, **clouds, **seen}, group)
-    textured = {g: at(f"texture.{g}", "textured") for g in groups}
+    textured: dict[str, Path | Output] = {g: at(f"texture.{g}", "textured") for g in groups}
     for group in groups if met else ():
         others = {f"neighbour.{name}": at(f"texture.{group}", "textured", name) for name in met}
         add(LEVEL, {"textured": textured[group]} | others, group)
         textured[group] = at(f"level.{group}", "textured")
     add(COLLISION, {g: at(f"decimate.{g}", "mesh") for g in groups}, keep_border=bool(cell))
     add(EXPORT, textured | plants | {"collision": at("collision", "mesh")}, name=tile.name)
+    if settings.params(EXPORT).rasters:
+        add(RASTERS, textured, name=tile.name, **_fineness(settings))
 
     truth: dict[str, Path | Output] = {}
     if tile.truth_mesh and tile.truth_points:
@@ -216,6 +221,18 @@ def _kept(settings: Settings) -> dict[str, Any]:
     """When photos are looked at for classes: `segment` says so, for both steps."""
     given = settings.params(SEGMENT)
     return {"overwrite": given.overwrite, "min_classified": given.min_classified, "photos": given.photos}
+
+
+def _fineness(settings: Settings) -> dict[str, Any]:
+    """Of rasters: `export` says so.
+
+    Raises:
+        UnavailableError: what writes them isn't installed.
+    """
+    if geotiff.missing():
+        raise UnavailableError("rasterio", "isn't installed, and export.rasters needs it", geotiff.REMEDY)
+    wanted, texel = settings.params(EXPORT).rasters, settings.params(UNWRAP, "terrain").texel
+    return {"pixel": texel if wanted is True else wanted, "texel": texel}
 
 
 def scanner_path(tile: Tile) -> dict[str, Any]:

@@ -143,8 +143,12 @@ class Renderer:
         background: tuple[int, int, int] = (255, 255, 255),
         shaded: bool = False,
         wireframe: bool = False,
+        samples: int = 1,
     ) -> Image:
-        """A map: straight down onto the box from `low` to `high` (3,), x to the right and y up."""
+        """A map: straight down onto the box from `low` to `high` (3,), x to the right and y up.
+
+        Its `range` is measured from 1 m above the box; `samples` and all else are as in `view`.
+        """
         low, high = np.asarray(low, float), np.asarray(high, float)
         metre = max(high[0] - low[0], 1e-3) / width
         height = max(1, round((high[1] - low[1]) / metre))
@@ -154,7 +158,7 @@ class Renderer:
             x, y = low[0] + (column + 0.5) * metre, high[1] - (row + 0.5) * metre
             return np.column_stack([x, y, np.full(len(x), top)]), np.broadcast_to([0.0, 0.0, -1.0], (len(x), 3))
 
-        return self._cast(width, height, rays, background, shaded, wireframe, 1)
+        return self._cast(width, height, rays, background, shaded, wireframe, samples)
 
     def nearest(self, points: F32) -> tuple[U8, U8, F32]:
         """Colours (N, 3) and masks (N,) of the places on the meshes nearest to points (N, 3), and metres to them."""

@@ -11,8 +11,8 @@ import functools
 import json
 import os
 import shutil
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,7 +21,7 @@ import numpy as np
 
 from scan2sim import __version__
 from scan2sim.pipeline.errors import DataError, from_os_error
-from scan2sim.pipeline.io import las
+from scan2sim.pipeline.io import geotiff, las
 from scan2sim.pipeline.io.clouds import Header
 from scan2sim.pipeline.io.crs import LOCAL, _horizontal, _parsed
 from scan2sim.pipeline.io.worlds import swap
@@ -47,6 +47,7 @@ MEDIA_TYPES = {
     ".html": "text/html",
     ".jpg": "image/jpeg",
     ".png": "image/png",
+    ".tif": "image/tiff; application=geotiff; profile=cloud-optimized",
 }
 ENCODINGS = {".laz": "laszip", ".las": "las", ".ply": "ply"}
 PDAL_NAMES = {"scan_angle": "ScanAngleRank", "scanner_channel": "ScanChannel", "nir": "Infrared"}
@@ -80,6 +81,7 @@ class TileItem:
         date: when it was scanned, where GPS times don't tell, with a time zone.
         times: first and last GPS time of its points, seconds, or None.
         world, glb, report, thumbnail: what was made of it: its SDF, GLB, page and picture; None where there is none.
+        rasters: kind ("orthophoto", "dsm", "dtm") to GeoTIFF.
         lineage: how it was made.
     """
 
@@ -92,6 +94,7 @@ class TileItem:
     glb: Path | None = None
     report: Path | None = None
     thumbnail: Path | None = None
+    rasters: Mapping[str, Path] = field(default_factory=dict)
     lineage: str = LINEAGE
 
 
@@ -226,6 +229,10 @@ def _add_assets(item: pystac.Item, tile: TileItem) -> None:
         ("report", tile.report, "How it was made and how good it is", ["metadata"], None),
         ("thumbnail", tile.thumbnail, "Picture", ["thumbnail"], None),
     ]
+    for kind, raster in tile.rasters.items():
+        files.append(
+            (kind, raster, geotiff.KINDS[kind], ["data", "visual"] if kind == "orthophoto" else ["data"], None)
+        )
     for i, cloud in enumerate(tile.clouds):  # "data" is where PDAL's reader looks
         files.append((f"data_{i}" if i else "data", cloud.path, "Lidar points", ["data"], cloud.digest))
     for key, path, title, roles, digest in files:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -31,6 +31,8 @@ class ExportParams(Params):
         jpeg_quality: of the GLB's textures, and of JPEG pages.
         world_origin: metres in the CRS; several tiles with the same one share their georeference.
             Default: the tile's own origin.
+        rasters: metres a pixel of an orthophoto, a DSM and a DTM as cloud-optimised GeoTIFF (the step `rasters`);
+            true: as fine as the ground's texels.
     """
 
     name: str = Field("tile", pattern=r"^[A-Za-z0-9_]+$")
@@ -43,6 +45,7 @@ class ExportParams(Params):
     pages: Literal["png", "jpeg"] = "png"
     jpeg_quality: int = Field(90, ge=1, le=100)
     world_origin: tuple[float, float, float] | None = None
+    rasters: bool | Annotated[float, Field(ge=0.001, le=100)] = False
 
 
 def export(inputs: Inputs, params: ExportParams, out: Path, report: Report) -> Done:

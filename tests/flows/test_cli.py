@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from scan2sim.pipeline.io import las
+from scan2sim.pipeline.classes import GROUPS, group_of
+from scan2sim.pipeline.io import geotiff, las
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.pipeline.types import Frame, PointCloud
+from scan2sim.pipeline.types import Frame, Mesh, PointCloud
 from tests.conftest import ROOT
 from tests.gazebo.checker import check_world
 
@@ -64,6 +65,27 @@ def world(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("world")
     good(scan2sim("run", street, "--out", out, "--hold-out", 4, *SMALL))
     return out
+
+
+def test_rasters_are_made_where_they_are_asked_for(street: Path, world: Path, tmp_path: Path) -> None:
+    rasterio = pytest.importorskip("rasterio", reason="rasterio isn't installed")
+    out = shutil.copytree(world, tmp_path / "out")
+    command = (street, "--out", out, "--hold-out", 4, *SMALL)
+    assert "rasters" not in good(scan2sim("plan", *command))
+    assert not (out / "rasters").exists()
+    good(scan2sim("run", *command, "--set", "export.rasters=0.1"))
+    tile = read_tile(street)
+    assert tile.truth_mesh is not None
+    truth = Mesh.load(tile.truth_mesh)
+    ground = truth.keep(group_of()[truth.label] == GROUPS.index("terrain"))
+    with rasterio.open(next(out.glob("rasters/*_dtm.tif"))) as raster:
+        assert raster.crs.to_epsg() == 32633
+        middle = truth.frame.to_crs(ground.corners.mean(axis=1))
+        height = np.array([value[0] for value in raster.sample(middle[:, :2])], float)
+    error = np.abs(height - middle[:, 2])[height > geotiff.NODATA]
+    assert len(error) > 1000 and np.median(error) < 0.02 and np.percentile(error, 90) < 0.06
+    good(scan2sim("run", *command))
+    assert not (out / "rasters").exists()  # they are of another run than the world
 
 
 @pytest.fixture

@@ -1,0 +1,112 @@
+"""Rasters: the world as maps that GIS tools read: an orthophoto, the highest surface, the ground."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pydantic import Field
+
+from scan2sim.pipeline.classes import GROUPS
+from scan2sim.pipeline.errors import DataError, SettingError
+from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from scan2sim.pipeline.render import Image, Renderer
+
+BAND = 2_000_000
+"""Pixels that are rendered at a time, in whole rows."""
+LARGEST = 1e9
+"""Pixels of a raster: half an hour of rendering."""
+SAMPLES = 4
+"""Rays a pixel each way, at most."""
+
+
+class RastersParams(Params):
+    """How fine rasters are; all is set by the recipe (`export.rasters` asks for them).
+
+    Attributes:
+        name: of the tile.
+        pixel: metres a pixel.
+        texel: metres a texel of the ground: where pixels are larger, they are the mean of several rays.
+    """
+
+    name: str = Field("tile", pattern=r"^[A-Za-z0-9_]+$")
+    pixel: float = Field(0.05, ge=0.001, le=100)
+    texel: float = Field(0.01, gt=0)
+
+
+def rasters(inputs: Inputs, params: RastersParams, out: Path, report: Report) -> Done:
+    """Look at the textured groups from straight above, in the tile's CRS.
+
+    Files below `rasters/`: `<name>_orthophoto.tif` (colours), `<name>_dsm.tif` (heights of the highest surface) and
+    `<name>_dtm.tif` (heights of the terrain's mesh alone: nothing where there is none, as below buildings).
+
+    Raises:
+        DataError: no group has a face.
+        SettingError: the raster would be too large.
+    """
+    import numpy as np
+
+    from scan2sim.pipeline import render
+    from scan2sim.pipeline.io import geotiff
+    from scan2sim.pipeline.io.crs import LOCAL
+
+    bodies = {group: render.textured(inputs[group]) for group in GROUPS if group in inputs}
+    bodies = {group: body for group, body in bodies.items() if len(body.mesh)}
+    if not bodies:
+        raise DataError("rasters", "there is nothing to show: every surface is empty", "Check the classes of the cloud")
+    vertices = np.concatenate([body.mesh.vertices for body in bodies.values()])
+    low, high = vertices.min(axis=0).astype(float), vertices.max(axis=0).astype(float)
+    frame = next(iter(bodies.values())).mesh.frame
+    grid = geotiff.Grid.around(frame, low, high, params.pixel)
+    if grid.width * grid.height > LARGEST:
+        raise SettingError(
+            "export.rasters",
+            f"{params.pixel:g} m a pixel are {grid.width} x {grid.height} pixels",
+            f"Set export.rasters={params.pixel * (grid.width * grid.height / LARGEST) ** 0.5 * 1.1:.2g} or more",
+        )
+
+    def looks(renderer: Renderer, samples: int = 1) -> Iterator[Image]:
+        rows = max(1, BAND // grid.width)
+        for first in range(0, grid.height, rows):
+            south_west, north_east = grid.band(first, min(rows, grid.height - first))
+            corners = np.append(south_west, low[2]), np.append(north_east, high[2])
+            yield renderer.above(*corners, width=grid.width, samples=samples)
+
+    def heights(renderer: Renderer) -> Iterator[npt.NDArray[np.float64]]:
+        for image in looks(renderer):
+            z = high[2] + 1.0 - image.range.astype(float) + frame.origin[2]
+            yield np.where(image.hit, z / frame.unit, np.nan)
+
+    def colours() -> Iterator[npt.NDArray[np.uint8]]:
+        for image in looks(
+            render.Renderer(list(bodies.values())), min(SAMPLES, round(params.pixel / params.texel)) or 1
+        ):
+            yield np.dstack([image.rgb, image.hit * np.uint8(255)])
+
+    folder = out / "rasters"
+    folder.mkdir()
+    plain = {group: render.Body(body.mesh) for group, body in bodies.items()}
+    report(0.0, "orthophoto")
+    geotiff.write_colours(folder / f"{params.name}_orthophoto.tif", grid, colours())
+    report(0.6, "DSM")
+    geotiff.write_heights(folder / f"{params.name}_dsm.tif", grid, heights(render.Renderer(list(plain.values()))))
+    report(0.8, "DTM")
+    ground = [plain["terrain"]] if "terrain" in plain else []
+    geotiff.write_heights(folder / f"{params.name}_dtm.tif", grid, heights(render.Renderer(ground)))
+    facts: dict[str, Any] = {
+        "width": grid.width,
+        "height": grid.height,
+        "pixel_m": params.pixel,
+        "bytes": sum(file.stat().st_size for file in folder.iterdir()),
+    }
+    local = "the tile has no CRS, so its rasters have none: they lie at the tile's own coordinates"
+    return Done({"rasters": folder}, facts, [local] if frame.crs == LOCAL else [])
+
+
+RASTERS = Step("rasters", 1, rasters, RastersParams)
