@@ -58,6 +58,9 @@ From = Annotated[str | None, typer.Option("--from", metavar="STEP", help="Run th
 Name = Annotated[str | None, typer.Option("--name", help="The tile's name; default: from the folder.")]
 TileOut = Annotated[Path, typer.Option("--out", "-o", help="The tile's folder.")]
 Crs = Annotated[str | None, typer.Option(help='CRS, where the files lack it: "EPSG:32633", or "local".')]
+Classes = Annotated[
+    str, typer.Option(metavar="CODE=CLASS,...", help="What codes of the cloud are: 65=noise,200=5 (docs/formats.md).")
+]
 Link = Annotated[bool, typer.Option("--link", help="Link files into the tile instead of copying them.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a tile that is there already.")]
 
@@ -355,18 +358,20 @@ def import_colmap_model(
     crs: Crs = "local",
     upright: Annotated[bool, typer.Option("--upright", help="Turn it so that photos stand upright.")] = False,
     scale: Annotated[float, typer.Option(help="Metres per unit of the model.")] = 1.0,
+    classes: Classes = "",
     name: Name = None,
     link: Link = False,
     overwrite: Overwrite = False,
 ) -> None:
     """COLMAP model, text or binary."""
     from scan2sim.flows.display import progress
+    from scan2sim.pipeline.classes import parse
     from scan2sim.pipeline.io.colmap import import_colmap
 
     up: Literal["photos"] | None = "photos" if upright else None
     with progress("import") as report:
         path = import_colmap(
-            model, images, out, cloud=cloud, crs=crs or "local", up=up, scale=scale,
+            model, images, out, cloud=cloud, crs=crs or "local", up=up, scale=scale, classes=parse(classes),
             name=name, link=link, overwrite=overwrite, report=report,
         )  # fmt: skip
     typer.echo(f"Tile: {path}")
@@ -385,19 +390,21 @@ def import_plain_clouds(
     crs: Crs = None,
     units: Annotated[str | None, typer.Option(help="m, ft or us-ft, where the CRS doesn't say.")] = None,
     trajectory: Annotated[Path | None, typer.Option(help="CSV of the scanner's path: time,x,y,z.")] = None,
+    classes: Classes = "",
     name: Name = None,
     link: Link = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Plain clouds, with a CSV of photos if there are any."""
     from scan2sim.flows.display import progress
+    from scan2sim.pipeline.classes import parse
     from scan2sim.pipeline.io.las_csv import import_las
 
     told: list[str] = []
     with progress("import") as report:
         path = import_las(
             clouds, out, photos=photos, cameras=cameras, images=images, crs=crs, units=units, trajectory=trajectory,
-            name=name, link=link, overwrite=overwrite, warn=told.append, report=report,
+            classes=parse(classes), name=name, link=link, overwrite=overwrite, warn=told.append, report=report,
         )  # fmt: skip
     _imported(path, told)
 

@@ -220,9 +220,11 @@ def _assign(corridor: Corridor, places: F64, options: Options, spool: Spool, rep
         path = cKDTree(dense((tile.trajectory.positions + np.asarray(tile.frame.origin))[:, :2]))
     total, done, far = sum(corridor.counts), 0, 0
     for cloud in tile.clouds:
+        table = clouds.meanings(cloud, tile.classes)
         for part in clouds.chunks(cloud, tile.frame, CHUNK):
             report(READING * done / total, f"reading {cloud.name}")
             done += len(part)
+            part = part if part.label is None else replace(part, label=table[part.label])
             rows = spool.rows(part)
             xy = spool.world(rows)[:, :2]
             if path is not None:

@@ -67,7 +67,7 @@ def _bounds(low: object, high: object) -> str:
 def _cloud(path: Path) -> tuple[str, Facts]:
     import numpy as np
 
-    from scan2sim.pipeline.classes import CLASSES
+    from scan2sim.pipeline.classes import name_of
     from scan2sim.pipeline.io import clouds
     from scan2sim.pipeline.io.crs import name as crs_name
     from scan2sim.pipeline.types import Frame
@@ -87,12 +87,12 @@ def _cloud(path: Path) -> tuple[str, Facts]:
     if cloud.time is not None and len(cloud):
         facts.append(("GPS time", f"{cloud.time.min():.3f} to {cloud.time.max():.3f} s"))
     if cloud.label is not None:
-        names = {c.code: c.name for c in CLASSES}
+        table = clouds.meanings(path, {})
         codes, counts = np.unique(cloud.label, return_counts=True)
         facts += [
             (
                 "classes" if i == 0 else "",
-                f"{code:3d} {names.get(code, '?'):<16}{count:>14,}  {count / len(cloud):6.1%}",
+                f"{code:3d} {name_of(int(table[code])):<16}{count:>14,}  {count / len(cloud):6.1%}",
             )
             for i, (code, count) in enumerate(zip(codes.tolist(), counts.tolist(), strict=True))
         ]

@@ -100,7 +100,8 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
         nodes.append(Node(at(label, "").node, step, settings.params(step, group, **given), inputs))
 
     frame: dict[str, Any] = {"crs": tile.frame.crs, "origin": tile.frame.origin, "unit": tile.frame.unit}
-    add(INGEST, {f"cloud.{i:04d}": path for i, path in enumerate(tile.clouds)}, **frame)
+    files = {f"cloud.{i:04d}": path for i, path in enumerate(tile.clouds)}
+    add(INGEST, files, **frame, classes=dict(tile.classes))
     whole = {"cloud": at("ingest", "cloud")}
     path = scanner_path(tile)
     if path:

@@ -1,17 +1,20 @@
 """The classes of points and what becomes of each: one table.
 
 Codes are those of ASPRS LAS 1.4 (2 ground, 3-5 vegetation, 6 building, 11 road, ...) and, from 64
-on, user-definable ones. A group is a surface that is meshed by itself (D3.2, section 4.2: terrain,
-building, vegetation); classes without a group are left out of the surface, though they still hide
-what is behind them.
+on, user-definable ones: another survey's 65 is no pole (`meanings`). A group is a surface that is
+meshed by itself (D3.2, section 4.2: terrain, building, vegetation); classes without a group are left
+out of the surface, though they still hide what is behind them.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+
+from scan2sim.pipeline.errors import SettingError
 
 Group = Literal["terrain", "building", "vegetation"]
 GROUPS: tuple[Group, ...] = ("terrain", "building", "vegetation")
@@ -53,8 +56,112 @@ CLASSES: tuple[PointClass, ...] = (
     PointClass(69, "sidewalk", "terrain", (200, 180, 190)),
 )
 CODE: dict[str, int] = {c.name: c.code for c in CLASSES}
+OTHER_NAMES = {"ground": 2, "vegetation": 5, "noise": 7, "bridge": 17, "sign": 64, "car": 66, "wall": 68, "fence": 68}
 NOISE = (7, 18)
-UNKNOWN = (0, 1, 12)  # never classified, unclassified, legacy overlap
+UNCLASSIFIED = CODE["unclassified"]
+UNKNOWN = (0, UNCLASSIFIED, 12)  # never classified, unclassified, legacy overlap
+OF_THE_SURVEY = 64
+"""From this code on each survey has classes of its own (LAS 1.4 R15, table 17)."""
+U8 = npt.NDArray[np.uint8]
+
+
+def code_of(text: str) -> int | None:
+    """The code of a class by its name, however that is written ("Road sign"), or by itself ("64"); None: no such."""
+    plain = _plain(text)
+    names = {_plain(name): code for name, code in (OTHER_NAMES | CODE).items()}
+    return names.get(plain, int(plain) if plain.isdigit() and int(plain) in CODE.values() else None)
+
+
+def name_of(code: int) -> str:
+    """What a code is called; "code_31" where it has no name."""
+    return next((c.name for c in CLASSES if c.code == code), f"code_{code}")
+
+
+def parse(text: str) -> dict[int, int]:
+    """Codes of a survey and what they are here, of "65=noise,200=5".
+
+    Raises:
+        SettingError: a code or class that there isn't.
+    """
+    return mapping(dict((entry.strip().partition("=")[::2]) for entry in text.split(",") if entry.strip()))
+
+
+def mapping(given: Mapping[str, str | int]) -> dict[int, int]:
+    """Codes of a survey (0 to 255) and what they are here, of texts: `{"65": "noise"}`.
+
+    Raises:
+        SettingError: a code or class that there isn't.
+    """
+    found = {}
+    for code, name in given.items():
+        meant = code_of(str(name))
+        if not (code.strip().isdecimal() and len(code.strip()) < 4 and int(code) < 256):
+            raise SettingError(
+                "classes", f"{code[:40]!r} is no code", "Write 65=noise: a code of the file from 0 to 255"
+            )
+        if meant is None:
+            raise SettingError(
+                "classes",
+                f"there is no class {str(name)[:40]!r} (for {code})",
+                f"There are: {', '.join(CODE)}, or codes",
+            )
+        found[int(code)] = meant
+    return found
+
+
+def meanings(ours: bool, names: Mapping[int, str], given: Mapping[int, int]) -> U8:
+    """Lookup table (256,): a file's code to ours.
+
+    Codes below 64 are the standard's. Others are unclassified, but where the file names them as we do, or says that
+    it is of this project; and what the user says holds before all that.
+
+    Args:
+        ours: the file says that scan2sim wrote it.
+        names: what the file calls its codes.
+        given: the user's word, code to code.
+    """
+    table = np.arange(256, dtype=np.uint8)
+    known = set(CODE.values())
+    for code in range(256):
+        named = code_of(names.get(code, ""))
+        if code in given:
+            table[code] = given[code]
+        elif code in known and (code < OF_THE_SURVEY or (ours and not names.get(code))):
+            continue
+        elif named is not None:
+            table[code] = named
+        elif code >= OF_THE_SURVEY:
+            table[code] = UNCLASSIFIED
+    return table
+
+
+def known() -> npt.NDArray[np.bool_]:
+    """Lookup table (256,): whether a LAS code says what a point is."""
+    table = np.zeros(256, bool)
+    table[list(CODE.values())] = True
+    table[list(UNKNOWN)] = False
+    return table
+
+
+def strangers(label: U8, table: U8) -> str:
+    """What to say of a file's codes (N,) that `meanings` made nothing of; empty if there are none.
+
+    Codes of the survey's own are meant: what has none is told of where surfaces are made (`split`).
+    """
+    count = np.bincount(label, minlength=256)
+    lost = [c for c in np.flatnonzero(count).tolist() if c >= OF_THE_SURVEY and table[c] == UNCLASSIFIED]
+    if not lost:
+        return ""
+    codes = ", ".join(f"{c} ({count[c] / len(label):.1%})" for c in lost[:8])
+    return (
+        f"codes {codes} are the survey's own (LAS leaves those from {OF_THE_SURVEY} on to it), "
+        f"and taken as unclassified. Say what they are: import with --classes {lost[0]}=building, or write [classes] and "
+        f'{lost[0]} = "building" into tile.toml'
+    )
+
+
+def _plain(text: str) -> str:
+    return "".join(c for c in text.lower() if c.isalnum())
 
 
 def group_of() -> npt.NDArray[np.int8]:

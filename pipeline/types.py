@@ -7,8 +7,8 @@ origin is subtracted before anything becomes float32 ("local" coordinates below)
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -351,6 +351,7 @@ class Tile:
         clouds: point cloud files.
         views: posed photos, poses in the frame's local coordinates.
         trajectory: the scanner's path, or None.
+        classes: codes of the clouds and what they are here, where the user says so (`pipeline.classes`).
         cell: what of the survey that it was cut from is the tile's own, or None: all of it.
         truth_mesh: ground-truth surface (.npz `Mesh` with `label`), for generated tiles, or None.
         truth_points: ground-truth coloured surface samples (LAZ), for generated tiles, or None.
@@ -362,6 +363,7 @@ class Tile:
     clouds: tuple[Path, ...]
     views: tuple[View, ...] = ()
     trajectory: Trajectory | None = None
+    classes: Mapping[int, int] = field(default_factory=dict)
     cell: Cell | None = None
     truth_mesh: Path | None = None
     truth_points: Path | None = None

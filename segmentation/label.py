@@ -8,9 +8,6 @@ from typing import TYPE_CHECKING
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
     from scan2sim.pipeline.types import U8
 
 
@@ -76,15 +73,12 @@ def label(inputs: Inputs, params: LabelParams, out: Path, report: Report) -> Don
 
 
 def classified(label: U8 | None) -> float:
-    """Share of points that have a class of their own (other than never classified and unclassified)."""
-    import numpy as np
-
-    from scan2sim.pipeline.classes import UNKNOWN
+    """Share of points whose class says what they are: not "unclassified", nor a code that has no meaning."""
+    from scan2sim.pipeline.classes import known
 
     if label is None or not len(label):
         return 0.0
-    known: npt.NDArray[np.bool_] = ~np.isin(label, UNKNOWN)
-    return float(known.mean())
+    return float(known()[label].mean())
 
 
-LABEL = Step("label", 1, label, LabelParams)
+LABEL = Step("label", 2, label, LabelParams)

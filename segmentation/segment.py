@@ -48,7 +48,7 @@ def segment(inputs: Inputs, params: SegmentParams, out: Path, report: Report) ->
 
     import numpy as np
 
-    from scan2sim.pipeline.classes import CLASSES, group_of
+    from scan2sim.pipeline.classes import group_of, name_of
     from scan2sim.pipeline.types import PointCloud
     from scan2sim.segmentation.label import classified
 
@@ -71,11 +71,10 @@ def segment(inputs: Inputs, params: SegmentParams, out: Path, report: Report) ->
         source = "photos and shape" if told else "shape"
     np.savez(beside, confidence=sure, source=kinds)
     count = np.bincount(label, minlength=256)
-    names = {c.code: c.name for c in CLASSES}
     facts = {
         "source": source,
         "own_classes": round(own, 4),
-        "points": {names.get(code, str(code)): int(count[code]) for code in np.flatnonzero(count).tolist()},
+        "points": {name_of(code): int(count[code]) for code in np.flatnonzero(count).tolist()},
     } | told
     warnings = []
     if source == "shape":
@@ -151,4 +150,4 @@ def _from_photos(
     return code_of_index()[best], np.round(255 * sure).astype(np.uint8), seen.astype(np.uint8), told
 
 
-SEGMENT = Step("segment", 4, segment, SegmentParams)
+SEGMENT = Step("segment", 5, segment, SegmentParams)

@@ -8,14 +8,15 @@ install, or None.
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from scan2sim.pipeline import classes
 from scan2sim.pipeline.errors import InputError, UnavailableError
 from scan2sim.pipeline.io import files
-from scan2sim.pipeline.types import F64, Frame, PointCloud
+from scan2sim.pipeline.types import F64, U8, Frame, PointCloud
 
 CHUNK = 2_000_000
 FORMATS = {
@@ -79,13 +80,24 @@ def read_header(path: Path) -> Header:
 
 
 def read(path: Path, frame: Frame) -> PointCloud:
-    """Read a cloud into `frame`'s local coordinates.
+    """Read a cloud into `frame`'s local coordinates; its classes are the file's codes (see `meanings`).
 
     Raises:
         InputError: missing, truncated, or of an unknown format. UnavailableError: its library isn't installed.
     """
     cloud: PointCloud = _reader(path).read(path, frame)
     return cloud
+
+
+def meanings(path: Path, given: Mapping[int, int]) -> U8:
+    """Lookup table (256,) of what a cloud's class codes are here; `given` is the user's word (`pipeline.classes`).
+
+    Raises:
+        InputError: as `read`.
+    """
+    reader = _reader(path)
+    ours, names = reader.class_names(path) if hasattr(reader, "class_names") else (False, {})
+    return classes.meanings(ours, names, given)
 
 
 def chunks(path: Path, frame: Frame, size: int = CHUNK) -> Iterator[PointCloud]:

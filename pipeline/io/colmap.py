@@ -9,6 +9,7 @@ metres: align it first (`colmap model_aligner`), or say `up` and `scale`.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -50,6 +51,7 @@ def import_colmap(
     link: bool = False,
     overwrite: bool = False,
     name: str | None = None,
+    classes: Mapping[int, int] | None = None,
     report: Report = silent,
 ) -> Path:
     """Make a tile of a COLMAP model and its photos.
@@ -64,6 +66,7 @@ def import_colmap(
         up: direction of the model that becomes +z, or "photos" for the mean of the photos' up; the
             model's +z by default.
         scale: metres per unit of the model.
+        classes: codes of the cloud and what they are here, where they differ (`pipeline.classes`).
         link: link to the photos and the cloud instead of copying them.
 
     Returns:
@@ -106,8 +109,9 @@ def import_colmap(
                 }
             )
         write_tile(
-            folder, name=tile_name(name or Path(out).name), crs=crs, clouds=[file], cameras=cameras, photos=entries
-        )
+            folder, name=tile_name(name or Path(out).name), crs=crs, clouds=[file], cameras=cameras, photos=entries,
+            classes=classes,
+        )  # fmt: skip
         read_tile(folder)  # what it refuses is refused here, before the tile appears
     report(1.0, "done")
     return Path(out) / "tile.toml"

@@ -128,6 +128,15 @@ def read(path: Path, frame: Frame) -> PointCloud:
     return PointCloud(frame, xyz, _eight_bits(rgb), label=label, time=time, intensity=intensity)
 
 
+def class_names(path: Path) -> tuple[bool, dict[int, str]]:
+    """Whether this project wrote a file, and what its lookup record calls its classes."""
+    with _open(path) as reader:
+        header = reader.header
+        writers = f"{header.system_identifier} {header.generating_software}".lower()
+        names = {c: n for record in header.vlrs.get("ClassificationLookupVlr") for c, n in record.lookups.items()}
+    return SOFTWARE in writers, names
+
+
 def chunks(path: Path, frame: Frame, size: int = CHUNK) -> Iterator[PointCloud]:
     """The points in their order, `size` at a time, as `read` reads them.
 
@@ -156,18 +165,20 @@ def write(path: Path, cloud: PointCloud, scale: float = 0.001) -> None:
     write_parts(path, [cloud], scale)
 
 
-def write_parts(path: Path, parts: Iterable[PointCloud], scale: float = 0.001) -> None:
+def write_parts(path: Path, parts: Iterable[PointCloud], scale: float = 0.001, software: str = SOFTWARE) -> None:
     """Write what `write` would of all parts together, which are in one frame and have the same attributes.
 
     Args:
         parts: at least one; only one at a time is in memory.
         scale: metres, the precision of coordinates.
+        software: that classes are of; another than `SOFTWARE` where they are as a survey has them.
     """
     import laspy
 
     rest = iter(parts)
     first = next(rest)
     header = _header(first, scale)
+    header.generating_software = software
     with laspy.open(path, mode="w", header=header) as writer:
         for part in chain([first], rest):
             writer.write_points(_record(part, header))
@@ -178,7 +189,7 @@ def _header(cloud: PointCloud, scale: float) -> Any:
     from laspy.vlrs.known import WktCoordinateSystemVlr
 
     header = laspy.LasHeader(point_format=6 if cloud.rgb is None else 7, version="1.4")
-    header.creation_date, header.generating_software = DAY, SOFTWARE
+    header.creation_date = DAY
     header.scales = np.full(3, scale / cloud.frame.unit)
     header.offsets = np.floor(cloud.frame.to_crs(np.zeros(3)))
     if cloud.frame.crs != "local":

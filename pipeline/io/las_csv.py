@@ -59,6 +59,7 @@ def import_las(
     link: bool = False,
     overwrite: bool = False,
     name: str | None = None,
+    classes: Mapping[int, int] | None = None,
     warn: Callable[[str], None] = lambda _: None,
     report: Report = silent,
 ) -> Path:
@@ -75,6 +76,7 @@ def import_las(
         units: "m", "ft" or "us-ft", where the CRS doesn't say it.
         trajectory: CSV of the scanner's path: a heading, then time,x,y,z a line.
         link: link to clouds and photos instead of copying them.
+        classes: codes of the clouds and what they are here, where they differ (`pipeline.classes`).
         warn: receives what was assumed of clouds that don't say it.
 
     Returns:
@@ -113,6 +115,7 @@ def import_las(
             photos=shots,
             trajectory=place(trajectory, folder, "trajectory.csv", link) if trajectory else None,
             units=units,
+            classes=classes,
         )
         read_tile(folder)  # what it refuses is refused here, before the tile appears
     report(1.0, "done")
@@ -126,7 +129,7 @@ def _take(cloud: Path, folder: Path, frame: Frame, link: bool) -> str:
     name = f"{cloud.resolve().parent.name if cloud.name == 'ept.json' else cloud.stem}.laz"
     if (folder / name).exists():
         raise InputError(cloud, f"is the second cloud to be called {name} in the tile", "Rename one of them")
-    las.write_parts(folder / name, cloud_io.chunks(cloud, frame))
+    las.write_parts(folder / name, cloud_io.chunks(cloud, frame), software="")  # its classes are the survey's still
     return name
 
 

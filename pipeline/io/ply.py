@@ -54,10 +54,12 @@ class Layout:
     last: bool
 
 
-def read_header(path: Path) -> tuple[int, F64, F64, str | None]:
-    """Number of points that are finite, low and high corner (CRS units); PLY has no CRS."""
+def read_header(path: Path) -> tuple[int, F64, F64, str | None, tuple[str, ...]]:
+    """Number of points that are finite, low and high corner (CRS units), no CRS, and how many aren't finite."""
     found = points.summary(path, _parts(path))
-    return found.count, found.low, found.high, None
+    lost = layout(path).count - found.count
+    notes = (f"{lost:,} points with NaN coordinates left out",) if lost else ()
+    return found.count, found.low, found.high, None, notes
 
 
 def read(path: Path, frame: Frame) -> PointCloud:

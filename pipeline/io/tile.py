@@ -7,6 +7,9 @@ units = "m"                 # "ft", "us-ft"; default: as the CRS says, else metr
 clouds = ["cloud.laz"]      # LAS, LAZ, COPC, PLY, E57, PCD, XYZ, CSV; coordinates in that CRS and unit
 trajectory = "path.csv"     # optional: the scanner's path, time,x,y,z or with rotations (.csv, .tum)
 
+[classes]                   # optional: what codes of the clouds are, where they differ from docs/formats.md's
+65 = "noise"
+
 [[cameras]]
 id = "front"
 model = "opencv"            # pinhole, opencv (Brown-Conrady), fisheye, equirectangular
@@ -32,7 +35,7 @@ A generated tile also names its ground truth:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -40,7 +43,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from scan2sim.pipeline.cells import Cell
-from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.classes import mapping, name_of
+from scan2sim.pipeline.errors import InputError, SettingError
 from scan2sim.pipeline.io import clouds as cloud_io
 from scan2sim.pipeline.io import crs as crs_io
 from scan2sim.pipeline.io import files, toml
@@ -101,6 +105,7 @@ class TileFile(_Strict):
     units: Literal["m", "ft", "us-ft"] | None = None
     clouds: tuple[str, ...] = Field(min_length=1)
     trajectory: str | None = None
+    classes: dict[str, str | int] = {}
     cameras: tuple[CameraEntry, ...] = ()
     photos: tuple[PhotoEntry, ...] = ()
     cell: CellEntry | None = None
@@ -133,6 +138,7 @@ def read_tile(path: Path) -> Tile:
         clouds=clouds,
         views=tuple(_view(path, i, entry, cameras, frame) for i, entry in enumerate(spec.photos)),
         trajectory=_trajectory(path, spec, frame),
+        classes=_classes(path, spec),
         cell=_cell(spec.cell, unit),
         truth_mesh=_existing(path, spec.truth.mesh, "truth.mesh") if spec.truth else None,
         truth_points=_existing(path, spec.truth.points, "truth.points") if spec.truth else None,
@@ -151,6 +157,7 @@ def write_tile(
     units: str | None = None,
     cell: dict[str, Any] | None = None,
     truth: dict[str, str] | None = None,
+    classes: Mapping[int, int] | None = None,
 ) -> Path:
     """Write `folder/tile.toml` and return its path.
 
@@ -169,6 +176,8 @@ def write_tile(
         body["truth"] = truth
     if cell:
         body["cell"] = cell
+    if classes:
+        body["classes"] = {str(code): name_of(meant) for code, meant in classes.items()}
     body["cameras"] = [_camera_entry(key, camera) for key, camera in cameras.items()]
     body["photos"] = [
         {k: (v.tolist() if isinstance(v, np.ndarray) else v) for k, v in photo.items() if v is not None}
@@ -269,6 +278,13 @@ def _view(tile: Path, index: int, entry: PhotoEntry, cameras: dict[str, Camera],
         mask=tile.parent / entry.mask if entry.mask else None,
         time=entry.time,
     )
+
+
+def _classes(tile: Path, spec: TileFile) -> dict[int, int]:
+    try:
+        return mapping(spec.classes)
+    except SettingError as error:
+        raise InputError(tile, f"field `classes`: {error.cause}", error.remedy) from None
 
 
 def _cell(entry: CellEntry | None, unit: float) -> Cell | None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from pydantic import Field
+
 from scan2sim.pipeline.errors import DataError
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
@@ -13,11 +15,12 @@ WIDEST = 5000.0
 
 
 class IngestParams(Params):
-    """Where the cloud is brought to; set by the recipe from the tile."""
+    """Where the cloud is brought to, and what its classes are; set by the recipe from the tile."""
 
     crs: str = "local"
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     unit: float = 1.0
+    classes: dict[int, int] = Field(default_factory=dict)
 
 
 def ingest(inputs: Inputs, params: IngestParams, out: Path, report: Report) -> Done:
@@ -29,8 +32,11 @@ def ingest(inputs: Inputs, params: IngestParams, out: Path, report: Report) -> D
     Raises:
         DataError: fewer than 1000 points in all, or points that are further apart than 5 km.
     """
+    from dataclasses import replace
+
     import numpy as np
 
+    from scan2sim.pipeline import classes
     from scan2sim.pipeline.io import clouds
     from scan2sim.pipeline.types import Frame, PointCloud
 
@@ -41,6 +47,11 @@ def ingest(inputs: Inputs, params: IngestParams, out: Path, report: Report) -> D
         report(i / len(inputs), f"reading {inputs[name].name}")
         warnings += [f"{inputs[name].name}: {note}" for note in clouds.read_header(inputs[name]).notes]
         cloud = clouds.read(inputs[name], frame)
+        if cloud.label is not None and len(cloud):
+            table = clouds.meanings(inputs[name], params.classes)
+            strange = classes.strangers(cloud.label, table)
+            warnings += [f"{inputs[name].name}: {strange}"] if strange else []
+            cloud = replace(cloud, label=table[cloud.label])
         finite = np.atleast_1d(np.isfinite(cloud.xyz).all(axis=1))
         if not finite.all():
             warnings.append(f"{inputs[name].name}: {np.count_nonzero(~finite):,} points with NaN coordinates left out")
@@ -65,7 +76,7 @@ def ingest(inputs: Inputs, params: IngestParams, out: Path, report: Report) -> D
         "points": len(cloud),
         "extent_m": (high - low).round(2).tolist(),
         "coloured": cloud.rgb is not None,
-        "classified": bool(cloud.label is not None and (cloud.label > 1).any()),
+        "classified": bool(cloud.label is not None and classes.known()[cloud.label].any()),
         "timed": cloud.time is not None,
     }
     return Done({"cloud": out / "cloud.npz"}, facts, warnings)

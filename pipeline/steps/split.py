@@ -5,9 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from scan2sim.pipeline.classes import CLASSES, GROUPS, NOISE, group_of
+from scan2sim.pipeline.classes import GROUPS, NOISE, group_of, known, name_of
 from scan2sim.pipeline.errors import DataError
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
+
+TELL = 0.01
+"""Share of points without a class from which on a run warns."""
 
 
 class SplitParams(Params):
@@ -53,10 +56,17 @@ def split(inputs: Inputs, params: SplitParams, out: Path, report: Report) -> Don
             "no point belongs to terrain, building or vegetation",
             "Check the cloud's classes, or classify it anew with --set segment.overwrite=true",
         )
-    known = {c.code: c.name for c in CLASSES}
     codes, numbers = np.unique(cloud.label, return_counts=True)
-    classes = {known.get(int(c), f"code_{c}"): int(n) for c, n in zip(codes, numbers, strict=True)}
+    classes = {name_of(int(c)): int(n) for c, n in zip(codes, numbers, strict=True)}
+    vanished = {name_of(int(c)): int(n) for c, n in zip(codes, numbers, strict=True) if not known()[c]}
+    if sum(vanished.values()) > TELL * len(cloud):
+        which = ", ".join(f"{name} {n / len(cloud):.1%}" for name, n in vanished.items())
+        warnings.append(
+            f"{sum(vanished.values()) / len(cloud):.1%} of the points have no class that says what they are ({which}): "
+            'the world has no surface there. Say what codes are by [classes] in tile.toml (31 = "building"), '
+            "or have all classes told anew by --set segment.overwrite=true"
+        )
     return Done(files, {"points_in": len(cloud), "points": counts, "classes": classes}, warnings)
 
 
-SPLIT = Step("split", 1, split, SplitParams)
+SPLIT = Step("split", 2, split, SplitParams)

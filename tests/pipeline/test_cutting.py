@@ -368,7 +368,7 @@ def test_clouds_of_all_kinds_join_as_in_a_tile(tmp_path: Path) -> None:
     (folder / "tile.toml").write_text(tomli_w.dumps(body))
     told: list[str] = []
     made = tiles(cut_survey(folder, tmp_path / "out", CUT, warn=told.append))
-    assert "1 points with NaN coordinates left out" in told
+    assert "2.ply: 1 points with NaN coordinates left out" in told
     first, middle, last = (clouds.read(tile.clouds[0], tile.frame) for tile in made.values())
     assert first.time is not None and first.intensity is not None and (first.rgb != 128).any()  # type: ignore[union-attr]
     assert middle.rgb is not None and (middle.rgb == 128).all(axis=1).mean() > 0.5
