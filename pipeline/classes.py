@@ -153,10 +153,10 @@ def strangers(label: U8, table: U8) -> str:
     if not lost:
         return ""
     codes = ", ".join(f"{c} ({count[c] / len(label):.1%})" for c in lost[:8])
+    one = lost[0]
     return (
-        f"codes {codes} are the survey's own (LAS leaves those from {OF_THE_SURVEY} on to it), "
-        f"and taken as unclassified. Say what they are: import with --classes {lost[0]}=building, or write [classes] and "
-        f'{lost[0]} = "building" into tile.toml'
+        f"codes {codes} are the survey's own (LAS leaves {OF_THE_SURVEY} and up to it), and taken as unclassified. "
+        f'Say what they are: import with --classes {one}=building, or write [classes] {one} = "building" in tile.toml'
     )
 
 
