@@ -12,14 +12,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 
 from scan2sim.pipeline.types import F32, I32
 
-SWEEPS = 50
-CLOSE = 1e-3
-"""Of the bound: how far above it the energy may be for the work to end."""
+SWEEPS = 100
+CLOSE = 2e-3
+"""Share of the energy that may be above the bound for the work to end."""
 
 
 def adjacent(faces: I32) -> tuple[I32, I32]:
@@ -92,22 +91,28 @@ def solve(view: I32, cost: F32, pairs: I32, price: F32) -> Solution:
     )
     message = np.zeros((len(pairs), view.shape[1]), np.float32)
     pick = cost.argmin(axis=1)
-    best, energy, bound = pick.copy(), _energy(view, cost, pick, pairs, price), 0.0
+    best, energy, bound = pick.copy(), _energy(view, cost, *graph, pick), 0.0
     for sweep in range(2 * SWEEPS):
         if energy - bound <= CLOSE * energy:
             break
         bound = max(bound, _sweep(view, cost, *graph, message, pick, sweep % 2 == 0))
-        found = _energy(view, cost, pick, pairs, price)
+        found = _energy(view, cost, *graph, pick)
         if found < energy:
             best, energy = pick.copy(), found
     return Solution(np.where(seen, view[np.arange(len(view)), best], -1).astype(np.int32), energy, bound)
 
 
-def _energy(view: I32, cost: F32, pick: npt.NDArray[np.integer], pairs: I32, price: F32) -> float:
-    rows = np.arange(len(view))
-    own, chosen = cost[rows, pick], view[rows, pick]
-    apart = chosen[pairs[:, 0]] != chosen[pairs[:, 1]]
-    return float(own[np.isfinite(own)].sum(dtype=np.float64) + price[apart].sum(dtype=np.float64))
+@njit(cache=True)
+def _energy(view, cost, count, start, other, edge, price, pick):  # type: ignore[no-untyped-def]
+    """What a picked candidate a face costs, prices included."""
+    energy = 0.0
+    for f in range(len(count)):
+        if count[f] > 0:
+            energy += cost[f, pick[f]]
+        for k in range(start[f], start[f + 1]):
+            if f < other[k] and view[f, pick[f]] != view[other[k], pick[other[k]]]:
+                energy += price[edge[k]]
+    return energy
 
 
 @njit(cache=True)
@@ -132,39 +137,40 @@ def _sweep(view, cost, count, start, other, edge, price, message, pick, forward)
         before = after = 0
         for k in range(start[f], start[f + 1]):
             e, g = edge[k], other[k]
-            later = (g > f) == forward
-            after, before = after + later, before + (not later)
             for i in range(count[f]):
                 told[i] += message[e, i]
-                if later:
+            if (g > f) == forward:
+                after += 1
+                for i in range(count[f]):
                     known[i] += message[e, i]
-                elif view[f, i] != view[g, pick[g]]:
-                    known[i] += price[e]
-        pick[f] = known[: count[f]].argmin()
-        least = told[: count[f]].min()
+            else:
+                before += 1
+                taken = view[g, pick[g]]
+                for i in range(count[f]):
+                    known[i] += 0.0 if view[f, i] == taken else price[e]
+        pick[f], least = 0, told[0]
+        for i in range(1, count[f]):
+            least = min(least, told[i])
+            if known[i] < known[pick[f]]:
+                pick[f] = i
         bound += least
         share = 1.0 / max(before, after, 1)
         for k in range(start[f], start[f + 1]):
             e, g = edge[k], other[k]
             if (g > f) == forward:
+                dearest = np.inf
                 for i in range(count[f]):
                     known[i] = share * (told[i] - least) - message[e, i]
-                bound += _pass(view[f, : count[f]], known, view[g, : count[g]], price[e], message[e])
+                    dearest = min(dearest, known[i] + price[e])
+                low = np.inf
+                for j in range(count[g]):
+                    there = dearest
+                    for i in range(count[f]):
+                        if view[f, i] == view[g, j]:
+                            there = min(there, known[i])
+                    message[e, j] = there
+                    low = min(low, there)
+                for j in range(count[g]):
+                    message[e, j] -= low
+                bound += low
     return bound
-
-
-@njit(cache=True, inline="always")
-def _pass(view, mine, other, price, message):  # type: ignore[no-untyped-def]
-    """Fill a face's message to another: what each of the other's candidates costs here, less the least of it."""
-    dearest = mine[: len(view)].min() + price
-    least = np.inf
-    for j in range(len(other)):
-        told = dearest
-        for i in range(len(view)):
-            if view[i] == other[j]:
-                told = min(told, mine[i])
-        message[j] = told
-        least = min(least, told)
-    for j in range(len(other)):
-        message[j] -= least
-    return least
