@@ -1,7 +1,7 @@
 """Solvers of the choice of photos (`texturing.labels`) side by side: energy, time, and the textures they lead to.
 
-`python -m bench.choice [--scenes kitti street_clean street_hard] [--out bench-out/texture]`, after `python -m
-bench.texture`, whose scenes and depth maps it takes (`--scenes sample` makes its own small one).
+`python -m bench.choice [--scenes kitti street_clean street_hard] [--solvers ...] [--energies] [--out bench-out/texture]`,
+after `python -m bench.texture`, whose scenes and depth maps it takes (`--scenes sample` makes its own small one).
 
 - best: each face its own best photo, no matter what its neighbours take.
 - settled: from there on, face after face its cheapest photo given its neighbours' (iterated conditional modes).
@@ -19,7 +19,7 @@ import argparse
 import importlib.util
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -187,7 +187,7 @@ def paint(files: dict[str, Path], choice: Choice, folder: Path) -> Path:
     return files["textured"]
 
 
-def compare(scene: Scene, *, textures: bool) -> dict[str, dict[str, Any]]:
+def compare(scene: Scene, names: Sequence[str], *, textures: bool) -> dict[str, dict[str, Any]]:
     """Figures of all solvers, printed as they come."""
     folder = scene.folder / "choices"
     files = prepare(scene, folder)
@@ -196,7 +196,8 @@ def compare(scene: Scene, *, textures: bool) -> dict[str, dict[str, Any]]:
     problem = (choice.view, labels.costs(choice.view, choice.quality), pairs, price)
     bound = labels.solve(*problem).bound
     told: dict[str, dict[str, Any]] = {}
-    for name, solver in solvers().items():
+    for name in names:
+        solver = solvers()[name]
         began = time.perf_counter()
         label = solver(problem)
         seconds = time.perf_counter() - began
@@ -219,6 +220,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=[*SCENES, WARM])
     parser.add_argument("--out", type=Path, default=ROOT / "bench-out" / "texture")
+    parser.add_argument("--solvers", nargs="+", default=list(solvers()), choices=list(solvers()))
     parser.add_argument("--energies", action="store_true", help="energies and times alone, no textures")
     arguments = parser.parse_args()
     told = {}
@@ -228,7 +230,7 @@ def main() -> None:
             continue
         if not scene.views.is_file():
             make(name, scene)
-        told[name] = compare(scene, textures=not arguments.energies)
+        told[name] = compare(scene, arguments.solvers, textures=not arguments.energies)
     print("RESULT " + json.dumps(told))
 
 

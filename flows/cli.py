@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -486,6 +487,7 @@ def _settings(set_: list[str] | None, config: Path | None, hold_out: int | None)
 
 def main() -> None:
     """Run the command; errors become one message and an exit code (`pipeline.errors.EXIT_CODES`)."""
+    os.environ.setdefault("PYTHONSAFEPATH", "1")  # a random.py in the current folder is not our processes' own
     try:
         app()
     except SystemExit as ended:
