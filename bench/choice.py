@@ -1,6 +1,6 @@
 """Solvers of the choice of photos (`texturing.labels`) side by side: energy, time, and the textures they lead to.
 
-`python -m bench.choice [--scenes kitti street_clean street_hard] [--solvers ...] [--energies] [--out bench-out/texture]`,
+`python -m bench.choice [--scenes kitti street_clean street_hard] [--solvers best ours ...] [--energies] [--out DIR]`,
 after `python -m bench.texture`, whose scenes and depth maps it takes (`--scenes sample` makes its own small one).
 
 - best: each face its own best photo, no matter what its neighbours take.
