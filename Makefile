@@ -1,5 +1,6 @@
 # Two commands are all the set-up there is: `make demo` and `make test`.
-PYTHON ?= $(shell command -v python3.11 || command -v python3)
+PYTHON ?= $(shell command -v python3.11 || command -v python3.12 || command -v python3.13 || command -v python3)
+NO_PYTHON = There is no Python here. Install 3.11, 3.12 or 3.13, or say where it is: make PYTHON=/path/to/python3.11
 BIN := .venv/bin
 TILE ?= data_samples/tile
 OUT ?= demo-out
@@ -26,13 +27,11 @@ bench: .venv/.installed-dev
 sample-tile: .venv/.installed
 	$(BIN)/python -m scan2sim.data_samples.make_tile
 
+# both install what the system lacks, where they may: see deploy/install.py
 .venv/.installed: pyproject.toml constraints.txt
-	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[segmentation]'
-	@$(BIN)/python -c "import open3d" || { \
-		echo "Open3D can't be loaded: on Debian or Ubuntu, apt-get install $$(tr '\n' ' ' < packages.txt)"; exit 1; }
-	touch $@
+	@$(or $(PYTHON),$(error $(NO_PYTHON))) deploy/install.py
+	@touch $@
 
 .venv/.installed-dev: .venv/.installed
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
-	touch $@
+	@$(or $(PYTHON),$(error $(NO_PYTHON))) deploy/install.py dev
+	@touch $@

@@ -222,7 +222,7 @@ def segment_a_tile(
 @segments.command("train")
 def segment_train(
     folder: Annotated[Path, typer.Argument(help="Of images/ and labels/ (docs/segmentation.md).")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="File of the weights.")] = Path("street.safetensors"),
+    out: Annotated[Path, typer.Option("--out", "-o", help="ONNX file of the weights.")] = Path("street.onnx"),
     minutes: Annotated[float, typer.Option(help="At most; 0: no limit.")] = 0,
     steps: Annotated[int, typer.Option(help="Of the optimiser.")] = 3000,
     seed: Annotated[int, typer.Option(help="Of weights, crops and looks.")] = 0,

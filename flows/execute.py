@@ -23,7 +23,7 @@ from typing import Any, Literal
 
 from scan2sim import __version__
 from scan2sim.flows.memory import need, share
-from scan2sim.flows.planning import Planned
+from scan2sim.flows.planning import Planned, check
 from scan2sim.flows.recipe import Node
 from scan2sim.pipeline.errors import BusyError, ScanError, StepError, UnavailableError, from_os_error
 from scan2sim.pipeline.step import Report, silent
@@ -95,9 +95,10 @@ def execute(
         memory: GB that nodes may need together (`flows.memory`); one that needs more runs alone.
 
     Raises:
-        ScanError: of the first node that failed; what was finished is kept.
+        ScanError: of a node that can't run here, before any does; of the first that failed; what was finished is kept.
         KeyboardInterrupt: likewise.
     """
+    check(planned)
     front = Frontier(planned, store, watch)
     running: dict[Connection, tuple[Planned, ForkServerProcess, float]] = {}
     try:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from scan2sim.flows.recipe import Node, Output
+from scan2sim.pipeline import libraries
 from scan2sim.pipeline.errors import StepError
 from scan2sim.pipeline.store import Manifest, Store, digest, key_of
 
@@ -119,6 +120,20 @@ def plan(
             reason = f"follows {again[0]}" if again else reason
         planned[node.label] = Planned(node, key, keys, reason)
     return list(planned.values())
+
+
+def check(planned: Sequence[Planned]) -> None:
+    """Refuse at once a plan with steps that can't run on this machine, where a library or a package is missing.
+
+    Raises:
+        UnavailableError: the system lacks libraries.
+        ScanError: of the first such step.
+    """
+    missing = [item.node for item in planned if item.reason is not None]
+    if missing:
+        libraries.check()
+    for node in missing:
+        node.step.check(node.params)
 
 
 def _reason(node: Node, key: str, store: Store) -> str | None:

@@ -15,7 +15,7 @@ from rich.markup import escape
 from scan2sim.flows import gazebo
 from scan2sim.flows.display import RunDisplay, console
 from scan2sim.flows.execute import Event, Executor, execute, locked, versions
-from scan2sim.flows.planning import Planned, plan
+from scan2sim.flows.planning import Planned, check, plan
 from scan2sim.flows.publish import publish
 from scan2sim.flows.recipe import Node, recipe
 from scan2sim.flows.report import write_report
@@ -112,10 +112,15 @@ def show_warnings(done: dict[str, Manifest]) -> None:
 
 
 def show_plan(path: Path, out: Path, settings: Settings, *, force: bool = False, start: str | None = None) -> None:
-    """Print each step of the tile, whether it would run, and why."""
+    """Print each step of the tile, whether it would run, and why.
+
+    Raises:
+        ScanError: see `pipeline.errors`; also if a step couldn't run here.
+    """
     from rich.table import Table
 
     planned, _ = _plan(read_tile(path), out, settings, force, start)
+    check(planned)
     table = Table("step", "would run", "why", box=None, header_style="bold")
     for item in planned:
         runs, why = ("yes", item.reason) if item.reason else ("no", "kept: same input, settings and version")

@@ -13,7 +13,8 @@ from scan2sim.flows.planning import plan
 from scan2sim.flows.recipe import Node, Output, recipe
 from scan2sim.flows.run import STORE, Log, execute_shown, show_warnings
 from scan2sim.flows.settings import Settings
-from scan2sim.pipeline.errors import DataError
+from scan2sim.pipeline.errors import DataError, SettingError
+from scan2sim.pipeline.extras import need
 from scan2sim.pipeline.io import image, las
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.las_classes import write_classified
@@ -100,7 +101,18 @@ def _write_pictures(views: Path, labels: Path, out: Path) -> None:
 
 
 def train_network(folder: Path, weights: Path, *, minutes: float, steps: int, seed: int) -> None:
-    """Train the project's own network on a folder of labelled photos, and write its weights."""
+    """Train the project's own network on a folder of labelled photos, and write its weights.
+
+    Args:
+        weights: an ONNX file; what torch reads lies beside it then.
+
+    Raises:
+        SettingError: the file's name ends otherwise.
+        UnavailableError: torch isn't installed.
+    """
+    if weights.suffix != ".onnx":
+        raise SettingError("--out", f"{weights.name} is no name of an ONNX file", "Name one that ends in .onnx")
+    need("segment train", "torch", "safetensors", "onnx")
     from scan2sim.segmentation.backends.street import save
     from scan2sim.segmentation.train import Recipe, train
 
@@ -125,9 +137,9 @@ def _pixels(folder: Path, settings: Settings) -> dict[str, float]:
     from scan2sim.pipeline.types import Camera
     from scan2sim.segmentation.backends import load
     from scan2sim.segmentation.label import LABEL
+    from scan2sim.segmentation.labelled import pairs, read
     from scan2sim.segmentation.labels import CLASSES, IGNORED, code_of_index
     from scan2sim.segmentation.photos import Labeller, labels_of
-    from scan2sim.segmentation.train import pairs, read
 
     given = settings.params(LABEL)
     network = load(given.network, given.weights, given.device)

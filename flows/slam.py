@@ -17,6 +17,7 @@ from scan2sim.flows.display import console, progress
 from scan2sim.flows.execute import locked
 from scan2sim.flows.settings import Settings
 from scan2sim.pipeline.errors import InputError, SettingError
+from scan2sim.pipeline.extras import need
 from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.io.image import read_rgb
 from scan2sim.pipeline.io.tile import read_tile
@@ -94,6 +95,7 @@ def slam_video(path: Path, out: Path, options: Options, settings: Settings) -> T
         ScanError: see `pipeline.errors`; earlier results stay.
     """
     params = odometry_params(settings)
+    _need(options)
     video = open_video(path, fps=options.fps, times=options.times)
     camera, gps, mask = _camera(video, options), _gps(video, options), _mask(video, options)
     with locked(out), progress("slam") as report:
@@ -133,6 +135,20 @@ def slam_video(path: Path, out: Path, options: Options, settings: Settings) -> T
     console.print(json.dumps(tracked.facts, indent=1), highlight=False, markup=False)
     console.print(f"Trajectory: {out / 'trajectory.csv'}", highlight=False, soft_wrap=True, markup=False)
     return tracked
+
+
+def _need(options: Options) -> None:
+    """Refuse at once what would fail for want of a package in the end.
+
+    Raises:
+        UnavailableError: naming it.
+    """
+    if options.adjust:
+        need("--adjust", "pycolmap")
+    if options.backend == "adam":
+        need("--backend adam", "torch", instead="or use the backend lm")
+    if options.view:
+        need("--view", "av")
 
 
 def odometry_params(settings: Settings) -> OdometryParams:

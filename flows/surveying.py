@@ -19,7 +19,8 @@ from scan2sim.flows.prepare import survey_of
 from scan2sim.flows.recipe import survey_recipe
 from scan2sim.flows.run import STORE, Log, default_jobs, execute_shown, show_results
 from scan2sim.flows.settings import Settings
-from scan2sim.pipeline.errors import ScanError, SettingError, SpaceError, StepError, UnavailableError
+from scan2sim.pipeline.errors import ScanError, SettingError, SpaceError, StepError
+from scan2sim.pipeline.extras import need
 from scan2sim.pipeline.io.remote import Remote, is_remote, likeness
 from scan2sim.pipeline.io.survey import Survey, read_survey
 from scan2sim.pipeline.io.tile import read_tile
@@ -49,11 +50,8 @@ def run_source(
     """
     jobs, gigabytes = jobs or default_jobs(), parse(memory)
     if runner != "processes":
-        try:
-            from scan2sim.flows.survey import meet_server, survey
-        except ModuleNotFoundError as error:
-            remedy = "pip install -c constraints.txt -e '.[flows]'"
-            raise UnavailableError(error.name or "prefect", "isn't installed", remedy) from None
+        need(f"--runner {runner}", "prefect")
+        from scan2sim.flows.survey import meet_server, survey
 
         meet_server()
         survey(source, target, length, buffer, settings.values, runner, jobs, memory, cores, address)

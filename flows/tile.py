@@ -15,7 +15,7 @@ from prefect.cache_policies import NO_CACHE
 from scan2sim.flows.dispatch import dispatch
 from scan2sim.flows.execute import Executor, run_on_worker, versions
 from scan2sim.flows.memory import parse
-from scan2sim.flows.planning import Planned
+from scan2sim.flows.planning import Planned, check
 from scan2sim.flows.run import run_tile
 from scan2sim.flows.settings import Settings
 from scan2sim.flows.workers import workers
@@ -52,6 +52,8 @@ def by_tasks(
     workers(runner, count, address)  # tells early of what there isn't
 
     def run(planned: list[Planned], store: Store, failures: dict[str, ScanError]) -> dict[str, Manifest]:
+        if address is None:
+            check(planned)  # workers elsewhere may have what is missing here
         missing = any(item.reason is not None for item in planned)
         with workers(runner if missing else "threads", count, address) as call:
 

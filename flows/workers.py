@@ -7,7 +7,6 @@ worker anew for every task, which costs more than many a step takes.)
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import re
 import socket
@@ -16,6 +15,7 @@ from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
 from scan2sim.pipeline.errors import SettingError, UnavailableError
+from scan2sim.pipeline.extras import need
 
 Call = Callable[..., Any]
 """Has a worker call a function with arguments, waits, and returns its result or raises its exception."""
@@ -36,9 +36,8 @@ def workers(name: str, count: int, address: str | None = None) -> AbstractContex
     kinds = {"threads": _threads, "dask": _dask, "ray": _ray}
     if name not in kinds:
         raise SettingError("runner", f"there is no `{name}`", "Choose threads, dask or ray")
-    if name != "threads" and importlib.util.find_spec(name) is None:
-        extra = "flows" if name == "dask" else name
-        raise UnavailableError(name, "isn't installed", f"pip install -c constraints.txt -e '.[{extra}]'")
+    if name != "threads":
+        need(f"--runner {name}", {"dask": "distributed"}.get(name, name))
     return kinds[name](count, address)
 
 

@@ -5,7 +5,7 @@ To add one: a function, its `Params`, one line in `flows/recipe.py`, one test.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -53,6 +53,10 @@ class Run(Protocol):
     def __call__(self, inputs: Inputs, params: Any, out: Path, report: Report) -> Done: ...
 
 
+def _can_always(params: Any) -> None:
+    """The check of a step that needs nothing but the core."""
+
+
 @dataclass(frozen=True)
 class Step:
     """A step of the mission.
@@ -64,6 +68,8 @@ class Step:
             import what is heavy inside.
         params: its parameters; defaults are the mission's numbers.
         per_class: defaults that differ between terrain, building and vegetation.
+        check: given parameters, raises a ScanError if the step can't run with them on this machine (a package is
+            missing, say); called before any step runs, and quick.
     """
 
     name: str
@@ -71,3 +77,4 @@ class Step:
     run: Run
     params: type[Params] = Params
     per_class: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    check: Callable[[Any], None] = _can_always

@@ -17,7 +17,7 @@ class LabelParams(Params):
     Attributes:
         network: "street", the project's own; "segformer" or "onnx", with the user's weights.
         weights: file or folder of the weights; default: those that come with the project (of "street").
-        device: of torch, as "cuda" or "cpu"; "auto": a GPU where there is one.
+        device: "cpu", or "cuda" by torch or onnxruntime; "auto": a GPU where they have one.
         overwrite, min_classified, photos: as of `segment`, set by the recipe: photos are not looked at where the
             cloud keeps its own classes, or where they aren't asked.
     """
@@ -81,4 +81,16 @@ def classified(label: U8 | None) -> float:
     return float(known()[label].mean())
 
 
-LABEL = Step("label", 2, label, LabelParams)
+def can_label(params: LabelParams) -> None:
+    """Refuse a network that can't run here.
+
+    Raises:
+        ScanError: as `segmentation.backends.check`.
+    """
+    from scan2sim.segmentation.backends import check
+
+    if params.photos:
+        check(params.network, params.weights)
+
+
+LABEL = Step("label", 3, label, LabelParams, check=can_label)

@@ -1,7 +1,6 @@
 """Training of the project's own network on labelled photos. Import late: loads torch.
 
-A folder of `images/*.jpg` (or png) and `labels/*.png` of the same names, LAS class codes a pixel (0 sky, 255 not to
-be learnt), as `data_samples.training` writes it. Runs are repeatable for a seed, on one machine with one number of
+From a folder as `segmentation.labelled` reads it. Runs are repeatable for a seed, on one machine with one number of
 threads.
 """
 
@@ -18,9 +17,9 @@ import numpy.typing as npt
 import torch
 import torch.nn.functional as F
 
-from scan2sim.pipeline.errors import DataError
 from scan2sim.pipeline.step import Report, silent
 from scan2sim.pipeline.types import F32, U8
+from scan2sim.segmentation.labelled import pairs, read, split
 from scan2sim.segmentation.labels import CLASSES, IGNORED, index_of_code
 from scan2sim.segmentation.network import StreetNet
 
@@ -58,24 +57,6 @@ class Trained:
 
     network: StreetNet
     iou: dict[str, float]
-
-
-def pairs(folder: Path) -> list[tuple[Path, Path]]:
-    """Images and their labels, by name.
-
-    Raises:
-        DataError: there are none.
-    """
-    found = [
-        (image, label)
-        for image in sorted((folder / "images").glob("*"))
-        if (label := folder / "labels" / f"{image.stem}.png").is_file()
-    ]
-    if not found:
-        raise DataError(
-            folder, "has no images/NAME.jpg with labels/NAME.png", "Make some, as docs/segmentation.md says"
-        )
-    return found
 
 
 def train(folder: Path, recipe: Recipe, report: Report = silent) -> Trained:
@@ -125,28 +106,6 @@ def _averaged(mean: torch.Tensor, new: torch.Tensor, n: torch.Tensor | int) -> t
 def _one_cycle(done: float) -> float:
     """Share of the highest rate: up over the first twentieth, down along a cosine."""
     return min(1.0, done / 0.05 + 0.02) * 0.5 * (1 + math.cos(math.pi * min(1.0, done)))
-
-
-def split(found: Sequence[tuple[Path, Path]], share: float) -> tuple[list[tuple[Path, Path]], list[tuple[Path, Path]]]:
-    """To learn from, and to check with: whole streets, the last ones."""
-    streets = sorted({image.stem.split("_")[0] for image, _ in found})
-    last = set(streets[len(streets) - round(share * len(streets)) :])
-    learn = [pair for pair in found if pair[0].stem.split("_")[0] not in last]
-    return (learn, [pair for pair in found if pair[0].stem.split("_")[0] in last]) if learn else (list(found), [])
-
-
-def read(image: Path, label: Path) -> tuple[U8, U8]:
-    """(H, W, 3) colours and (H, W) indices of classes, `IGNORED` where there is none.
-
-    Raises:
-        DataError: either can't be read, or they differ in size.
-    """
-    import cv2
-
-    bgr, codes = cv2.imread(str(image)), cv2.imread(str(label), cv2.IMREAD_GRAYSCALE)
-    if bgr is None or codes is None or bgr.shape[:2] != codes.shape:
-        raise DataError(label, "and its image can't be read, or differ in size", "Make them again")
-    return np.asarray(bgr[..., ::-1], np.uint8), index_of_code()[codes]
 
 
 def class_weights(labels: Sequence[Path]) -> torch.Tensor:

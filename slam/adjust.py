@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scan2sim.pipeline.errors import UnavailableError
+from scan2sim.pipeline.extras import need
 from scan2sim.pipeline.types import Trajectory
 from scan2sim.slam.evaluate import umeyama
 from scan2sim.slam.geometry import angles
@@ -34,12 +34,11 @@ def adjust(odometry: Odometry) -> dict[str, float]:
     Raises:
         UnavailableError: pycolmap isn't installed.
     """
+    need("--adjust", "pycolmap")
+    import pycolmap
+
     from scan2sim.pipeline.cameras import project
 
-    try:
-        import pycolmap
-    except ImportError:
-        raise UnavailableError("pycolmap", "is not installed", "pip install pycolmap") from None
     keyframes = odometry.map.keyframes
     poses = np.stack([k.T_world_cam for k in keyframes])
     known = kept(odometry)

@@ -16,7 +16,8 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from scan2sim.pipeline.errors import DataError, UnavailableError
+from scan2sim.pipeline.errors import DataError
+from scan2sim.pipeline.extras import need
 from scan2sim.pipeline.io.trajectory import replacing
 from scan2sim.pipeline.types import F64, Trajectory
 from scan2sim.slam.gps import GpsTrack, noise, smooth
@@ -268,10 +269,9 @@ def plot(evaluation: Evaluation, file: Path) -> None:
     Raises:
         UnavailableError: matplotlib isn't installed.
     """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise UnavailableError("matplotlib", "is not installed", "Run: pip install scan2sim[slam]") from None
+    need("a plot", "matplotlib")
+    from matplotlib.figure import Figure
+
     e = evaluation
     blue, amber = "#1f5fbf", "#f0a818"
     figure = Figure(figsize=(13, 6), dpi=110, layout="constrained")

@@ -18,7 +18,8 @@ from xml.etree import ElementTree
 import numpy as np
 import numpy.typing as npt
 
-from scan2sim.pipeline.errors import InputError, UnavailableError, from_os_error
+from scan2sim.pipeline.errors import InputError, from_os_error
+from scan2sim.pipeline.extras import need
 from scan2sim.pipeline.io import files
 from scan2sim.pipeline.types import F64, Frame
 
@@ -410,12 +411,9 @@ def _samples(stream: Stream, key: str, width: int) -> F64:
 
 def _packets(path: Path) -> Iterator[tuple[float, float, bytes]]:
     """Start (s), length (s) and payload of the telemetry packets of a video."""
-    try:
-        import av
-    except ImportError:
-        raise UnavailableError(
-            "av", "is not installed, so telemetry can't be read from videos", "Run: pip install scan2sim[slam]"
-        ) from None
+    need("telemetry of a video", "av")
+    import av
+
     try:
         with av.open(str(path)) as video:
             tracks = [stream for stream in video.streams if stream.type == "data"]

@@ -25,7 +25,8 @@ from typing import Any
 
 import numpy as np
 
-from scan2sim.pipeline.errors import InputError, ScanError, SettingError, SpaceError, UnavailableError, from_os_error
+from scan2sim.pipeline.errors import InputError, ScanError, SettingError, SpaceError, from_os_error
+from scan2sim.pipeline.extras import need
 from scan2sim.pipeline.io.trajectory import replacing
 from scan2sim.pipeline.io.video import Encoder
 from scan2sim.pipeline.step import Report, silent
@@ -135,10 +136,12 @@ def study(
         report: progress.
 
     Raises:
+        UnavailableError: PyAV or matplotlib isn't installed, or what the backend needs.
         SettingError: numbers that make no sense.
         InputError: the source can't be read, or has another size than its mask.
         SpaceError: the disk is full or may not be written to.
     """
+    need("slam study", "av", "matplotlib", *(["torch"] if backend == "adam" else []))
     _check(heights, bitrates, rates, jobs)
     video = _open(source)
     if mask is not None and mask.shape != (video.height, video.width):
@@ -170,10 +173,7 @@ def study(
     for cell, result in _run(missing, shared, folder, same, jobs, _progress(report, len(cells), len(results))):
         results[cell] = result
         _tables(out, shared, cells, results)
-    try:
-        plot(out / "plot.png", shared.segment, cells, results)
-    except UnavailableError as error:
-        report(1.0, str(error))
+    plot(out / "plot.png", shared.segment, cells, results)
     report(1.0, "done")
     return out / "table.md"
 
@@ -595,15 +595,9 @@ def _csv(cells: Sequence[Cell], results: dict[Cell, Result]) -> str:
 
 
 def plot(file: Path, segment: float, cells: Sequence[Cell], results: dict[Cell, Result]) -> None:
-    """Write a PNG: errors against bit rate, a line a resolution, a row of charts a frame rate.
+    """Write a PNG: errors against bit rate, a line a resolution, a row of charts a frame rate."""
+    from matplotlib.figure import Figure
 
-    Raises:
-        UnavailableError: matplotlib isn't installed.
-    """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise UnavailableError("matplotlib", "is not installed", "Run: pip install scan2sim[slam]") from None
     heights, bitrates, rates = _axes(cells)
     figure = Figure(figsize=(12, 1 + 4 * len(rates)), dpi=110, layout="constrained")
     charts = figure.subplots(len(rates), 2, squeeze=False, sharex=True, sharey="col")

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.extras import need
 from scan2sim.pipeline.types import F64, U8
 
 PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
@@ -95,12 +96,9 @@ def open_video(path: Path, *, fps: float = 10.0, times: Path | None = None) -> V
 
 
 def _av() -> Any:
-    try:
-        import av
-    except ImportError:
-        from scan2sim.pipeline.errors import UnavailableError
+    need("a video", "av")
+    import av
 
-        raise UnavailableError("PyAV", "is not installed", "pip install 'scan2sim[slam]'") from None
     return av
 
 

@@ -7,13 +7,13 @@ told by `Weights.describe` what it is and under which licence.
 from __future__ import annotations
 
 import hashlib
-import importlib.util
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from scan2sim.pipeline import extras
 from scan2sim.pipeline.errors import InputError, SettingError
 
 Shape = tuple[int, ...]
@@ -75,8 +75,7 @@ class Weights:
 
 def missing() -> str | None:
     """What to install for networks, or None."""
-    names = [name for name in ("torch", "safetensors") if importlib.util.find_spec(name) is None]
-    return ", ".join(names) or None
+    return extras.missing("torch", "safetensors")
 
 
 def torch_device(device: str) -> str:

@@ -9,7 +9,6 @@ so memory is bounded by a band and a few photos.
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import shutil
 from collections.abc import Callable, Sequence
@@ -20,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
 
+from scan2sim.pipeline.extras import missing, need
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
@@ -286,7 +286,7 @@ class Painter:
 
 def best_device() -> str:
     """The device that "auto" stands for here."""
-    if shutil.which("nvidia-smi") is None or importlib.util.find_spec("torch") is None:
+    if shutil.which("nvidia-smi") is None or missing("torch"):
         return "numba"
     import torch
 
@@ -386,4 +386,14 @@ def _facts(
     }
 
 
-TEXTURE = Step("texture", 2, texture, TextureParams)
+def can_texture(params: TextureParams) -> None:
+    """Refuse a device of torch where torch isn't installed.
+
+    Raises:
+        UnavailableError: as said.
+    """
+    if params.device not in ("auto", "numba"):
+        need(f"texture.device {params.device}", "torch")
+
+
+TEXTURE = Step("texture", 2, texture, TextureParams, check=can_texture)

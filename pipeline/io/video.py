@@ -6,7 +6,8 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any, Self
 
-from scan2sim.pipeline.errors import UnavailableError, from_os_error
+from scan2sim.pipeline.errors import from_os_error
+from scan2sim.pipeline.extras import need
 from scan2sim.pipeline.types import U8
 
 TICKS = 90_000
@@ -40,10 +41,9 @@ class Encoder:
             UnavailableError: PyAV isn't installed.
             SpaceError: the file can't be written to.
         """
-        try:
-            import av
-        except ImportError:
-            raise UnavailableError("PyAV", "is not installed", "pip install 'scan2sim[slam]'") from None
+        need("a video", "av")
+        import av
+
         self.count, self.file, self._last = 0, file, -1
         try:
             self._container: Any = av.open(str(file), "w", format="mp4", options=container or {})

@@ -1,17 +1,19 @@
 """Segmentation networks behind one protocol: a file a backend, found by its name.
 
-A backend's module has `available() -> str | None` (what to install, if it can't run here) and
+A backend's module has `missing(weights) -> str | None` (the packages it lacks to run those weights here) and
 `load(weights, device) -> Network`.
 """
 
 from __future__ import annotations
 
 import importlib
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
-from scan2sim.pipeline.errors import SettingError
+from scan2sim.pipeline.errors import InputError, SettingError
+from scan2sim.pipeline.extras import unavailable
 from scan2sim.pipeline.types import F32, U8
 
 NAMES = ("street", "segformer", "onnx")
@@ -53,23 +55,47 @@ def load(name: str, weights: Path | None, device: str = "auto") -> Network:
     """The network of a backend, with the user's weights or, for "street", the project's own.
 
     Raises:
-        SettingError: there is no such backend, it can't run here, or it wants weights.
+        SettingError: it wants weights, or the device isn't there.
         InputError: the weights are damaged, of another architecture, or unsafe to read.
+        ScanError: as `check`.
+    """
+    network: Network = check(name, weights).load(weights, device)
+    return network
+
+
+def check(name: str, weights: Path | None) -> Any:
+    """The module of a backend that can run here; nothing heavy is loaded.
+
+    Raises:
+        SettingError: there is no such backend.
+        UnavailableError: a package is missing.
+        InputError: the weights aren't there.
     """
     if name not in NAMES:
         raise SettingError("label.network", f"there is no {name!r}", f"Choose one of: {', '.join(NAMES)}")
     backend = importlib.import_module(f"scan2sim.segmentation.backends.{name}")
-    missing = backend.available()
-    if missing:
-        raise SettingError("label.network", f"{name!r} can't run here: {missing}", f"Install {missing}")
-    network: Network = backend.load(weights, device)
-    return network
+    lacking = backend.missing(weights)
+    if lacking:
+        raise unavailable(f"label.network {name}", lacking)
+    if weights is not None and not weights.exists():
+        raise InputError(weights, "doesn't exist", "Correct label.weights; nothing is downloaded")
+    return backend
 
 
 def torch_device(device: str) -> str:
-    """The device of torch that "auto" stands for here: a GPU where there is one."""
-    if device != "auto":
-        return device
+    """A device of torch; "auto" stands for a GPU where there is one.
+
+    Raises:
+        SettingError: torch can't use it here.
+    """
+    if device == "auto" and shutil.which("nvidia-smi") is None:
+        return "cpu"
     import torch
 
-    return "cuda" if torch.cuda.is_available() else "cpu"
+    if device == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        return str(torch.zeros(1, device=device).device)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise SettingError("label.device", f"torch can't use {device!r} here ({reason})", "Say cpu, or auto") from None

@@ -1,20 +1,22 @@
-"""Any segmentation network in an ONNX file of the user's, by onnxruntime.
+"""Any segmentation network in an ONNX file, by onnxruntime.
 
 The file has one input, (1, 3, H, W) float RGB, and one output, (1, C, h, w) logits or probabilities. Its
 `metadata_props` may tell, as JSON: "labels", names of the C channels in order (else `<name>.labels.txt` beside it, one
-a line); "mean" and "std" that the input, 1 for white, is normalised with (else ImageNet's). "license" is told on.
+a line); "mean" and "std" that the input, 1 for white, is normalised with (else ImageNet's); "pixels_a_radian", the
+angular resolution that photos are resampled to (else they are taken as they are). "license" is told on.
 """
 
 from __future__ import annotations
 
 import hashlib
-import importlib.util
 import json
+import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from scan2sim.pipeline import extras
 from scan2sim.pipeline.errors import InputError, SettingError
 from scan2sim.pipeline.types import F32, U8
 from scan2sim.segmentation.backends import Facts
@@ -25,9 +27,9 @@ CUDA = "CUDAExecutionProvider"
 REMEDY = "Export the network with one input (1, 3, H, W) of floats and one output (1, C, h, w)"
 
 
-def available() -> str | None:
-    """What to install, or None."""
-    return None if importlib.util.find_spec("onnxruntime") else "onnxruntime"
+def missing(weights: Path | None) -> str | None:
+    """Packages that aren't installed, or None."""
+    return extras.missing("onnxruntime")
 
 
 def load(weights: Path | None, device: str) -> Network:
@@ -45,7 +47,7 @@ def load(weights: Path | None, device: str) -> Network:
 class Network:
     """See `segmentation.backends.Network`; h, w are what the file gives, also where it wants photos of a fixed size."""
 
-    def __init__(self, path: Path, device: str) -> None:
+    def __init__(self, path: Path, device: str, backend: str = "onnx") -> None:
         self._path = path
         self._session = _session(path, device)
         inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
@@ -71,7 +73,9 @@ class Network:
         if beside.is_file():
             digest.update(beside.read_bytes())
         licence = meta.get("license") or "not told"
-        self.facts = Facts(f"onnx ({path.name})", labels, digest.hexdigest(), licence, None)
+        told = _json(meta.get("pixels_a_radian"), None)
+        resolution = None if told is None else float(numbers([told], 1, path)[0])
+        self.facts = Facts(f"{backend} ({path.name})", labels, digest.hexdigest(), licence, resolution)
 
     def probabilities(self, rgb: U8) -> F32:
         """See `segmentation.backends.Network`.
@@ -110,6 +114,8 @@ def _session(path: Path, device: str) -> Any:
     providers = [] if device == "cpu" or CUDA not in onnxruntime.get_available_providers() else [(CUDA, number)]
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 4  # its errors are raised; no need to print them as well
+    options.intra_op_num_threads = _threads()
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # several nodes share the cores
     try:
         session = onnxruntime.InferenceSession(path, options, [*providers, "CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's errors have no kind in common
@@ -119,6 +125,14 @@ def _session(path: Path, device: str) -> Any:
             "label.device", f"onnxruntime can't use {device!r} here", "Install onnxruntime-gpu, or set cpu"
         )
     return session
+
+
+def _threads() -> int:
+    """As many as OpenMP's libraries take; onnxruntime itself doesn't ask."""
+    told = os.environ.get("OMP_NUM_THREADS", "")
+    if told.isdecimal() and int(told):
+        return int(told)
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _told(error: Exception, path: Path, cause: str, remedy: str) -> Exception:

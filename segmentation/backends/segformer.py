@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import importlib.util
 import json
 import re
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from scan2sim.pipeline import extras
 from scan2sim.pipeline.errors import InputError, SettingError
 from scan2sim.pipeline.types import F32, U8
 from scan2sim.segmentation.backends import Facts, torch_device
@@ -25,10 +25,9 @@ SMALLEST = 32
 REMEDY = f"Give a folder on this disk with config.json and {FILES[0]} of a {ARCHITECTURE}; nothing is downloaded"
 
 
-def available() -> str | None:
-    """What to install, or None."""
-    missing = [name for name in ("torch", "safetensors", "transformers") if importlib.util.find_spec(name) is None]
-    return ", ".join(missing) or None
+def missing(weights: Path | None) -> str | None:
+    """Packages that aren't installed, or None."""
+    return extras.missing("torch", "safetensors", "transformers")
 
 
 def load(weights: Path | None, device: str) -> Network:

@@ -1,55 +1,101 @@
-"""The project's own network, trained on the synthetic street: the default, which needs no download."""
+"""The project's own network, trained on the synthetic street: the default, which needs no download.
+
+Its weights come in two forms: ONNX, which onnxruntime runs on any processor, and safetensors, which torch runs where
+there is a GPU. `scan2sim segment train` writes both.
+"""
 
 from __future__ import annotations
 
 import hashlib
-import importlib.util
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from scan2sim.pipeline import extras
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.types import F32, U8
-from scan2sim.segmentation.backends import Facts, torch_device
+from scan2sim.segmentation.backends import Facts, onnx, torch_device
+from scan2sim.segmentation.backends import Network as AnyNetwork
 
 if TYPE_CHECKING:
     from scan2sim.segmentation.network import StreetNet
 
-OWN = Path(__file__).resolve().parent.parent / "weights" / "street.safetensors"
+OWN = Path(__file__).resolve().parent.parent / "weights" / "street.onnx"
+LICENCE = "as the project's"
+OPSET = 17
 
 
-def available() -> str | None:
-    """What to install, or None."""
-    missing = [name for name in ("torch", "safetensors") if importlib.util.find_spec(name) is None]
-    return ", ".join(missing) or None
+def missing(weights: Path | None) -> str | None:
+    """Packages that aren't installed, or None."""
+    if weights is not None and _is_torchs(weights):
+        return extras.missing("torch", "safetensors")
+    return onnx.missing(weights)
+
+
+def load(weights: Path | None, device: str) -> AnyNetwork:
+    """The network with the project's own weights, or others that `scan2sim segment train` wrote, in either form."""
+    if weights is None:
+        weights = OWN.with_suffix(".safetensors") if _has_gpu(device) else OWN
+    return Network(weights, torch_device(device)) if _is_torchs(weights) else onnx.Network(weights, device, "street")
+
+
+def _is_torchs(weights: Path) -> bool:
+    return weights.suffix != ".onnx"
+
+
+def _has_gpu(device: str) -> bool:
+    """Whether torch is here and has a GPU that is wanted."""
+    return device != "cpu" and not extras.missing("torch", "safetensors") and torch_device(device) != "cpu"
 
 
 def save(network: StreetNet, path: Path, told: dict[str, object]) -> None:
-    """Write weights in half precision, with their labels and what is told of their training."""
+    """Write weights in half precision, with their labels and what is told of their training.
+
+    Args:
+        path: of the ONNX file; one of the same name with `.safetensors` is written beside it.
+    """
     import torch
     from safetensors.torch import save_file
 
     from scan2sim.segmentation.labels import CLASSES
 
-    halves = {
-        name: value.half() if value.is_floating_point() else value for name, value in network.state_dict().items()
-    }
-    halves = {name: value.contiguous() for name, value in halves.items() if value.dtype != torch.int64}
+    state = {name: value for name, value in network.state_dict().items() if value.dtype != torch.int64}
+    halves = {name: value.half().contiguous() for name, value in state.items()}
     path.parent.mkdir(parents=True, exist_ok=True)
-    save_file(halves, str(path), {"network": "StreetNet", "labels": json.dumps(CLASSES), **_texts(told)})
+    facts = {"network": "StreetNet", "labels": CLASSES, **told}
+    save_file(halves, str(path.with_suffix(".safetensors")), {key: _text(value) for key, value in facts.items()})
+    network.load_state_dict({name: value.float() for name, value in halves.items()}, strict=False)
+    _export(network, path, facts)
 
 
-def _texts(told: dict[str, object]) -> dict[str, str]:
-    return {key: value if isinstance(value, str) else json.dumps(value) for key, value in told.items()}
+def _export(network: StreetNet, path: Path, facts: dict[str, Any]) -> None:
+    """Write the network as ONNX, as `backends.onnx` reads it; it normalises photos itself."""
+    import warnings
+
+    import onnx as files
+    import torch
+
+    from scan2sim.segmentation.network import PIXELS_A_RADIAN
+
+    with warnings.catch_warnings():  # the exporter that replaces this one needs onnxscript; this one does
+        warnings.simplefilter("ignore")
+        torch.onnx.export(
+            network.eval(), (torch.zeros(1, 3, 64, 96),), str(path), dynamo=False, opset_version=OPSET,
+            input_names=["image"], output_names=["logits"],
+            dynamic_axes={"image": {2: "height", 3: "width"}, "logits": {2: "h", 3: "w"}},
+        )  # fmt: skip
+    model = files.load(path)
+    normalised = {"mean": [0, 0, 0], "std": [1, 1, 1], "pixels_a_radian": PIXELS_A_RADIAN, "license": LICENCE}
+    files.helper.set_model_props(model, {key: _text(value) for key, value in (facts | normalised).items()})
+    files.save(model, path)
 
 
-def load(weights: Path | None, device: str) -> Network:
-    """The network with the project's own weights, or others that `scan2sim segment train` wrote."""
-    return Network(weights or OWN, torch_device(device))
+def _text(value: object) -> str:
+    return value if isinstance(value, str) else json.dumps(value)
 
 
 class Network:
-    """See `segmentation.backends.Network`."""
+    """See `segmentation.backends.Network`: by torch."""
 
     def __init__(self, path: Path, device: str) -> None:
         from safetensors import SafetensorError, safe_open
@@ -76,7 +122,7 @@ class Network:
             raise InputError(path, "lacks weights of StreetNet, or has others", remedy)
         self._device = device
         self._net.eval().to(device)
-        self.facts = Facts(f"street ({path.name})", labels, digest, "as the project's", PIXELS_A_RADIAN)
+        self.facts = Facts(f"street ({path.name})", labels, digest, LICENCE, PIXELS_A_RADIAN)
 
     def probabilities(self, rgb: U8) -> F32:
         """See `segmentation.backends.Network`."""

@@ -16,7 +16,8 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from scan2sim.pipeline.errors import SettingError, UnavailableError
+from scan2sim.pipeline.errors import SettingError
+from scan2sim.pipeline.extras import unavailable
 from scan2sim.pipeline.types import F32, U8
 
 
@@ -85,7 +86,7 @@ def named(
     module = _module(name)
     lacking = module.available()
     if lacking:
-        raise UnavailableError(f"slam.features {name}", f"needs {lacking}", f"pip install {lacking.replace(',', '')}")
+        raise unavailable(f"slam.features {name}", lacking)
     backend: Features = module.load(weights, count, upsample, device)
     return backend
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from scan2sim.pipeline.errors import UnavailableError
+from scan2sim.pipeline.extras import need
 from scan2sim.slam.geometry import exp_so3
 from scan2sim.slam.graph.problem import Graph, Solution
 
@@ -28,12 +28,9 @@ def solve(graph: Graph, *, iterations: int | None = None, points: bool = True) -
     Raises:
         UnavailableError: torch is not installed.
     """
-    try:
-        import torch
-    except ImportError:
-        raise UnavailableError(
-            "backend adam", "needs torch", "pip install 'scan2sim[segmentation]', or use the backend lm"
-        ) from None
+    need("backend adam", "torch", instead="or use the backend lm")
+    import torch
+
     device = "cuda" if torch.cuda.is_available() else "cpu"
 
     def tensor(values: Any, kind: Any = torch.float64) -> Any:

@@ -14,7 +14,8 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from scan2sim.pipeline.errors import SettingError, UnavailableError
+from scan2sim.pipeline.errors import SettingError
+from scan2sim.pipeline.extras import unavailable
 from scan2sim.slam.features import Features, Found
 
 I64 = npt.NDArray[np.int64]
@@ -73,7 +74,7 @@ def named(name: str, weights: Path | None = None, *, device: str = "auto") -> Ma
     module = _module(name)
     lacking = module.available()
     if lacking:
-        raise UnavailableError(f"slam.matchers {name}", f"needs {lacking}", f"pip install {lacking.replace(',', '')}")
+        raise unavailable(f"slam.matchers {name}", lacking)
     backend: Matcher = module.load(weights, device)
     return backend
 

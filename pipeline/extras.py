@@ -1,0 +1,50 @@
+"""Packages that only some of the work needs: which extra brings each, and what to say where one is missing."""
+
+from __future__ import annotations
+
+import importlib.util
+
+from scan2sim.pipeline.errors import UnavailableError
+
+EXTRA_OF = {
+    "torch": "segmentation",
+    "safetensors": "segmentation",
+    "transformers": "segmentation",
+    "onnx": "segmentation",
+    "av": "slam",
+    "matplotlib": "slam",
+    "pycolmap": "slam",
+    "prefect": "flows",
+    "distributed": "flows",
+    "ray": "ray",
+    "s3fs": "s3",
+}
+"""A package's import name to the extra of `scan2sim` that installs it."""
+
+
+def missing(*packages: str) -> str | None:
+    """Those that aren't installed, as "torch, safetensors"; None: all are."""
+    return ", ".join(name for name in packages if importlib.util.find_spec(name) is None) or None
+
+
+def need(what: str, *packages: str, instead: str = "") -> None:
+    """Go on only if all packages are installed.
+
+    Args:
+        what: needs them: a setting, option or command.
+        instead: what to do without them, a sentence's second half ("or set ...").
+
+    Raises:
+        UnavailableError: some aren't; it names them, and the extra that brings them.
+    """
+    lacking = missing(*packages)
+    if lacking:
+        raise unavailable(what, lacking, instead)
+
+
+def unavailable(what: str, lacking: str, instead: str = "") -> UnavailableError:
+    """The error of `need`, for packages as `missing` tells them."""
+    names = lacking.split(", ")
+    extras = ",".join(sorted({EXTRA_OF[name] for name in names if name in EXTRA_OF}))
+    install = f"pip install 'scan2sim[{extras}]'" if extras else f"pip install {' '.join(names)}"
+    return UnavailableError(what, f"needs {lacking}, not installed here", " ".join(filter(None, [install, instead])))

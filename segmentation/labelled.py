@@ -1,0 +1,55 @@
+"""Labelled photos, to learn from and to check with: `images/*.jpg` (or png) and `labels/*.png` of the same names.
+
+Labels are LAS class codes a pixel (0 sky, 255 not to be learnt), as `data_samples.training` writes them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from scan2sim.pipeline.errors import DataError
+from scan2sim.pipeline.types import U8
+from scan2sim.segmentation.labels import index_of_code
+
+
+def pairs(folder: Path) -> list[tuple[Path, Path]]:
+    """Images and their labels, by name.
+
+    Raises:
+        DataError: there are none.
+    """
+    found = [
+        (image, label)
+        for image in sorted((folder / "images").glob("*"))
+        if (label := folder / "labels" / f"{image.stem}.png").is_file()
+    ]
+    if not found:
+        raise DataError(
+            folder, "has no images/NAME.jpg with labels/NAME.png", "Make some, as docs/segmentation.md says"
+        )
+    return found
+
+
+def split(found: Sequence[tuple[Path, Path]], share: float) -> tuple[list[tuple[Path, Path]], list[tuple[Path, Path]]]:
+    """To learn from, and to check with: whole streets, the last ones."""
+    streets = sorted({image.stem.split("_")[0] for image, _ in found})
+    last = set(streets[len(streets) - round(share * len(streets)) :])
+    learn = [pair for pair in found if pair[0].stem.split("_")[0] not in last]
+    return (learn, [pair for pair in found if pair[0].stem.split("_")[0] in last]) if learn else (list(found), [])
+
+
+def read(image: Path, label: Path) -> tuple[U8, U8]:
+    """(H, W, 3) colours and (H, W) indices of classes, `IGNORED` where there is none.
+
+    Raises:
+        DataError: either can't be read, or they differ in size.
+    """
+    import cv2
+
+    bgr, codes = cv2.imread(str(image)), cv2.imread(str(label), cv2.IMREAD_GRAYSCALE)
+    if bgr is None or codes is None or bgr.shape[:2] != codes.shape:
+        raise DataError(label, "and its image can't be read, or differ in size", "Make them again")
+    return np.asarray(bgr[..., ::-1], np.uint8), index_of_code()[codes]
