@@ -17,6 +17,7 @@ import sys
 import sysconfig
 from collections import defaultdict
 from pathlib import Path
+from typing import Any
 
 from scan2sim.pipeline.libraries import PACKAGE_OF
 
@@ -42,7 +43,6 @@ def needed(folder: Path) -> tuple[int, dict[str, list[str]]]:
     Returns:
         how many there are; library to the files (relative to the folder) that need it.
     """
-    from elftools.elf.dynamic import DynamicSegment
     from elftools.elf.elffile import ELFFile
 
     wanted: dict[str, list[str]] = defaultdict(list)
@@ -53,13 +53,12 @@ def needed(folder: Path) -> tuple[int, dict[str, list[str]]]:
             if file.read(4) != b"\x7fELF":
                 continue
             own.add(path.name)
-            for segment in ELFFile(file).iter_segments("PT_DYNAMIC"):
-                assert isinstance(segment, DynamicSegment)
-                for tag in segment.iter_tags():
-                    if tag.entry.d_tag == "DT_NEEDED":
-                        wanted[tag.needed].append(path.relative_to(folder).as_posix())
-                    elif tag.entry.d_tag == "DT_SONAME":
-                        own.add(tag.soname)
+            dynamic: Any = next(ELFFile(file).iter_segments("PT_DYNAMIC"), None)
+            for tag in dynamic.iter_tags() if dynamic is not None else ():
+                if tag.entry.d_tag == "DT_NEEDED":
+                    wanted[tag.needed].append(path.relative_to(folder).as_posix())
+                elif tag.entry.d_tag == "DT_SONAME":
+                    own.add(tag.soname)
     return len(own), {name: users for name, users in sorted(wanted.items()) if name not in own}
 
 
