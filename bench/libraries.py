@@ -29,7 +29,9 @@ ALWAYS = {
 OTHER_NAMES = {"libgomp.so.1.0.0": "libgomp.so.1"}
 """Full names that some wheels ask for, of the same file."""
 NEVER_LOADED = {
-    "libtensorflow_framework.so.2": "Open3D's operators for TensorFlow, which the project doesn't use",
+    "libtensorflow_framework.so.2": "Open3D's operators for TensorFlow, never used here",
+    "libtorch_cpu.so": "Open3D's operators for PyTorch, never used here",
+    "libc10.so": "likewise",
     "libcuda.so.1": "NVIDIA's driver: where there is a GPU, it comes with that",
     "libnvidia-ml.so.1": "likewise",
     "libtbb.so.12": "numba's third choice of threads; it has others",

@@ -1,11 +1,13 @@
 """Classes told from photos and shape against classes known, beside shape alone; on streets never trained on.
 
-`python -m bench.segmentation [--parts streets time kitti semkitti mesh] [--out bench-out/segmentation]`
+`python -m bench.segmentation [--parts streets time network kitti semkitti mesh] [--out bench-out/segmentation]`
 
 - streets: three streets of seeds below those of training: the default European town, and two with looks drawn anew.
   point_miou is the mean over the streets of the mean over road, terrain, building, low and high vegetation.
   geometry: classes from shape alone, ground by a surface search and the rest by height above it and shape.
 - time: a street of nine million points and forty photos, from tile to classes, everything included.
+- network: the project's own on one photo of 1536 x 1024, by onnxruntime and by torch, turn by turn on the same cores:
+  network_ratio is the first's time by the second's, network_same the share of pixels with the same class.
 - mesh: distance of the truth to the meshes made by true classes and by those told (the first street).
 - semkitti: shape alone on a labelled sweep (one; no photo). kitti: pixels against polygons drawn on three photos.
 
@@ -18,6 +20,7 @@ import argparse
 import json
 import shutil
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +40,7 @@ SEMKITTI = {
     10: "vehicle", 11: "vehicle", 13: "vehicle", 15: "vehicle", 18: "vehicle", 20: "vehicle", 252: "vehicle",
     30: "person", 254: "person",
 }  # fmt: skip
-PARTS = ("streets", "time", "kitti", "semkitti", "mesh")
+PARTS = ("streets", "time", "network", "kitti", "semkitti", "mesh")
 
 
 def scan2sim(*arguments: object) -> float:
@@ -101,6 +104,29 @@ def time_of_nine_million(out: Path) -> float:
     found, seconds = told(tile, out / "told_9m")
     print(f"\n9 million points, 40 photos: {seconds:.0f} s, mIoU {found.mean():.3f}\n{found.table()}", flush=True)
     return seconds / 60
+
+
+def network() -> dict[str, float]:
+    """Times and classes of the project's own network by onnxruntime and by torch."""
+    import cv2
+
+    from scan2sim.segmentation.backends import load
+    from scan2sim.segmentation.backends.street import OWN
+
+    bgr = cv2.imread(str(next((ROOT / "data_samples" / "tile" / "photos").glob("*_front.jpg"))))
+    photo = np.ascontiguousarray(cv2.resize(bgr, (1536, 1024))[..., ::-1])
+    networks = {form: load("street", OWN.with_suffix(form), "cpu") for form in (".onnx", ".safetensors")}
+    told = {form: one.probabilities(photo).argmax(axis=0) for form, one in networks.items()}
+    seconds: dict[str, list[float]] = {form: [] for form in networks}
+    for _ in range(15):
+        for form, one in networks.items():
+            start = time.perf_counter()
+            one.probabilities(photo)
+            seconds[form].append(time.perf_counter() - start)
+    onnx, torch = (float(np.median(seconds[form])) for form in networks)
+    same = float((told[".onnx"] == told[".safetensors"]).mean())
+    print(f"\na photo of 1536 x 1024: {onnx:.3f} s by onnxruntime, {torch:.3f} s by torch; same class: {same:.6f}")
+    return {"network_ratio": onnx / torch, "network_same": same}
 
 
 def mesh(out: Path) -> None:
@@ -193,12 +219,15 @@ def main() -> None:
     arguments = parser.parse_args()
     out: Path = arguments.out
     out.mkdir(parents=True, exist_ok=True)
-    result: dict[str, Any] = dict.fromkeys(("point_miou", "sign_iou", "geometry_miou", "minutes_9m"))
+    figures = ("point_miou", "sign_iou", "geometry_miou", "minutes_9m", "network_ratio", "network_same")
+    result: dict[str, Any] = dict.fromkeys(figures)
     print(f"mean over {', '.join(MEAN_OF)}")
     if "streets" in arguments.parts:
         result |= streets(out)
     if "time" in arguments.parts:
         result["minutes_9m"] = time_of_nine_million(out)
+    if "network" in arguments.parts:
+        result |= network()
     if "mesh" in arguments.parts:
         mesh(out)
     for part, needed, work in (

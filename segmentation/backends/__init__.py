@@ -78,7 +78,7 @@ def check(name: str, weights: Path | None) -> Any:
     if lacking:
         raise unavailable(f"label.network {name}", lacking)
     if weights is not None and not weights.exists():
-        raise InputError(weights, "doesn't exist", "Correct label.weights; nothing is downloaded")
+        raise InputError(weights, "is no file or folder", "Give one on this disk; nothing is downloaded")
     return backend
 
 

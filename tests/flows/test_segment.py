@@ -14,8 +14,6 @@ from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.segmentation.score import confusion
 from tests.flows.test_cli import bad, good, scan2sim
 
-pytest.importorskip("torch", reason="torch is not installed (pip install 'scan2sim[segmentation]')")
-
 
 @pytest.fixture(scope="module")
 def told(small_street: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:

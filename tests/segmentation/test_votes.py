@@ -131,7 +131,6 @@ def test_ground_codes_and_vehicles_have_their_own_classes(labelled, tmp_path):
 
 
 def test_weights_that_are_no_weights_are_named(tmp_path):
-    pytest.importorskip("torch")
     from scan2sim.segmentation.backends import load
 
     with pytest.raises(InputError, match=r"no\.safetensors"):

@@ -149,7 +149,7 @@ def test_what_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(weights, "missing", lambda: "torch, safetensors")
     for module, name in ((features, "aliked"), (features, "superpoint"), (matchers, "superglue")):
         assert module.missing(name) == "torch, safetensors"
-        with pytest.raises(UnavailableError, match="pip install torch safetensors"):
+        with pytest.raises(UnavailableError, match=r"pip install 'scan2sim\[segmentation\]'"):
             module.named(name)
 
 

@@ -7,7 +7,7 @@ from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.io import image
 from tests.texturing.corner import CAMERAS, POSES, photograph, points
 
-pytest.importorskip("torch", reason="torch is not installed (pip install 'scan2sim[gpu]')")
+pytest.importorskip("torch", reason="torch is not installed (pip install 'scan2sim[segmentation]')")
 
 
 @pytest.mark.parametrize("name", CAMERAS)

@@ -15,19 +15,29 @@ from scan2sim.segmentation.backends import load  # noqa: E402
 from scan2sim.segmentation.backends.street import OWN, save  # noqa: E402
 from scan2sim.segmentation.labels import CLASSES  # noqa: E402
 from scan2sim.segmentation.network import StreetNet  # noqa: E402
+from tests.conftest import ROOT  # noqa: E402
 
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory):
     torch.manual_seed(0)
-    path = tmp_path_factory.mktemp("weights") / "w.safetensors"
+    path = tmp_path_factory.mktemp("weights") / "w.onnx"
     save(StreetNet(len(CLASSES)), path, {"iou": {}})
-    return path
+    return path.with_suffix(".safetensors")
+
+
+def photos():
+    """Of the committed street, and noise of an odd size."""
+    import cv2
+
+    yield np.random.default_rng(0).integers(0, 255, (101, 131, 3), np.uint8)
+    for path in sorted((ROOT / "data_samples" / "tile" / "photos").glob("*.jpg"))[:3]:
+        yield np.ascontiguousarray(cv2.imread(str(path))[..., ::-1])
 
 
 def test_the_weights_that_come_along_are_small_and_tell_every_class():
     network = load("street", None, "cpu")
-    assert OWN.stat().st_size < 8e6
+    assert OWN.stat().st_size < 8e6 and OWN.with_suffix(".safetensors").stat().st_size < 8e6
     assert network.facts.labels == CLASSES and len(network.facts.sha256) == 64
     found = network.probabilities(np.random.default_rng(0).integers(0, 255, (96, 128, 3), np.uint8))
     assert found.shape == (len(CLASSES), 24, 32) and found.sum(axis=0) == pytest.approx(1, abs=1e-4)
@@ -35,8 +45,37 @@ def test_the_weights_that_come_along_are_small_and_tell_every_class():
 
 def test_the_same_weights_and_photo_give_the_same_classes(weights):
     photo = np.random.default_rng(0).integers(0, 255, (100, 130, 3), np.uint8)
-    a, b = (load("street", weights, "cpu").probabilities(photo) for _ in range(2))
-    np.testing.assert_array_equal(a, b)
+    for form in (weights, weights.with_suffix(".onnx")):
+        a, b = (load("street", form, "cpu").probabilities(photo) for _ in range(2))
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("own", [True, False], ids=["the project's own", "just trained"])
+def test_onnxruntime_and_torch_tell_the_same_classes(weights, own):
+    form = OWN.with_suffix(".safetensors") if own else weights
+    by_torch, by_onnx = load("street", form, "cpu"), load("street", form.with_suffix(".onnx"), "cpu")
+    assert by_torch.facts.labels == by_onnx.facts.labels
+    assert by_torch.facts.pixels_a_radian == by_onnx.facts.pixels_a_radian
+    for photo in photos():
+        a, b = by_torch.probabilities(photo), by_onnx.probabilities(photo)
+        assert a.shape == b.shape and np.abs(a - b).max() < 1e-4
+        assert (a.argmax(axis=0) == b.argmax(axis=0)).mean() > 0.9999
+
+
+def test_classes_do_not_depend_on_the_number_of_cores(monkeypatch):
+    photo = np.random.default_rng(0).integers(0, 255, (256, 320, 3), np.uint8)
+    told = []
+    for cores in ("1", "2", "3"):
+        monkeypatch.setenv("OMP_NUM_THREADS", cores)
+        told.append(load("street", None, "cpu").probabilities(photo))
+    np.testing.assert_array_equal(told[0], told[1])
+    np.testing.assert_array_equal(told[0], told[2])
+
+
+def test_a_damaged_network_is_named(weights, tmp_path):
+    (tmp_path / "cut.onnx").write_bytes(OWN.read_bytes()[:-1000])
+    with pytest.raises(InputError, match=r"cut\.onnx"):
+        load("street", tmp_path / "cut.onnx", "cpu")
 
 
 def test_truncated_weights(weights, tmp_path):
