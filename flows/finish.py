@@ -24,7 +24,7 @@ from scan2sim.pipeline.store import Digests, Manifest, Store
 from scan2sim.pipeline.types import Tile
 
 TILES, PICTURE = "tiles", "picture.jpg"
-SHOWN = {"export", "rasters", "exposure", "pictures", "score"}
+SHOWN = {"export", "rasters", "exposure", "preview", "pictures", "score"}
 """Steps whose files, not just figures, are shown."""
 
 

@@ -8,11 +8,13 @@ from pathlib import Path
 
 from scan2sim.flows.execute import versions
 from scan2sim.flows.planning import Planned
+from scan2sim.flows.report import PAGES, SCRIPTS
 from scan2sim.flows.settings import Settings
 from scan2sim.pipeline.io.worlds import STAMP, link, swap
 from scan2sim.pipeline.store import Manifest, Store
 from scan2sim.pipeline.types import Tile
 
+THREE = "three.js"
 BULKY = ("poses", "positions", "times")  # parameters that repeat the tile
 
 
@@ -30,6 +32,9 @@ def publish(
         _publish(result("rasters", "rasters"), out / "rasters", keys["rasters"])
     elif (out / "rasters" / STAMP).is_file():  # of an earlier world
         shutil.rmtree(out / "rasters")
+    if done["preview"].files:
+        _publish(result("preview", "preview"), out / SCRIPTS, keys["preview"])
+        shutil.copyfile(PAGES / THREE, out / SCRIPTS / THREE)
     shutil.copyfile(result("exposure", "exposures"), out / "exposure.json")  # for the next tile's `exposure.prior`
     config = {
         "tile": str(tile.path),

@@ -26,6 +26,7 @@ from scan2sim.pipeline.steps.path import PATH
 from scan2sim.pipeline.steps.pictures import PICTURES
 from scan2sim.pipeline.steps.plants import PLANTS
 from scan2sim.pipeline.steps.poisson import POISSON
+from scan2sim.pipeline.steps.preview import PREVIEW
 from scan2sim.pipeline.steps.rasters import RASTERS
 from scan2sim.pipeline.steps.split import SPLIT
 from scan2sim.pipeline.steps.trim import TRIM
@@ -47,7 +48,7 @@ from scan2sim.texturing.unwrap import UNWRAP
 STEPS: tuple[Step, ...] = (
     INGEST, PATH, VIEWS, LABEL, SEGMENT, OVERLAP, SPLIT, VOXEL, POISSON, TRIM, ISLANDS, CLIP, JOIN, DECIMATE, PLANTS,
     UNWRAP, VISIBILITY, EXPOSURE, AGREEMENT, CHOOSE, TEXTURE, LEVEL, COLLISION, EXPORT, RASTERS, GEOMETRY, SCORE,
-    PICTURES, BORDERS,
+    PICTURES, PREVIEW, BORDERS,
 )  # fmt: skip
 PER_CLASS: tuple[Step, ...] = (VOXEL, POISSON, TRIM, ISLANDS, CLIP, JOIN, DECIMATE, CHOOSE, UNWRAP, TEXTURE, LEVEL)
 
@@ -185,6 +186,7 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
         mine = {f"textured.{g}": at(f"level.{g}", "textured") for g in groups}
         theirs = {f"textured.{g}.{n}": at(f"level.{g}", "textured", n) for g in groups for n in first}
         add(BORDERS, mine | theirs, **cell)
+    add(PREVIEW, textured | scanner)
     add(PICTURES, textured | stages | clouds | {"views": seen["views"]} | scanner)
     return nodes
 

@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from scan2sim.flows import gazebo
 from scan2sim.flows.execute import versions
 from scan2sim.flows.planning import Planned
 from scan2sim.pipeline.classes import GROUPS
@@ -18,6 +19,9 @@ from scan2sim.pipeline.store import Manifest, Store
 from scan2sim.pipeline.types import Tile
 
 TEMPLATE = "report.html.j2"
+PAGES = Path(__file__).parent / "pages"
+SCRIPTS = "report_files"
+"""Folder beside the page: what it loads to show the world."""
 AREAS = ("area_m2", "seen_m2", "coloured_m2", "filled_m2")
 Picture = dict[str, Any]
 """An entry of an album's index.json: `file`, `role`, `title`, `caption`, and perhaps `other`."""
@@ -38,7 +42,8 @@ def write_report(
             shown = telling(entries, done[label].facts["photos"]) if name == "error" else entries
             pictures += [_with_pixels(entry, folder) for entry in shown]
     page = out / "report.html"
-    write_whole(page, _render(body, pictures))
+    view = done["preview"].facts if "preview" in done and done["preview"].files else None
+    write_whole(page, _render(body, pictures, view, gazebo.commands(out / "world" / f"{tile.name}.sdf")))
     return page
 
 
@@ -89,11 +94,21 @@ def _with_pixels(entry: Picture, folder: Path) -> Picture:
     return entry | {"src": _embedded(folder / entry["file"])} | other
 
 
-def _render(body: Mapping[str, Any], pictures: Sequence[Picture]) -> str:
+def _render(
+    body: Mapping[str, Any], pictures: Sequence[Picture], view: Mapping[str, Any] | None, opened: Mapping[str, str]
+) -> str:
     from jinja2 import Environment, FileSystemLoader
+    from markupsafe import Markup
 
     environment = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True)
-    return environment.get_template(TEMPLATE).render(body=body, pictures=pictures, groups=GROUPS)
+    return environment.get_template(TEMPLATE).render(
+        body=body,
+        pictures=pictures,
+        groups=GROUPS,
+        gazebo=opened,
+        view=view and {**view, "folder": SCRIPTS, "about": {name: view[name] for name in ("walk", "turn")}},
+        script=Markup((PAGES / "walk.js").read_text(encoding="utf-8")),
+    )
 
 
 def _embedded(path: Path) -> str:

@@ -16,6 +16,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from scan2sim.flows import gazebo
 from scan2sim.flows.execute import versions
 from scan2sim.flows.report import write_whole
 from scan2sim.pipeline.classes import GROUPS
@@ -83,7 +84,8 @@ def write_survey_report(out: Path, name: str, tiles: Sequence[TileState], *, pat
     try:
         out.mkdir(parents=True, exist_ok=True)
         write_whole(out / DATA, json.dumps(body, indent=1))
-        write_whole(out / PAGE, _render(body, tiles, drive))
+        world = out / "world" / f"{name}.sdf"
+        write_whole(out / PAGE, _render(body, tiles, drive, gazebo.commands(world)))
     except OSError as error:
         raise from_os_error(error, out) from None
     return out / PAGE
@@ -186,7 +188,7 @@ def _borders(tiles: Sequence[TileState]) -> list[dict[str, Any]]:
 # --- the page ---
 
 
-def _render(body: Mapping[str, Any], tiles: Sequence[TileState], path: F64) -> str:
+def _render(body: Mapping[str, Any], tiles: Sequence[TileState], path: F64, opened: Mapping[str, str]) -> str:
     from jinja2 import Environment, FileSystemLoader
 
     environment = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True)
@@ -199,6 +201,7 @@ def _render(body: Mapping[str, Any], tiles: Sequence[TileState], path: F64) -> s
         warnings=sorted(warnings.items(), key=lambda told: (-told[1], told[0])),
         thumbnails={tile.name: _thumbnail(tile.thumbnail) for tile in tiles if tile.thumbnail},
         groups=GROUPS,
+        gazebo=opened,
         shown=SHOWN,
     )
 

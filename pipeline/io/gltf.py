@@ -12,11 +12,22 @@ from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.io.textured import Textured, unique_uv
 
 
-def write(path: Path, surfaces: Mapping[str, Textured], jpeg_quality: int = 90) -> None:
+def write(
+    path: Path,
+    surfaces: Mapping[str, Textured],
+    jpeg_quality: int = 90,
+    *,
+    scale: float = 1.0,
+    normals: bool = True,
+) -> None:
     """Write all surfaces into one file, a mesh with one primitive for every page.
 
     Local metres, turned from z-up to glTF's y-up: (x, y, z) becomes (x, z, -y). Materials are matt
     (metallic 0, roughness 1) and single-sided. Pages are read and packed one at a time.
+
+    Args:
+        scale: of the pages' sides.
+        normals: False leaves them out, for viewers that show textures in their own light.
     """
     import trimesh
     from trimesh.visual import TextureVisuals
@@ -46,23 +57,26 @@ def write(path: Path, surfaces: Mapping[str, Textured], jpeg_quality: int = 90) 
 
     def embed(buffers: dict[str, bytes], tree: dict[str, Any]) -> None:
         for material in tree["materials"]:
-            data = _jpeg(images[material["name"]], jpeg_quality)
+            data = _jpeg(images[material["name"]], jpeg_quality, scale)
             buffers[material["name"]] = data + b"\0" * (-len(data) % 4)
             tree["images"].append({"name": material["name"], "bufferView": len(buffers) - 1, "mimeType": "image/jpeg"})
             tree["textures"].append({"source": len(tree["images"]) - 1})
             material["pbrMetallicRoughness"]["baseColorTexture"] = {"index": len(tree["textures"]) - 1}
 
-    path.write_bytes(scene.export(file_type="glb", include_normals=True, buffer_postprocessor=embed))
+    path.write_bytes(scene.export(file_type="glb", include_normals=normals, buffer_postprocessor=embed))
 
 
 def _y_up(xyz: np.ndarray) -> np.ndarray:
     return xyz[:, [0, 2, 1]] * np.array([1, 1, -1], np.float32)
 
 
-def _jpeg(page: Path, quality: int) -> bytes:
+def _jpeg(page: Path, quality: int, scale: float) -> bytes:
     import cv2
 
     image = cv2.imread(str(page), cv2.IMREAD_COLOR)
     if image is None:
         raise InputError(page, "is no readable image", "Texture the mesh again")
+    if scale < 1:
+        height, width = (max(1, round(side * scale)) for side in image.shape[:2])
+        image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
     return bytes(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1])

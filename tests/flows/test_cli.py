@@ -19,6 +19,7 @@ from scan2sim.pipeline.classes import GROUPS, group_of
 from scan2sim.pipeline.io import geotiff, las
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.types import Frame, Mesh, PointCloud
+from tests.browser import chromium
 from tests.conftest import ROOT
 from tests.gazebo.checker import check_world
 
@@ -86,6 +87,43 @@ def test_rasters_are_made_where_they_are_asked_for(street: Path, world: Path, tm
     assert len(error) > 1000 and np.median(error) < 0.02 and np.percentile(error, 90) < 0.06
     good(scan2sim("run", *command))
     assert not (out / "rasters").exists()  # they are of another run than the world
+
+
+def test_the_report_has_the_world_to_turn_and_walk_through(world: Path, tmp_path: Path) -> None:
+    def eye() -> np.ndarray:
+        return np.array(page.value("document.querySelector('output').value").split(), float)
+
+    with chromium(tmp_path) as page:
+        page.open(world / "report.html")
+        page.click("[data-open]")
+        page.until("document.querySelector('header').dataset.state == 'open' && document.querySelector('output').value")
+        street, start = page.picture()[50:450], eye()
+        assert street.std() > 15, "the canvas shows more than one colour"
+        for _ in range(20):
+            page.key("KeyW", "w", 0.3)
+        assert np.linalg.norm((eye() - start)[:2]) > 0.3 and abs((eye() - start)[2]) < 0.5, "it walks on the ground"
+        page.drag((400, 300), (700, 300))
+        page.until("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(true))))")
+        assert np.abs(page.picture()[50:450].astype(int) - street).mean() > 10
+        page.click("[data-to=turn]")
+        page.until(f"Number(document.querySelector('output').value.split('  ')[2]) > {start[2] + 5}")
+        assert page.errors == []
+        page.open(world / "report.html", phone=True, dark=True)
+        page.click("[data-open]")
+        page.until("document.querySelector('header').dataset.state == 'open'")
+        assert page.value("getComputedStyle(document.querySelector('.pad')).display") == "grid"
+        page.open(Path(shutil.copy(world / "report.html", tmp_path)))  # without what lies beside it
+        page.click("[data-open]")
+        page.until("document.querySelector('[role=status]').textContent.includes(\"isn't beside this page\")")
+
+
+def test_without_webgl_the_report_shows_the_picture_and_says_why(world: Path, tmp_path: Path) -> None:
+    with chromium(tmp_path, "--disable-3d-apis") as page:
+        page.open(world / "report.html")
+        page.click("[data-open]")
+        page.until("document.querySelector('[role=status]').textContent.includes('no WebGL')")
+        assert page.value("document.querySelector('header img').getBoundingClientRect().height") > 100
+        assert page.errors == []
 
 
 @pytest.fixture

@@ -1,0 +1,225 @@
+// The world in the page: turned from above, walked through at eye height. Classic scripts, as a page that is opened by
+// a double click (file://) may load no modules and fetch nothing: world.js calls scan2simWorld with the GLB as base64.
+"use strict";
+
+(() => {
+  const EYE = 1.6; // metres above the ground
+  const CELL = 1; // metres: the ground's triangles are looked up in squares of it
+  const STEP = 0.6; // metres above the feet: what is higher is no ground to step onto
+  const SPEED = 3.5; // metres a second; with Shift four times as much
+  const SKY = 0xc8d6e6;
+  const MOVES = {
+    KeyW: [0, 1], ArrowUp: [0, 1], KeyS: [0, -1], ArrowDown: [0, -1],
+    KeyA: [-1, 0], ArrowLeft: [-1, 0], KeyD: [1, 0], ArrowRight: [1, 0],
+  };
+
+  // Scripts that the world needs, beside the page; the page itself stays quick to load.
+  async function load(folder, names) {
+    for (const name of names) {
+      await new Promise((done, fail) => {
+        const script = document.createElement("script");
+        script.src = `${folder}/${name}`;
+        script.onload = done;
+        script.onerror = () => fail(new Error(`${folder}/${name} isn't beside this page`));
+        document.head.append(script);
+      });
+    }
+  }
+
+  // Meshes of a GLB, z-up as in the simulator, in the photos' own light.
+  async function meshes(base64) {
+    const bytes = Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0));
+    const { scene } = await new THREE.GLTFLoader().parseAsync(bytes.buffer, "");
+    scene.rotation.x = Math.PI / 2;
+    scene.updateMatrixWorld();
+    const found = [];
+    scene.traverse((node) => {
+      if (!node.isMesh) return;
+      const map = node.material.map;
+      if (map) map.anisotropy = 8;
+      const material = new THREE.MeshBasicMaterial({ map, side: THREE.DoubleSide });
+      const mesh = new THREE.Mesh(node.geometry.applyMatrix4(node.matrixWorld), material);
+      mesh.name = node.name;
+      found.push(mesh);
+    });
+    return found;
+  }
+
+  // Heights of the ground: its triangles by the squares that they touch.
+  class Ground {
+    constructor(all) {
+      const terrain = all.filter((mesh) => mesh.name.startsWith("terrain"));
+      this.cells = new Map();
+      for (const { geometry } of terrain.length ? terrain : all) {
+        const xyz = geometry.attributes.position.array, index = geometry.index.array;
+        for (let i = 0; i < index.length; i += 3) this.add([0, 1, 2].map((k) => xyz.subarray(3 * index[i + k], 3 * index[i + k] + 3)));
+      }
+    }
+
+    add(corners) {
+      const [low, high] = [Math.min, Math.max].map((end) => [0, 1].map((k) => Math.floor(end(...corners.map((c) => c[k])) / CELL)));
+      for (let x = low[0]; x <= high[0]; x++) {
+        for (let y = low[1]; y <= high[1]; y++) {
+          const key = `${x},${y}`;
+          if (!this.cells.has(key)) this.cells.set(key, []);
+          this.cells.get(key).push(corners);
+        }
+      }
+    }
+
+    // The highest ground at a place that isn't above a height; the lowest where all is; null where there is none.
+    height(x, y, top) {
+      let below = null, lowest = null;
+      for (const [a, b, c] of this.cells.get(`${Math.floor(x / CELL)},${Math.floor(y / CELL)}`) ?? []) {
+        const area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]);
+        const u = ((x - a[0]) * (c[1] - a[1]) - (y - a[1]) * (c[0] - a[0])) / area;
+        const v = ((b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0])) / area;
+        if (!(u >= 0 && v >= 0 && u + v <= 1)) continue;
+        const z = a[2] + u * (b[2] - a[2]) + v * (c[2] - a[2]);
+        if (z <= top && (below === null || z > below)) below = z;
+        if (lowest === null || z < lowest) lowest = z;
+      }
+      return below ?? lowest;
+    }
+  }
+
+  class View {
+    // box: the element that holds the world; about: where eyes are at first, `walk` and `turn`: [eye, target], metres
+    constructor(box, all, about) {
+      this.box = box;
+      this.about = about;
+      this.renderer = new THREE.WebGLRenderer({ antialias: true });
+      this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
+      this.canvas = this.renderer.domElement;
+      this.canvas.tabIndex = 0;
+      this.canvas.setAttribute("aria-label", "The world; W A S D or arrow keys walk, dragging looks around");
+      box.prepend(this.canvas);
+      this.scene = new THREE.Scene();
+      this.scene.background = new THREE.Color(SKY);
+      this.scene.add(...all);
+      this.ground = new Ground(all);
+      this.camera = new THREE.PerspectiveCamera(65, 1, 0.05, 5000);
+      this.camera.up.set(0, 0, 1);
+      this.orbit = new THREE.OrbitControls(this.camera, this.canvas);
+      this.orbit.maxPolarAngle = Math.PI / 2 - 0.02;
+      this.orbit.addEventListener("change", () => (this.stale = true));
+      this.held = new Set();
+      this.listen();
+      new ResizeObserver(() => this.fit()).observe(box);
+      this.fit();
+      this.mode("walk");
+      let before = performance.now();
+      const frame = (now) => {
+        this.move(Math.min(0.25, (now - before) / 1000));
+        before = now;
+        if (this.stale) this.draw();
+        requestAnimationFrame(frame);
+      };
+      requestAnimationFrame(frame);
+    }
+
+    fit() {
+      const { clientWidth: width, clientHeight: height } = this.box;
+      this.renderer.setSize(width, height, false);
+      this.camera.aspect = width / Math.max(1, height);
+      this.camera.updateProjectionMatrix();
+      this.stale = true;
+    }
+
+    mode(name) {
+      this.walking = name === "walk";
+      this.box.dataset.mode = name;
+      this.orbit.enabled = !this.walking;
+      const [eye, target] = this.about[name].map((place) => new THREE.Vector3(...place));
+      this.camera.position.copy(eye);
+      this.camera.lookAt(target);
+      if (!this.walking) this.orbit.target.copy(target);
+      const ahead = target.sub(eye).normalize();
+      this.turn = Math.atan2(ahead.y, ahead.x);
+      this.tilt = Math.asin(ahead.z);
+      this.stale = true;
+    }
+
+    listen() {
+      const keys = (event, down) => {
+        if (!(event.code in MOVES) || !this.walking || event.ctrlKey || event.metaKey) return;
+        event.preventDefault();
+        this.hold(event.code, down);
+        this.fast = event.shiftKey;
+      };
+      this.canvas.addEventListener("keydown", (event) => keys(event, true));
+      this.canvas.addEventListener("keyup", (event) => keys(event, false));
+      this.canvas.addEventListener("blur", () => this.held.clear());
+      this.canvas.addEventListener("pointerdown", () => this.canvas.focus({ preventScroll: true }));
+      this.canvas.addEventListener("pointermove", (event) => {
+        if (!this.walking || !event.buttons) return;
+        const pixel = (this.camera.fov * Math.PI) / 180 / this.box.clientHeight; // what is dragged stays under the finger
+        this.turn += event.movementX * pixel;
+        this.tilt = THREE.MathUtils.clamp(this.tilt + event.movementY * pixel, -1.5, 1.5);
+        this.look();
+      });
+    }
+
+    hold(code, down) {
+      if (down) this.held.add(code);
+      else this.held.delete(code);
+    }
+
+    look() {
+      const ahead = new THREE.Vector3(Math.cos(this.turn) * Math.cos(this.tilt), Math.sin(this.turn) * Math.cos(this.tilt), Math.sin(this.tilt));
+      this.camera.lookAt(ahead.add(this.camera.position));
+      this.stale = true;
+    }
+
+    move(seconds) {
+      if (!this.walking || !this.held.size) return;
+      const way = SPEED * (this.fast ? 4 : 1) * seconds;
+      let [right, ahead] = [0, 0];
+      for (const code of this.held) [right, ahead] = [right + MOVES[code][0], ahead + MOVES[code][1]];
+      const eye = this.camera.position, [cos, sin] = [Math.cos(this.turn), Math.sin(this.turn)];
+      eye.x += way * (ahead * cos + right * sin);
+      eye.y += way * (ahead * sin - right * cos);
+      const ground = this.ground.height(eye.x, eye.y, eye.z - EYE + STEP);
+      if (ground !== null) eye.z += (ground + EYE - eye.z) * Math.min(1, 12 * seconds);
+      this.stale = true;
+    }
+
+    draw() {
+      this.stale = false;
+      this.renderer.render(this.scene, this.camera);
+      this.box.querySelector("output").value = this.camera.position.toArray().map((v) => v.toFixed(2)).join("  ");
+    }
+  }
+
+  // What the page says of a box: `data-folder` of the scripts, `data-about` (see View).
+  async function open(box) {
+    const say = (text) => (box.querySelector("[role=status]").textContent = text);
+    box.dataset.state = "loading";
+    say("Loading the world …");
+    try {
+      const base64 = await new Promise((got, fail) => {
+        window.scan2simWorld = got;
+        load(box.dataset.folder, ["three.js", "world.js"]).catch(fail);
+      });
+      const view = new View(box, await meshes(base64), JSON.parse(box.dataset.about));
+      box.querySelectorAll("[data-to]").forEach((button) => button.addEventListener("click", () => view.mode(button.dataset.to)));
+      box.querySelectorAll("[data-key]").forEach((button) => {
+        for (const kind of ["pointerdown", "pointerup", "pointerleave", "pointercancel"]) {
+          button.addEventListener(kind, () => view.hold(button.dataset.key, kind === "pointerdown"));
+        }
+        button.addEventListener("contextmenu", (event) => event.preventDefault());
+      });
+      const full = box.querySelector("[data-full]");
+      full.hidden = !document.fullscreenEnabled;
+      full.addEventListener("click", () => (document.fullscreenElement ? document.exitFullscreen() : box.requestFullscreen()));
+      say("");
+      box.dataset.state = "open";
+      view.canvas.focus({ preventScroll: true });
+    } catch (error) {
+      box.dataset.state = "failed";
+      say(/webgl/i.test(error.message) ? "This browser has no WebGL to show the world with: here is its picture." : `The world can't be shown: ${error.message}.`);
+    }
+  }
+
+  for (const box of document.querySelectorAll("[data-about]")) box.querySelector("[data-open]").addEventListener("click", () => open(box));
+})();

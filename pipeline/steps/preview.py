@@ -1,0 +1,92 @@
+"""Preview: the world small enough for a browser, which the report shows to turn and to walk through."""
+
+from __future__ import annotations
+
+import base64
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pydantic import Field
+
+from scan2sim.pipeline.classes import GROUPS
+from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
+
+if TYPE_CHECKING:
+    from scan2sim.pipeline.io.textured import Textured
+    from scan2sim.pipeline.types import F64
+
+CALL = b"scan2simWorld"  # the function of flows/pages/walk.js that is given the GLB
+
+
+class PreviewParams(Params):
+    """How much a browser is given.
+
+    Attributes:
+        megapixels: of all texture pages together; larger ones are scaled down.
+        triangles: worlds of more have no preview.
+        jpeg_quality: of the pages.
+    """
+
+    megapixels: float = Field(32.0, ge=0.1, le=1000)
+    triangles: int = Field(2_000_000, ge=0, le=20_000_000)
+    jpeg_quality: int = Field(85, ge=1, le=100)
+
+
+def preview(inputs: Inputs, params: PreviewParams, out: Path, report: Report) -> Done:
+    """Pack the textured groups as a GLB inside a script, `preview/world.js`.
+
+    A page that is opened by a double click may read no other file but scripts. Facts: `scale` of the pages' sides,
+    `bytes`, and where eyes are at first, `walk` and `turn`: [eye, target], local metres.
+    """
+    from scan2sim.pipeline import render
+    from scan2sim.pipeline.io import gltf, textured
+    from scan2sim.pipeline.steps.pictures import bird_pose, bounds, driver_pose
+    from scan2sim.pipeline.types import Trajectory
+
+    read = {group: textured.read(inputs[group]) for group in GROUPS if group in inputs}
+    surfaces: dict[str, Textured] = {group: surface for group, surface in read.items() if surface is not None}
+    triangles = sum(map(len, surfaces.values()))
+    if not 0 < triangles <= params.triangles:
+        return Done({}, {"triangles": triangles})
+    scale = min(1.0, (params.megapixels * 1e6 / _texels(surfaces)) ** 0.5)
+    folder = out / "preview"
+    folder.mkdir()
+    glb = out / "world.glb"
+    gltf.write(glb, surfaces, params.jpeg_quality, scale=scale, normals=False)
+    report(0.7, "eyes")
+    script = folder / "world.js"
+    script.write_bytes(CALL + b'("' + base64.b64encode(glb.read_bytes()) + b'");\n')
+    glb.unlink()
+    path = Trajectory.load(inputs["path"]) if "path" in inputs else None
+    low, high = bounds([surface.mesh.vertices for surface in surfaces.values()])
+    shapes = render.Renderer([render.Body(surface.mesh) for surface in surfaces.values()])
+    facts: dict[str, Any] = {
+        "triangles": triangles,
+        "scale": round(scale, 4),
+        "bytes": script.stat().st_size,
+        "walk": _eye(driver_pose(path.positions if path is not None else None, low, high, shapes), low),
+        "turn": _eye(bird_pose(low, high), low),
+    }
+    return Done({"preview": folder}, facts)
+
+
+def _texels(surfaces: dict[str, Textured]) -> int:
+    """Of all pages that a face lies on."""
+    from PIL import Image
+
+    total = 0
+    for surface in surfaces.values():
+        for page in surface.used_pages:
+            with Image.open(surface.pages[page]) as image:
+                total += image.width * image.height
+    return total
+
+
+def _eye(pose: F64, low: F64) -> list[list[float]]:
+    """Where a camera is, and what it looks at: the floor, or what is 20 m ahead."""
+    eye, ahead = pose[:3, 3], pose[:3, 2]
+    reach = (low[2] - eye[2]) / ahead[2] if ahead[2] < -0.1 else 20.0
+    return [eye.round(3).tolist(), (eye + ahead * reach).round(3).tolist()]
+
+
+PREVIEW = Step("preview", 1, preview, PreviewParams)

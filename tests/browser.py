@@ -1,0 +1,129 @@
+"""Headless Chromium, driven over its DevTools protocol, for pages that tests look at as a reader does."""
+
+from __future__ import annotations
+
+import base64
+import itertools
+import json
+import shutil
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+FLAGS = (
+    "--headless", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--hide-scrollbars",
+    "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update",
+    "--disable-sync", "--remote-debugging-port=0",
+)  # fmt: skip
+NAMES = ("chromium", "chromium-browser", "google-chrome")
+
+
+class Page:
+    """A page in the browser."""
+
+    def __init__(self, socket: Any) -> None:
+        self._socket = socket
+        self._ids = itertools.count(1)
+        self.errors: list[str] = []
+
+    def do(self, method: str, **params: Any) -> dict[str, Any]:
+        """Call a method of the protocol; returns its result."""
+        number = next(self._ids)
+        self._socket.send(json.dumps({"id": number, "method": method, "params": params}))
+        while True:
+            said = json.loads(self._socket.recv(timeout=120))
+            if said.get("method") == "Runtime.exceptionThrown":
+                self.errors.append(json.dumps(said["params"])[:1000])
+            if said.get("id") == number:
+                assert "error" not in said, said
+                return dict(said["result"])
+
+    def open(self, path: Path, *, phone: bool = False, dark: bool = False) -> None:
+        """Open a file, as by a double click, and wait until it is loaded."""
+        width, height = (390, 844) if phone else (1280, 800)
+        self.do("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=phone)
+        self.do("Emulation.setTouchEmulationEnabled", enabled=phone)
+        scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
+        self.do("Emulation.setEmulatedMedia", features=[scheme])
+        self.do("Page.navigate", url=path.resolve().as_uri())
+        self.until("document.readyState === 'complete'")
+
+    def value(self, script: str) -> Any:
+        """What an expression gives."""
+        result = self.do("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
+        assert "exceptionDetails" not in result, result
+        return result["result"].get("value")
+
+    def until(self, script: str, seconds: float = 120) -> None:
+        """Wait until an expression is true."""
+        end = time.monotonic() + seconds
+        while not self.value(script):
+            assert time.monotonic() < end, f"never true: {script}; {self.errors}"
+            time.sleep(0.05)
+
+    def click(self, selector: str) -> None:
+        """Click into the middle of an element."""
+        box = f"document.querySelector({selector!r})"
+        self.value(f"{box}.scrollIntoView({{block: 'nearest'}})")
+        x, y = self.value(f"(b => [b.x + b.width / 2, b.y + b.height / 2])({box}.getBoundingClientRect())")
+        for kind in ("mousePressed", "mouseReleased"):
+            self.do("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+
+    def key(self, code: str, key: str, seconds: float) -> None:
+        """Hold a key down."""
+        for kind in ("rawKeyDown", "keyUp"):
+            self.do("Input.dispatchKeyEvent", type=kind, code=code, key=key)
+            time.sleep(seconds if kind == "rawKeyDown" else 0)
+
+    def drag(self, start: tuple[float, float], end: tuple[float, float]) -> None:
+        """Drag with the left button, viewport pixels."""
+        self.do("Input.dispatchMouseEvent", type="mousePressed", x=start[0], y=start[1], button="left", clickCount=1)
+        for share in (0.5, 1.0):
+            x, y = (a + share * (b - a) for a, b in zip(start, end, strict=True))
+            self.do("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y, button="left", buttons=1)
+        self.do("Input.dispatchMouseEvent", type="mouseReleased", x=end[0], y=end[1], button="left", clickCount=1)
+
+    def picture(self, *, whole: bool = False) -> np.ndarray:
+        """(H, W, 3) of what is seen, or of the whole page."""
+        data = self.do("Page.captureScreenshot", captureBeyondViewport=whole)["data"]
+        return np.asarray(Image.open(BytesIO(base64.b64decode(data))).convert("RGB"))
+
+
+@contextmanager
+def chromium(folder: Path, *flags: str) -> Iterator[Page]:
+    """A page in a fresh browser, which is gone afterwards; the test is skipped where there is none."""
+    program = next(filter(None, map(shutil.which, NAMES)), None)
+    if program is None:
+        pytest.skip("Chromium isn't installed (apt-get install chromium)")
+    connect = pytest.importorskip("websockets.sync.client", reason="websockets isn't installed").connect
+    profile = folder / "profile"
+    with subprocess.Popen(
+        [program, *FLAGS, *flags, f"--user-data-dir={profile}", "about:blank"],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    ) as process:
+        try:
+            end = time.monotonic() + 60
+            while not (profile / "DevToolsActivePort").is_file():
+                assert process.poll() is None and time.monotonic() < end, "Chromium doesn't start"
+                time.sleep(0.05)
+            time.sleep(0.1)
+            port, path = (profile / "DevToolsActivePort").read_text().split()
+            with connect(f"ws://127.0.0.1:{port}{path}", max_size=None) as whole:
+                browser = Page(whole)
+                target = browser.do("Target.getTargets")["targetInfos"][0]["targetId"]
+            with connect(f"ws://127.0.0.1:{port}/devtools/page/{target}", max_size=None) as socket:
+                page = Page(socket)
+                page.do("Page.enable")
+                page.do("Runtime.enable")
+                yield page
+        finally:
+            process.terminate()

@@ -1,0 +1,61 @@
+"""Preview: the report's copy of the world is the world, within bounds."""
+
+from __future__ import annotations
+
+import base64
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+from scan2sim.pipeline.step import Done, silent
+from scan2sim.pipeline.steps.preview import CALL, PREVIEW, PreviewParams
+from tests.pipeline import made_up
+
+
+@pytest.fixture
+def made(tmp_path: Path) -> Any:
+    """Make the preview of the made-up tile, whose four pages are of 256 x 256 texels."""
+    meshes = {"terrain": made_up.ground(), "building": made_up.house()}
+    inputs = {group: made_up.textured(tmp_path / group, mesh) for group, mesh in meshes.items()}
+
+    def make(**params: Any) -> Done:
+        out = tmp_path / "out"
+        out.mkdir()
+        return PREVIEW.run(inputs, PreviewParams(**params), out, silent)
+
+    return make
+
+
+def scene(done: Done) -> trimesh.Scene:
+    """What is inside the script."""
+    script = (done.files["preview"] / "world.js").read_bytes()
+    assert script.startswith(CALL + b'("') and script.endswith(b'");\n')
+    return trimesh.load(io.BytesIO(base64.b64decode(script[len(CALL) + 2 : -4])), file_type="glb")
+
+
+@pytest.mark.parametrize(("megapixels", "side"), [(32, 256), (0.1, 158)])
+def test_it_is_the_world_with_pages_within_bounds(made: Any, megapixels: float, side: int) -> None:
+    done = made(megapixels=megapixels)
+    meshes = scene(done).geometry
+    assert sorted(meshes) == ["building_0", "building_1", "terrain_0", "terrain_1"]
+    assert sum(len(mesh.faces) for mesh in meshes.values()) == done.facts["triangles"] == 3210
+    heights = np.concatenate([mesh.vertices[:, 1] for mesh in meshes.values()])  # y up
+    assert heights.max() == pytest.approx(4.5)
+    sizes = [mesh.visual.material.baseColorTexture.width for mesh in meshes.values()]
+    assert sizes == [side] * 4 and done.facts["scale"] == pytest.approx(side / 256, abs=0.01)
+
+
+def test_one_starts_on_the_ground_and_above_it(made: Any) -> None:
+    facts = made().facts
+    (x, y, z), target = facts["walk"]
+    assert z - made_up.height(np.array(x), np.array(y)) == pytest.approx(1.6, abs=0.3)
+    assert np.linalg.norm(np.subtract(target, (x, y, z))) > 5 and facts["turn"][0][2] > 5
+
+
+def test_a_world_of_too_many_triangles_has_none(made: Any) -> None:
+    done = made(triangles=1000)
+    assert done.files == {} and done.facts == {"triangles": 3210}
