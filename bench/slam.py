@@ -28,8 +28,9 @@ import numpy as np
 
 from bench.measure import measure
 from scan2sim.pipeline.io import trajectory as trajectory_io
+from scan2sim.pipeline.similarity import umeyama
 from scan2sim.pipeline.types import Camera
-from scan2sim.slam.evaluate import Evaluation, evaluate, plot, umeyama
+from scan2sim.slam.evaluate import Evaluation, evaluate, plot
 from scan2sim.slam.odometry import Odometry, OdometryParams
 from scan2sim.slam.video import open_video
 

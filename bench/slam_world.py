@@ -21,7 +21,7 @@ import numpy as np
 
 from bench.segmentation import scan2sim
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.slam.evaluate import umeyama
+from scan2sim.pipeline.similarity import umeyama
 
 ROOT = Path(__file__).resolve().parent.parent
 DRIVE = ROOT.parent / "shared" / "data" / "kitti_raw0009_f00-24"

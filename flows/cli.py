@@ -350,32 +350,45 @@ def import_kitti(
     typer.echo(f"Tile: {path}")
 
 
-@imports.command("colmap")
-def import_colmap_model(
-    model: Annotated[Path, typer.Argument(help="Folder of cameras, images and points3D (.txt or .bin).")],
-    images: Annotated[Path, typer.Argument(help="Folder of the photos.")],
-    out: TileOut,
-    cloud: Annotated[Path | None, typer.Option(help="Dense cloud (LAS, LAZ, PLY); default: the sparse points.")] = None,
-    crs: Crs = "local",
-    upright: Annotated[bool, typer.Option("--upright", help="Turn it so that photos stand upright.")] = False,
-    scale: Annotated[float, typer.Option(help="Metres per unit of the model.")] = 1.0,
-    classes: Classes = "",
-    name: Name = None,
-    link: Link = False,
-    overwrite: Overwrite = False,
-) -> None:
-    """COLMAP model, text or binary."""
-    from scan2sim.flows.display import progress
-    from scan2sim.pipeline.classes import parse
-    from scan2sim.pipeline.io.colmap import import_colmap
+def _import_model(kind: str, about: str) -> None:
+    """`scan2sim import KIND`: the same options for every program's posed photos."""
 
-    up: Literal["photos"] | None = "photos" if upright else None
-    with progress("import") as report:
-        path = import_colmap(
-            model, images, out, cloud=cloud, crs=crs or "local", up=up, scale=scale, classes=parse(classes),
-            name=name, link=link, overwrite=overwrite, report=report,
-        )  # fmt: skip
-    typer.echo(f"Tile: {path}")
+    def command(
+        model: Annotated[Path, typer.Argument(help="The program's file or folder, as above.")],
+        images: Annotated[Path, typer.Argument(help="Folder of the photos.")],
+        out: TileOut,
+        cloud: Annotated[Path | None, typer.Option(help="Dense cloud; default: the sparse points.")] = None,
+        crs: Annotated[
+            str | None, typer.Option(help="To bring it to; or that it is in, where it isn't georeferenced.")
+        ] = None,
+        gps: Annotated[bool, typer.Option("--gps", help="Place it by the GPS in the photos' EXIF.")] = False,
+        upright: Annotated[bool, typer.Option("--upright", help="Turn it so that photos stand upright.")] = False,
+        scale: Annotated[float, typer.Option(help="Metres per unit of the model.")] = 1.0,
+        classes: Classes = "",
+        name: Name = None,
+        link: Link = False,
+        overwrite: Overwrite = False,
+    ) -> None:
+        from scan2sim.flows.display import progress
+        from scan2sim.pipeline.classes import parse
+        from scan2sim.pipeline.io.models import import_model
+
+        told: list[str] = []
+        with progress("import") as report:
+            path = import_model(
+                kind, model, images, out, cloud=cloud, crs=crs, gps=gps, up="photos" if upright else None, scale=scale,
+                classes=parse(classes), name=name, link=link, overwrite=overwrite, warn=told.append, report=report,
+            )  # fmt: skip
+        _imported(path, told)
+
+    imports.command(kind, help=about)(command)
+
+
+_import_model("colmap", "COLMAP: a folder of cameras, images and points3D, .txt or .bin (often sparse/0).")
+_import_model("opensfm", "OpenSfM or OpenDroneMap: a reconstruction.json, or the project's folder.")
+_import_model("metashape", "Agisoft Metashape: a cameras.xml (Export Cameras, Agisoft XML); needs a --cloud.")
+_import_model("bundler", "Bundler: a bundle.out, with its list.txt beside it.")
+_import_model("nvm", "VisualSFM: a .nvm file (NVM_V3).")
 
 
 @imports.command("las", hidden=True)  # what it was called when it read LAS and PLY alone

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from scan2sim.pipeline.extras import need
+from scan2sim.pipeline.similarity import umeyama
 from scan2sim.pipeline.types import Trajectory
-from scan2sim.slam.evaluate import umeyama
 from scan2sim.slam.geometry import angles
 from scan2sim.slam.odometry import Odometry
 from scan2sim.slam.output import SparseMap, write_colmap

@@ -19,6 +19,7 @@ import numpy.typing as npt
 from scan2sim.pipeline.errors import DataError
 from scan2sim.pipeline.extras import need
 from scan2sim.pipeline.io.trajectory import replacing
+from scan2sim.pipeline.similarity import umeyama
 from scan2sim.pipeline.types import F64, Trajectory
 from scan2sim.slam.gps import GpsTrack, noise, smooth
 
@@ -32,19 +33,6 @@ KITTI_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 KITTI_STEP = 10  # poses between the starts of KITTI's segments
 COURSE_SECONDS = 2.0  # smoothing of a GPS track before its length is measured
 STRIDE = 1.0  # m: shorter moves are not counted as way, or a standing receiver would travel
-
-
-@dataclass(frozen=True)
-class Similarity:
-    """`scale * rotation @ x + translation` in D dimensions: (D, D) rotation, (D,) translation."""
-
-    scale: float
-    rotation: F64
-    translation: F64
-
-    def apply(self, points: F64) -> F64:
-        """(N, D) moved points."""
-        return self.scale * points @ self.rotation.T + self.translation
 
 
 @dataclass(frozen=True)
@@ -201,26 +189,6 @@ def z_up(trajectory: Trajectory) -> Trajectory:
         both = np.kron(np.eye(2), turn)
         covariance = both @ covariance @ both.T
     return replace(trajectory, positions=trajectory.positions @ turn.T, rotations=rotations, covariance=covariance)
-
-
-def umeyama(source: F64, target: F64, *, scaled: bool) -> Similarity:
-    """The similarity (or rigid motion) that brings (N, D) `source` nearest to `target`, least squares, no reflection.
-
-    Source: Umeyama, Least-squares estimation of transformation parameters between two point patterns, 1991.
-
-    Raises:
-        DataError: all points of one of them are one.
-    """
-    a, b = source - source.mean(axis=0), target - target.mean(axis=0)
-    spread = float((a * a).sum())
-    if spread < 1e-12 or (b * b).sum() < 1e-12:
-        raise DataError("trajectory", "doesn't move", "Compare a part in which the camera travels")
-    u, s, vt = np.linalg.svd(b.T @ a)
-    sign = np.ones(len(s))
-    sign[-1] = np.sign(np.linalg.det(u) * np.linalg.det(vt))
-    rotation = (u * sign) @ vt
-    scale = float(s @ sign) / spread if scaled else 1.0
-    return Similarity(scale, rotation, target.mean(axis=0) - scale * rotation @ source.mean(axis=0))
 
 
 def way(ground: F64, stride: float = STRIDE) -> F64:

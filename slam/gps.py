@@ -21,6 +21,7 @@ import numpy.typing as npt
 from scan2sim.pipeline.errors import InputError, from_os_error
 from scan2sim.pipeline.extras import need
 from scan2sim.pipeline.io import files
+from scan2sim.pipeline.io.crs import utm
 from scan2sim.pipeline.types import F64, Frame
 
 MAX_SPEED = 70.0
@@ -441,8 +442,7 @@ def _located(path: Path, rows: Sequence[Sequence[float]]) -> GpsTrack:
         raise InputError(path, f"has no usable GPS fix ({len(rows)} points)", "Give a track with times and positions")
     time, lat, lon, height, sigma = data.T
     middle = data[np.argsort(lon)[len(data) // 2]]  # one wild fix doesn't choose the zone
-    zone = min(int((middle[2] + 180) // 6) + 1, 60)
-    crs = f"EPSG:{(32600 if middle[1] >= 0 else 32700) + zone}"
+    crs = utm(middle[1], middle[2])
     east, north = Transformer.from_crs("EPSG:4326", crs, always_xy=True).transform(lon, lat)
     known = np.isfinite(height)
     order = np.argsort(time[known], kind="stable")

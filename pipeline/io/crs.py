@@ -63,6 +63,12 @@ def common(
     return crs, unit
 
 
+def utm(latitude: float, longitude: float) -> str:
+    """The code of the UTM zone (WGS 84) of a place in degrees."""
+    zone = min(int((longitude + 180) // 6) + 1, 60)
+    return f"EPSG:{(32600 if latitude >= 0 else 32700) + zone}"
+
+
 def to_wgs84(frame: Frame, xyz: npt.ArrayLike = (0.0, 0.0, 0.0)) -> tuple[float, float, float] | None:
     """(latitude deg, longitude deg, height m) of a local point; None for a local frame.
 
@@ -122,6 +128,16 @@ def name(crs: str | None) -> str:
     parsed = _parsed(crs)
     code = parsed.to_epsg()
     return f"EPSG:{code}" if code else str(parsed.name)
+
+
+def short(crs: str) -> str:
+    """The authority's code where it says all that the CRS says, otherwise the CRS as it is."""
+    if crs == LOCAL:
+        return crs
+    from pyproj import CRS
+
+    code = CRS.from_user_input(crs).to_epsg(min_confidence=100)
+    return f"EPSG:{code}" if code else crs
 
 
 def _metres_per_unit(tile: Path, crs: str) -> float:

@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scan2sim.pipeline.errors import InputError, UnavailableError
-from scan2sim.pipeline.io import points
+from scan2sim.pipeline.io import files, points
 from scan2sim.pipeline.io.points import PART, Points
 from scan2sim.pipeline.types import F64, Frame, PointCloud
 
@@ -166,14 +166,13 @@ def _schema(path: Path, info: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _json(path: Path) -> dict[str, Any]:
+    files.check(path, REMEDY)
     try:
         if path.stat().st_size > LARGEST:
             raise ValueError(f"{path.stat().st_size:,} bytes")
         body = json.loads(path.read_text(encoding="utf-8"))
         if not isinstance(body, dict):
             raise ValueError("no object")
-    except FileNotFoundError:
-        raise InputError(path, "is missing", REMEDY) from None
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(path, f"is no readable JSON ({str(error)[:100]})", REMEDY) from None
     return body

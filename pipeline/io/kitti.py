@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from scan2sim.pipeline.errors import InputError, SettingError
+from scan2sim.pipeline.io import crs as crs_io
 from scan2sim.pipeline.io import las
 from scan2sim.pipeline.io.importing import place, tile_folder
 from scan2sim.pipeline.io.merging import GREY as GREY
@@ -306,8 +307,7 @@ def _read_oxts(drive: Path, numbers: list[int]) -> tuple[F64, str]:
         if not np.isfinite(rows[i]).all() or abs(rows[i, 0]) > 84 or abs(rows[i, 1]) > 180:
             raise InputError(path, "says an impossible place", "Unpack oxts again, or give poses")
     lat, lon, alt, roll, pitch, yaw = rows.T
-    zone = min(int((lon[0] + 180) // 6) + 1, 60)
-    crs = f"EPSG:{(32600 if lat[0] >= 0 else 32700) + zone}"
+    crs = crs_io.utm(lat[0], lon[0])
     east, north = Transformer.from_crs("EPSG:4326", crs, always_xy=True).transform(lon, lat)
     yaw = yaw + np.radians(Proj(crs).get_factors(lon, lat).meridian_convergence)  # true to grid
     T = np.tile(np.eye(4), (len(numbers), 1, 1))

@@ -33,7 +33,7 @@ from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.io import clouds as cloud_io
 from scan2sim.pipeline.io import crs as crs_io
 from scan2sim.pipeline.io import files, las
-from scan2sim.pipeline.io.importing import place, tile_folder
+from scan2sim.pipeline.io.importing import inside, place, tile_folder
 from scan2sim.pipeline.io.tile import read_tile, tile_name, write_tile
 from scan2sim.pipeline.step import Report, silent
 from scan2sim.pipeline.types import F64, Camera, CameraModel, Frame
@@ -105,11 +105,11 @@ def import_las(
             report(0.5 + 0.5 * i / len(shots), f"photo {shot['file']}")
             for key, where in (("file", "photos"), ("mask", "masks")):
                 if shot.get(key):
-                    shot[key] = place(base / shot[key], folder, f"{where}/{_inside(shot[key])}", link)
+                    shot[key] = place(base / shot[key], folder, f"{where}/{inside(shot[key])}", link)
         write_tile(
             folder,
             name=tile_name(name or Path(out).name),
-            crs=_short(known),
+            crs=crs_io.short(known),
             clouds=files,
             cameras=rigs,
             photos=shots,
@@ -248,18 +248,3 @@ def _rotation(row: Row, path: Path, where: str) -> F64:
             raise InputError(path, f"{where}: the quaternion's length is not 1", "Give it normalised, qw first")
         return Rotation.from_quat(np.roll(values, -1)).as_matrix()
     return Rotation.from_euler("XYZ", values, degrees=True).as_matrix() @ np.diag([1.0, -1.0, -1.0])
-
-
-def _short(crs: str) -> str:
-    """The authority's code where it says all that the CRS says, otherwise the CRS as it is."""
-    if crs == crs_io.LOCAL:
-        return crs
-    from pyproj import CRS
-
-    code = CRS.from_user_input(crs).to_epsg(min_confidence=100)
-    return f"EPSG:{code}" if code else crs
-
-
-def _inside(name: str) -> str:
-    """A file name that stays in the tile's folder: `../a/b.jpg` and `/a/b.jpg` become `a/b.jpg`."""
-    return "/".join(part for part in Path(name).parts if part not in ("..", ".", Path(name).anchor))

@@ -12,8 +12,9 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from scan2sim.pipeline.errors import DataError
+from scan2sim.pipeline.similarity import umeyama
 from scan2sim.pipeline.types import F64, Trajectory
-from scan2sim.slam.evaluate import evaluate, local, plot, umeyama, way, z_up
+from scan2sim.slam.evaluate import evaluate, local, plot, way, z_up
 from scan2sim.slam.gps import GpsTrack
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from scan2sim.slam.evaluate import umeyama
+from scan2sim.pipeline.similarity import umeyama
 from scan2sim.slam.finish import finish
 from tests.slam.made_up import Follower, drive, gps_of, run, scatter
 

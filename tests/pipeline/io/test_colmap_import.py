@@ -10,9 +10,11 @@ import pytest
 
 from scan2sim.pipeline.cameras import project
 from scan2sim.pipeline.errors import InputError, SettingError
-from scan2sim.pipeline.io import clouds
-from scan2sim.pipeline.io.colmap import camera_of, import_colmap
+from scan2sim.pipeline.io import clouds, las
+from scan2sim.pipeline.io.colmap import camera_of
+from scan2sim.pipeline.io.models import import_model
 from scan2sim.pipeline.io.tile import read_tile
+from scan2sim.pipeline.types import Frame, PointCloud
 
 pycolmap = pytest.importorskip("pycolmap")
 
@@ -62,7 +64,7 @@ def make_model(folder: Path, kinds: list[str], n: int = 40) -> tuple[object, dic
 @pytest.mark.parametrize("form", ["bin", "txt"])
 def test_points_project_onto_their_observations(tmp_path: Path, form: str) -> None:
     model, pixels = make_model(tmp_path, list(CAMERAS))
-    tile = read_tile(import_colmap(tmp_path / form, tmp_path / "images", tmp_path / "tile"))
+    tile = read_tile(import_model("colmap", tmp_path / form, tmp_path / "images", tmp_path / "tile"))
     points = tile.frame.to_local([point.xyz for _, point in sorted(model.points3D.items())])
     assert len(tile.views) == len(CAMERAS)
     for view in tile.views:
@@ -74,7 +76,9 @@ def test_points_project_onto_their_observations(tmp_path: Path, form: str) -> No
 
 def test_text_and_binary_give_the_same_tile(tmp_path: Path) -> None:
     make_model(tmp_path, ["OPENCV", "PINHOLE"])
-    tiles = [import_colmap(tmp_path / f, tmp_path / "images", tmp_path / f"t_{f}", name="t") for f in ("bin", "txt")]
+    tiles = [
+        import_model("colmap", tmp_path / f, tmp_path / "images", tmp_path / f"t_{f}", name="t") for f in ("bin", "txt")
+    ]
     assert tiles[0].read_text() == tiles[1].read_text()
     first, second = (read_tile(tile) for tile in tiles)
     a, b = (clouds.read(tile.clouds[0], tile.frame) for tile in (first, second))
@@ -83,7 +87,7 @@ def test_text_and_binary_give_the_same_tile(tmp_path: Path) -> None:
 
 def test_sparse_points_keep_place_and_colour(tmp_path: Path) -> None:
     model, _ = make_model(tmp_path, ["PINHOLE"])
-    tile = read_tile(import_colmap(tmp_path / "bin", tmp_path / "images", tmp_path / "tile"))
+    tile = read_tile(import_model("colmap", tmp_path / "bin", tmp_path / "images", tmp_path / "tile"))
     cloud = clouds.read(tile.clouds[0], tile.frame)
     points = [point for _, point in sorted(model.points3D.items())]
     assert np.abs(tile.frame.to_crs(cloud.xyz) - [p.xyz for p in points]).max() < 1e-3
@@ -92,8 +96,10 @@ def test_sparse_points_keep_place_and_colour(tmp_path: Path) -> None:
 
 def test_up_and_scale_turn_photos_and_points_together(tmp_path: Path) -> None:
     make_model(tmp_path, ["PINHOLE"])
-    plain = read_tile(import_colmap(tmp_path / "bin", tmp_path / "images", tmp_path / "a"))
-    turned = read_tile(import_colmap(tmp_path / "bin", tmp_path / "images", tmp_path / "b", up="photos", scale=2.0))
+    plain = read_tile(import_model("colmap", tmp_path / "bin", tmp_path / "images", tmp_path / "a"))
+    turned = read_tile(
+        import_model("colmap", tmp_path / "bin", tmp_path / "images", tmp_path / "b", up="photos", scale=2.0)
+    )
     up = -turned.views[0].T_world_cam[:3, 1]
     assert np.allclose(up, [0, 0, 1], atol=1e-6)
     distances = [
@@ -105,13 +111,27 @@ def test_up_and_scale_turn_photos_and_points_together(tmp_path: Path) -> None:
 
 def test_a_cloud_of_its_own_is_taken(tmp_path: Path) -> None:
     make_model(tmp_path, ["PINHOLE"])
-    first = import_colmap(tmp_path / "bin", tmp_path / "images", tmp_path / "a")
+    first = import_model("colmap", tmp_path / "bin", tmp_path / "images", tmp_path / "a")
     tile = read_tile(
-        import_colmap(tmp_path / "bin", tmp_path / "images", tmp_path / "b", cloud=first.parent / "cloud.laz")
+        import_model("colmap", tmp_path / "bin", tmp_path / "images", tmp_path / "b", cloud=first.parent / "cloud.laz")
     )
     assert tile.clouds[0].read_bytes() == (first.parent / "cloud.laz").read_bytes()
+
+
+def test_a_cloud_moves_with_its_model_but_for_one_that_has_a_crs(tmp_path: Path) -> None:
+    model, _ = make_model(tmp_path, ["PINHOLE"])
+    points = np.array([point.xyz for _, point in sorted(model.points3D.items())])
+    cloud = tmp_path / "dense.xyz"
+    np.savetxt(cloud, points, "%.4f")
+    tile = read_tile(
+        import_model("colmap", tmp_path / "bin", tmp_path / "images", tmp_path / "a", cloud=cloud, scale=2.0)
+    )
+    moved = clouds.read(tile.clouds[0], tile.frame)
+    assert np.abs(moved.frame.to_crs(moved.xyz) - 2 * points).max() < 2e-3
+    placed = tmp_path / "placed.laz"
+    las.write(placed, PointCloud(Frame("EPSG:32632", (5e5, 5e6, 0.0)), points.astype(np.float32)))
     with pytest.raises(SettingError, match="Align model and cloud first"):
-        import_colmap(tmp_path / "bin", tmp_path / "images", tmp_path / "c", cloud=tile.clouds[0], scale=2.0)
+        import_model("colmap", tmp_path / "bin", tmp_path / "images", tmp_path / "c", cloud=placed, scale=2.0)
 
 
 def test_an_unsupported_camera_model_is_named_with_a_remedy(tmp_path: Path) -> None:
@@ -123,13 +143,13 @@ def test_an_unsupported_camera_model_is_named_with_a_remedy(tmp_path: Path) -> N
 def test_no_model_a_damaged_one_and_a_missing_photo_leave_nothing(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match=r"empty: holds no COLMAP model.*sparse/0"):
-        import_colmap(tmp_path / "empty", tmp_path, tmp_path / "tile")
+        import_model("colmap", tmp_path / "empty", tmp_path, tmp_path / "tile")
     make_model(tmp_path, ["PINHOLE", "OPENCV"])
     (tmp_path / "images/cam/002.png").unlink()
     with pytest.raises(InputError, match=r"002\.png: is missing"):
-        import_colmap(tmp_path / "bin", tmp_path / "images", tmp_path / "tile")
+        import_model("colmap", tmp_path / "bin", tmp_path / "images", tmp_path / "tile")
     cameras = tmp_path / "bin" / "cameras.bin"
     cameras.write_bytes(cameras.read_bytes()[:20])
     with pytest.raises(InputError, match="is no readable COLMAP model"):
-        import_colmap(tmp_path / "bin", tmp_path / "images", tmp_path / "tile")
+        import_model("colmap", tmp_path / "bin", tmp_path / "images", tmp_path / "tile")
     assert not (tmp_path / "tile").exists() and not list(tmp_path.glob(".tile*"))

@@ -1,0 +1,41 @@
+"""Where a photo's EXIF says that it was taken."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+GPS = 0x8825
+LATITUDE_REF, LATITUDE, LONGITUDE_REF, LONGITUDE, ALTITUDE_REF, ALTITUDE = 1, 2, 3, 4, 5, 6
+
+
+def place(photo: Path) -> tuple[float, float, float | None] | None:
+    """Latitude and longitude (degrees), altitude (m, None where it isn't told); None without a usable position."""
+    from PIL import Image
+
+    try:
+        with Image.open(photo) as image:
+            told = image.getexif().get_ifd(GPS)
+        latitude = _degrees(told[LATITUDE]) * (-1 if str(told.get(LATITUDE_REF, "N")).upper().startswith("S") else 1)
+        longitude = _degrees(told[LONGITUDE]) * (-1 if str(told.get(LONGITUDE_REF, "E")).upper().startswith("W") else 1)
+    except Exception:  # Pillow's parsers raise whatever damage leads to; a photo without a position is no error
+        return None
+    null = latitude == 0 and longitude == 0  # what devices write that have no fix
+    if null or not (abs(latitude) <= 84 and abs(longitude) <= 180):
+        return None
+    return latitude, longitude, _altitude(told)
+
+
+def _degrees(value: Any) -> float:
+    degrees, minutes, seconds = (float(part) for part in value)
+    return degrees + minutes / 60 + seconds / 3600
+
+
+def _altitude(told: Any) -> float | None:
+    try:
+        altitude = float(told[ALTITUDE])
+    except (KeyError, TypeError, ValueError, ZeroDivisionError):
+        return None
+    below = told.get(ALTITUDE_REF) in (1, b"\x01")
+    return (-altitude if below else altitude) if math.isfinite(altitude) else None
