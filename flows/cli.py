@@ -350,6 +350,29 @@ def import_kitti(
     typer.echo(f"Tile: {path}")
 
 
+@imports.command("kitti-odometry")
+def import_kitti_sequence(
+    sequence: Annotated[Path, typer.Argument(help="A sequence's folder: velodyne, image_2, calib.txt, times.txt.")],
+    out: TileOut,
+    poses: Annotated[Path | None, typer.Option(help="Of camera 0, 3x4 a line; default: poses.txt in it.")] = None,
+    camera: Annotated[list[str] | None, typer.Option(help="Its folder; several times for several.")] = None,
+    max_range: Annotated[float, typer.Option(help="Metres; returns from further away are left out.")] = 50.0,
+    name: Name = None,
+    link: Link = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """KITTI odometry: merge a sequence's sweeps by its poses, colour points from the photos."""
+    from scan2sim.flows.display import progress
+    from scan2sim.pipeline.io.kitti_odometry import import_kitti_odometry
+
+    with progress("import") as report:
+        path = import_kitti_odometry(
+            sequence, out, poses=poses, cameras=camera or ["image_2"], max_range=max_range, name=name, link=link,
+            overwrite=overwrite, report=report,
+        )  # fmt: skip
+    _imported(path)
+
+
 def _import_model(kind: str, about: str) -> None:
     """`scan2sim import KIND`: the same options for every program's posed photos."""
 

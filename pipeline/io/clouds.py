@@ -1,8 +1,8 @@
 """Point cloud files: one module a format, found by its name; each says whether it can run here.
 
 A format's module has `read_header(path) -> (count, low, high, crs[, notes])`, `read(path, frame)` and
-`chunks(path, frame, size)`, and, where it needs more than the project's own dependencies, `available()`: what to
-install, or None.
+`chunks(path, frame, size)`, and, where it needs more than the project's own dependencies, `lacking()`: packages that
+aren't installed, or None.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from scan2sim.pipeline import classes
-from scan2sim.pipeline.errors import InputError, UnavailableError
+from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.extras import unavailable
 from scan2sim.pipeline.io import files
 from scan2sim.pipeline.types import F64, U8, Frame, PointCloud
 
@@ -53,9 +54,9 @@ def known(path: Path) -> bool:
 
 
 def missing(suffix: str) -> str | None:
-    """What to install so that a format (a key of `FORMATS`) can be read here, or None."""
+    """Packages that a format (a key of `FORMATS`) can't be read here without, or None."""
     module = importlib.import_module(f"scan2sim.pipeline.io.{FORMATS[suffix]}")
-    found: str | None = module.available() if hasattr(module, "available") else None
+    found: str | None = module.lacking() if hasattr(module, "lacking") else None
     return found
 
 
@@ -66,7 +67,7 @@ def _reader(path: Path) -> Any:
     files.check(path)
     lacking = missing(key)
     if lacking:
-        raise UnavailableError(path, f"needs {lacking}", f"pip install '{lacking}'")
+        raise unavailable(str(path), lacking)
     return importlib.import_module(f"scan2sim.pipeline.io.{FORMATS[key]}")
 
 

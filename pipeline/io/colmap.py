@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.extras import need
 from scan2sim.pipeline.io.models import Model, Photos, Shot
 from scan2sim.pipeline.types import F64, Camera, CameraModel
 
@@ -73,6 +74,7 @@ def camera_of(model: Path, camera: Any) -> Camera:
 
 
 def _read(model: Path) -> Any:
+    need("import colmap", "pycolmap")
     import pycolmap
 
     if not any((model / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):

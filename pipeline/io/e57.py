@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import closing
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.extras import missing
 from scan2sim.pipeline.io import points
 from scan2sim.pipeline.io.points import PART, Points
 from scan2sim.pipeline.types import F64, Frame, PointCloud
@@ -30,9 +30,9 @@ INVALID = ("cartesianInvalidState", "sphericalInvalidState")
 OTHERS = ("intensity", "timeStamp", "classification")
 
 
-def available() -> str | None:
-    """What to install so that E57 can be read here, or None."""
-    return None if find_spec("pye57") else "scan2sim[e57]"
+def lacking() -> str | None:
+    """The package that E57 can't be read here without, or None."""
+    return missing("pye57")
 
 
 def read_header(path: Path) -> tuple[int, F64, F64, str | None]:

@@ -13,14 +13,14 @@ import json
 import re
 import struct
 from collections.abc import Iterator
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from scan2sim.pipeline.errors import InputError, UnavailableError
+from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.extras import need
 from scan2sim.pipeline.io import files, points
 from scan2sim.pipeline.io.points import PART, Points
 from scan2sim.pipeline.types import F64, Frame, PointCloud
@@ -54,8 +54,8 @@ def _parts(path: Path) -> Iterator[Points]:
     kind = info.get("dataType")
     if kind not in SUFFIXES:
         raise InputError(path, f"has the dataType {str(kind)[:40]!r}", f"Build it with {', '.join(SUFFIXES)}")
-    if kind == "zstandard" and not find_spec("zstandard"):
-        raise UnavailableError(path, "needs zstandard", "pip install 'scan2sim[ept]'")
+    if kind == "zstandard":
+        need(str(path), "zstandard")
     schema = None if kind == "laszip" else _schema(path, info)
     for key, count in _nodes(path.parent):
         tile = path.parent / "ept-data" / f"{key}{SUFFIXES[kind]}"

@@ -34,6 +34,7 @@ from scan2sim.pipeline.types import F32, F64, Camera, Frame, PointCloud
 GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
 # the recording car's own returns, scanner axes: (low, high) corner in metres
 OWN_CAR: tuple[tuple[float, float, float], tuple[float, float, float]] = ((-3.2, -1.3, -2.0), (2.8, 1.3, 0.3))
+PHOTOS = (".png", ".jpg", ".jpeg")
 SAME_DAY = "Use the synced and rectified photos with the calibration of the same day"
 
 
@@ -43,6 +44,29 @@ class Rig:
 
     camera: Camera
     T_velo_cam: F64
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Sweeps of a moving car, its photos, and where it was.
+
+    Attributes:
+        name: of the drive.
+        sweeps: files by frame number.
+        rigs: cameras by the name of their folder.
+        photos: of each camera, files by frame number.
+        spans: (F, 3) seconds of each sweep's start, middle (facing forward) and end.
+        T_velo: (F, 4, 4) scanner to CRS at each sweep's middle.
+        crs: code, or "local".
+    """
+
+    name: str
+    sweeps: dict[int, Path]
+    rigs: dict[str, Rig]
+    photos: dict[str, dict[int, Path]]
+    spans: F64
+    T_velo: F64
+    crs: str
 
 
 def import_kitti_raw(
@@ -85,16 +109,28 @@ def import_kitti_raw(
         InputError: a file is missing or damaged. SettingError: `out` is not empty, no frame is left.
     """
     drive = _find_drive(drive)
-    sweeps = _numbered(drive / "velodyne_points" / "data", ".bin")
-    if frames is not None:
-        sweeps = {k: v for k, v in sweeps.items() if frames[0] <= k <= frames[1]}
-        if not sweeps:
-            raise SettingError("frames", f"no sweep of {drive} lies in {frames[0]}..{frames[1]}", "Widen the range")
+    sweeps = within(numbered(drive / "velodyne_points" / "data", ".bin"), frames, drive)
     numbers = list(sweeps)
-    rigs = {folder: _rig(drive, folder) for folder in cameras}
-    photos = {folder: _numbered(drive / folder / "data", (".png", ".jpg", ".jpeg")) for folder in cameras}
     spans = _spans(drive, numbers)
     T_velo, crs = _poses(drive, poses, numbers, spans[:, 1])
+    whole = Drive(
+        name or drive.name,
+        sweeps,
+        {folder: _rig(drive, folder) for folder in cameras},
+        {folder: numbered(drive / folder / "data", PHOTOS) for folder in cameras},
+        spans,
+        T_velo,
+        crs,
+    )
+    return assemble(whole, out, max_range=max_range, deskew=deskew, link=link, overwrite=overwrite, report=report)
+
+
+def assemble(
+    drive: Drive, out: Path, *, max_range: float, deskew: bool, link: bool, overwrite: bool, report: Report
+) -> Path:
+    """Make a tile of a drive: sweeps merged, coloured by the photos of their own frames. As `import_kitti_raw` says."""
+    numbers, sweeps, rigs, photos, spans = list(drive.sweeps), drive.sweeps, drive.rigs, drive.photos, drive.spans
+    T_velo, crs = drive.T_velo.copy(), drive.crs
     frame = Frame(crs, (0.0, 0.0, 0.0) if crs == "local" else tuple(np.floor(T_velo[0, :3, 3]).tolist()))
     T_velo[:, :3, 3] -= frame.origin
 
@@ -150,7 +186,7 @@ def import_kitti_raw(
         np.savetxt(work / "trajectory.csv", rows, "%.6f", delimiter=",", header="time,x,y,z", comments="")
         write_tile(
             work,
-            name=tile_name(name or drive.name),
+            name=tile_name(drive.name),
             crs=frame.crs,
             clouds=["cloud.laz"],
             cameras={key: rig.camera for key, rig in rigs.items()},
@@ -171,7 +207,21 @@ def _find_drive(folder: Path) -> Path:
     raise InputError(folder, cause, "Name one folder ..._sync of the synced and rectified data")
 
 
-def _numbered(folder: Path, suffixes: str | tuple[str, ...]) -> dict[int, Path]:
+def within(sweeps: dict[int, Path], frames: tuple[int, int] | None, drive: Path) -> dict[int, Path]:
+    """Those whose number lies in `frames` (first and last), all where it is None.
+
+    Raises:
+        SettingError: none is left.
+    """
+    if frames is None:
+        return sweeps
+    some = {k: v for k, v in sweeps.items() if frames[0] <= k <= frames[1]}
+    if not some:
+        raise SettingError("frames", f"no sweep of {drive} lies in {frames[0]}..{frames[1]}", "Widen the range")
+    return some
+
+
+def numbered(folder: Path, suffixes: str | tuple[str, ...]) -> dict[int, Path]:
     """Files by frame number, ascending."""
     found = sorted(p for p in folder.glob("*") if p.name.lower().endswith(suffixes) and p.stem.isdigit())
     if not found:
@@ -195,7 +245,12 @@ def _calibration(drive: Path, name: str) -> dict[str, F64]:
     return entries
 
 
-def _entry(drive: Path, name: str, key: str, size: int) -> F64:
+def entry(drive: Path, name: str, key: str, size: int) -> F64:
+    """(size,) numbers after `key:` in a calibration file of the drive or of the folder above.
+
+    Raises:
+        InputError: the file is missing, or has no such entry.
+    """
     values = _calibration(drive, name).get(key)
     if values is None or values.size != size:
         raise InputError(drive.parent / name, f"has no `{key}` of {size} numbers", "Unpack the calibration again")
@@ -204,22 +259,27 @@ def _entry(drive: Path, name: str, key: str, size: int) -> F64:
 
 def _rigid(drive: Path, name: str) -> F64:
     T = np.eye(4)
-    T[:3, :3] = _entry(drive, name, "R", 9).reshape(3, 3)
-    T[:3, 3] = _entry(drive, name, "T", 3)
+    T[:3, :3] = entry(drive, name, "R", 9).reshape(3, 3)
+    T[:3, 3] = entry(drive, name, "T", 3)
     return T
 
 
 def _rig(drive: Path, folder: str) -> Rig:
     """The camera of a photo folder: `pixel ~ P_rect . R_rect_00 . T_cam0_velo . X`."""
     n, file = folder.removeprefix("image_"), "calib_cam_to_cam.txt"
-    P = _entry(drive, file, f"P_rect_{n}", 12).reshape(3, 4)
-    width, height = _entry(drive, file, f"S_rect_{n}", 2).astype(int).tolist()
+    P = entry(drive, file, f"P_rect_{n}", 12).reshape(3, 4)
+    width, height = entry(drive, file, f"S_rect_{n}", 2).astype(int).tolist()
     rectify = np.eye(4)
-    rectify[:3, :3] = _entry(drive, file, "R_rect_00", 9).reshape(3, 3)
+    rectify[:3, :3] = entry(drive, file, "R_rect_00", 9).reshape(3, 3)
+    return rig(P, rectify @ _rigid(drive, "calib_velo_to_cam.txt"), width, height)
+
+
+def rig(P: F64, T_cam0_velo: F64, width: int, height: int) -> Rig:
+    """A rectified camera: KITTI gives its projection (3, 4) from rectified camera 0, and the scanner's place."""
     K = P[:, :3]
     shift = np.eye(4)
     shift[:3, 3] = np.linalg.solve(K, P[:, 3])  # rectified camera 0 to this camera
-    T_cam_velo = shift @ rectify @ _rigid(drive, "calib_velo_to_cam.txt")
+    T_cam_velo = shift @ T_cam0_velo
     u, _, vt = np.linalg.svd(T_cam_velo[:3, :3])  # the files have seven digits
     T_cam_velo[:3, :3] = u @ vt
     T_velo_cam = np.linalg.inv(T_cam_velo).astype(np.float64)
@@ -268,17 +328,22 @@ def _poses(drive: Path, poses: Path | None, numbers: list[int], times: F64) -> t
             return T_world, crs
         first = T_world[0]
     assert poses is not None
-    relative = _read_poses(poses, numbers)
+    relative = read_poses(poses, numbers)
     return first @ np.linalg.inv(relative[0]) @ relative, crs
 
 
-def _read_poses(path: Path, numbers: list[int]) -> F64:
+def read_poses(path: Path, numbers: list[int]) -> F64:
+    """(F, 4, 4) of the lines `numbers` of a file of row-major 3x4 matrices.
+
+    Raises:
+        InputError: it is none, or has too few.
+    """
     try:
         rows = np.loadtxt(path, ndmin=2)
         if rows.shape[1] != 12 or not np.isfinite(rows).all():
             raise ValueError(f"shape {rows.shape}")
     except FileNotFoundError:
-        raise InputError(path, "is missing", "Put it there, or leave it out for OXTS poses") from None
+        raise InputError(path, "is missing", "Put it there, or mend the name") from None
     except ValueError as error:
         raise InputError(path, f"is no pose file ({error})", "Write 12 numbers a line, row-major 3x4") from None
     if len(rows) <= numbers[-1]:

@@ -320,9 +320,9 @@ def test_a_cut_file_is_refused(written: tuple[Format, Path, PointCloud]) -> None
 
 
 def test_every_format_says_what_it_needs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr("scan2sim.pipeline.io.e57.find_spec", lambda _: None)
+    monkeypatch.setattr("scan2sim.pipeline.extras.importlib.util.find_spec", lambda name: None)
     (tmp_path / "c.e57").write_bytes(b"")
-    with pytest.raises(UnavailableError, match=r"c\.e57: needs scan2sim\[e57\].*pip install"):
+    with pytest.raises(UnavailableError, match=r"c\.e57: needs pye57.*pip install 'scan2sim\[e57\]'"):
         clouds.read_header(tmp_path / "c.e57")
     assert {suffix for suffix in clouds.FORMATS if clouds.missing(suffix)} == {".e57"}
 
