@@ -11,8 +11,8 @@ import pytest
 from scan2sim.pipeline.cameras import project
 from scan2sim.pipeline.errors import InputError, SettingError
 from scan2sim.pipeline.io import clouds, las
-from scan2sim.pipeline.io.colmap import camera_of
-from scan2sim.pipeline.io.models import import_model
+from scan2sim.pipeline.io.colmap import camera_of, read
+from scan2sim.pipeline.io.models import Photos, import_model
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.types import Frame, PointCloud
 
@@ -153,3 +153,24 @@ def test_no_model_a_damaged_one_and_a_missing_photo_leave_nothing(tmp_path: Path
     with pytest.raises(InputError, match="is no readable COLMAP model"):
         import_model("colmap", tmp_path / "bin", tmp_path / "images", tmp_path / "tile")
     assert not (tmp_path / "tile").exists() and not list(tmp_path.glob(".tile*"))
+
+
+@pytest.mark.parametrize("form", ["bin", "txt"])
+def test_damaged_models_are_refused_or_read(tmp_path: Path, form: str) -> None:
+    make_model(tmp_path, ["OPENCV", "PINHOLE"])
+    rng = np.random.default_rng(0)
+    refused = 0
+    for file in sorted((tmp_path / form).glob("[cip]*")):
+        whole = file.read_bytes()
+        for i in range(100):
+            at = int(rng.integers(len(whole)))
+            flipped = bytearray(whole)
+            flipped[at] = int(rng.integers(256))
+            file.write_bytes(whole[:at] if i % 2 else bytes(flipped))
+            try:
+                read(tmp_path / form, Photos(tmp_path / "images"))
+            except InputError:
+                refused += 1
+        file.write_bytes(whole)
+    assert refused > 100
+    read(tmp_path / form, Photos(tmp_path / "images"))
