@@ -121,11 +121,11 @@ def read_tiles(survey: Survey) -> tuple[dict[str, Tile], dict[str, ScanError]]:
     """The survey's tiles by name, and why others can't be read."""
     tiles: dict[str, Tile] = {}
     failed: dict[str, ScanError] = {}
-    for path in survey.tiles:
+    for name, path in survey.tiles.items():
         try:
-            tiles[path.parent.name] = read_tile(path)
+            tiles[name] = read_tile(path)
         except ScanError as error:
-            failed[path.parent.name] = error
+            failed[name] = error
     return tiles, failed
 
 
@@ -158,13 +158,12 @@ def _make(survey: Survey, settings: Settings, store: Store, run: Executor, diges
         for label, error in failures.items():
             name = label.split("/")[0]
             failed.setdefault(name, error)
-            tiles.pop(name, None)
-    names = [path.parent.name for path in survey.tiles]
+        tiles = {name: tile for name, tile in tiles.items() if name not in failed}
     return [
-        Made(name, None if name in unread else read_tile(survey.tiles[i]), error=failed[name])
+        Made(name, None if name in unread else read_tile(path), error=failed[name])
         if name in failed
         else Made(name, tiles[name], *_of_tile(name, planned, done, before))
-        for i, name in enumerate(names)
+        for name, path in survey.tiles.items()
     ]
 
 

@@ -6,15 +6,16 @@ crs = "EPSG:32633"          # of all tiles
 units = "m"                 # "ft", "us-ft"; only for local coordinates
 length = 100.0              # metres of the path a tile
 buffer = 5.0                # metres that tiles' clouds reach beyond their borders
-tiles = ["my_town_0000", "my_town_0001"]     # folders beside this file, in order along the path
+tiles = ["my_town_0000", "my_town_0001"]     # folders beside this file, in order along the path; names of their own stand in them
 ```
 What of the plane is a tile's own stands in its `tile.toml` under `[cell]`.
 """
 
 from __future__ import annotations
 
+import re
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -23,6 +24,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.io import toml
+from scan2sim.pipeline.io.tile import NAME, tile_name
 
 
 class SurveyFile(BaseModel):
@@ -30,7 +32,7 @@ class SurveyFile(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    name: str = Field(pattern=r"^[A-Za-z0-9_]+$")
+    name: str = Field(pattern=NAME)
     crs: str
     units: Literal["m", "ft", "us-ft"] | None = None
     length: float = Field(gt=0)
@@ -45,14 +47,14 @@ class Survey:
     Attributes:
         path: the `survey.toml`.
         name: of the survey.
-        tiles: the `tile.toml` of every tile, in order along the path; their folders have the tiles' names.
+        tiles: the `tile.toml` of every tile by its name, in order along the path.
         length: metres of the path a tile.
         buffer: metres that tiles' clouds reach beyond their borders.
     """
 
     path: Path
     name: str
-    tiles: tuple[Path, ...]
+    tiles: Mapping[str, Path]
     length: float
     buffer: float
 
@@ -67,15 +69,21 @@ def read_survey(path: Path) -> Survey:
     """
     path = path / "survey.toml" if path.is_dir() else path
     spec = _parse(path)
-    tiles = tuple(path.parent / name / "tile.toml" for name in spec.tiles)
-    for tile in tiles:
+    tiles: dict[str, Path] = {}
+    crs: dict[str, str] = {}
+    for folder in spec.tiles:
+        tile = path.parent / folder / "tile.toml"
         if not tile.is_file():
             raise InputError(tile, f"is missing (named in {path.name})", "Put it back, or take it out of `tiles`")
-    names = [tile.parent.name for tile in tiles]
-    if len(set(names)) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise InputError(path, f"names two tiles {twice}", "Take one of them out of `tiles`")
-    _check_crs(path, tiles)
+        name, crs[folder] = _peek(tile)
+        if name in tiles:
+            raise InputError(
+                path,
+                f"names two tiles {name} ({tiles[name].parent.name} and {tile.parent.name})",
+                "Take one of them out of `tiles`, or give it another `name`",
+            )
+        tiles[name] = tile
+    _check_crs(path, {folder: text for folder, text in crs.items() if text})
     return Survey(path, spec.name, tiles, spec.length, spec.buffer)
 
 
@@ -101,21 +109,24 @@ def _parse(path: Path) -> SurveyFile:
     return toml.read(path, SurveyFile, absent=absent, fields="docs/formats.md lists the fields of a survey")
 
 
-def _check_crs(path: Path, tiles: Sequence[Path]) -> None:
-    """Look at what the tiles say of their CRS; their clouds are not opened."""
-    known: dict[Path, str] = {}
-    for tile in tiles:
-        try:
-            crs = tomllib.loads(tile.read_text(encoding="utf-8")).get("crs")
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError):
-            continue
-        if isinstance(crs, str):
-            known[tile] = crs
-    for tile, crs in known.items():
+def _peek(tile: Path) -> tuple[str, str]:
+    """A tile's name and CRS, without opening its clouds; what can't be read: its folder's name, and an empty CRS."""
+    try:
+        body = tomllib.loads(tile.read_text(encoding="utf-8-sig"))
+    except (ValueError, RecursionError, OSError):
+        body = {}
+    name, crs = body.get("name"), body.get("crs")
+    known = isinstance(name, str) and re.fullmatch(NAME, name)
+    return str(name) if known else tile_name(tile.parent.name), crs if isinstance(crs, str) else ""
+
+
+def _check_crs(path: Path, known: Mapping[str, str]) -> None:
+    """Refuse tiles (by their folders) from two CRS."""
+    for folder, crs in known.items():
         first, other = next(iter(known.items()))
         if crs != other:
             raise InputError(
                 path,
-                f"has tiles from two CRS: {tile.parent.name} is in {crs[:60]}, {first.parent.name} in {other[:60]}",
+                f"has tiles from two CRS: {folder} is in {crs[:60]}, {first} in {other[:60]}",
                 "Cut all of it from one corridor, in one CRS",
             )

@@ -51,6 +51,8 @@ from scan2sim.pipeline.io import files, toml
 from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.types import Camera, CameraModel, Frame, Tile, Trajectory, View
 
+NAME = r"^[A-Za-z0-9_]{1,100}$"
+"""What tiles and surveys may be called: names become folders, files and names in SDF."""
 Vector = tuple[float, float, float]
 DISTORTION_LENGTHS = {"pinhole": (0,), "opencv": (0, 4, 5, 8), "fisheye": (0, 4), "equirectangular": (0,)}
 
@@ -100,7 +102,7 @@ class CellEntry(_Strict):
 class TileFile(_Strict):
     """All of `tile.toml`."""
 
-    name: str = Field(pattern=r"^[A-Za-z0-9_]+$")
+    name: str = Field(pattern=NAME)
     crs: str | None = None
     units: Literal["m", "ft", "us-ft"] | None = None
     clouds: tuple[str, ...] = Field(min_length=1)

@@ -93,20 +93,30 @@ def test_an_unchanged_survey_is_left_as_it_is(survey: Path, made: Path) -> None:
 
 
 def test_a_tile_that_fails_is_told_and_the_others_are_made(survey: Path, made: Path, tmp_path: Path) -> None:
-    broken = tmp_path / "tiles"
-    shutil.copytree(survey, broken)
+    broken = renamed(survey, tmp_path / "tiles")
     for tile in broken.glob("*/tile.toml"):
         tile.write_text(tile.read_text().replace('"../../corridor', f'"{survey.parent}/corridor'))
     cloud = sorted(broken.glob("*/cloud.laz"))[1]
     cloud.write_bytes(cloud.read_bytes()[: cloud.stat().st_size // 2])
     out = tmp_path / "out"
     bad(scan2sim("survey", broken, "--out", out, *SMALL), 5, "1 of 2 tiles failed", "truncated or damaged")
+    assert told(out)["tiles"].keys() == {tile.parent.name for tile in survey.glob("*/tile.toml")}
     first, second = told(out)["tiles"].values()
     assert first["state"] == "done" and second["state"] == "failed"
     assert "truncated or damaged" in second["reason"] and cloud.name in second["reason"]
     shutil.copyfile(sorted(survey.glob("*/cloud.laz"))[1], cloud)
     good(scan2sim("survey", broken, "--out", out, *SMALL))
     assert contents(out) == contents(made)
+
+
+def renamed(survey: Path, to: Path) -> Path:
+    """A copy whose tiles' folders aren't called as the tiles."""
+    shutil.copytree(survey, to)
+    for i, tile in enumerate(sorted(to.glob("*/tile.toml"))):
+        listing = to / "survey.toml"
+        listing.write_text(listing.read_text().replace(tile.parent.name, f"folder-{i}"))
+        tile.parent.rename(to / f"folder-{i}")
+    return to
 
 
 def contents(out: Path) -> dict[str, str]:

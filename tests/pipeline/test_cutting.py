@@ -107,7 +107,7 @@ def cut(bend: Path) -> Path:
 
 
 def tiles(survey: Path) -> dict[str, Tile]:
-    return {tile.name: tile for tile in map(read_tile, read_survey(survey).tiles)}
+    return {tile.name: tile for tile in map(read_tile, read_survey(survey).tiles.values())}
 
 
 def rows(files: Iterator[Path] | list[Path], frame: Frame) -> np.ndarray:
