@@ -99,8 +99,7 @@ def slam_video(path: Path, out: Path, options: Options, settings: Settings) -> T
     video = open_video(path, fps=options.fps, times=options.times)
     camera, gps, mask = _camera(video, options), _gps(video, options), _mask(video, options)
     with locked(out), progress("slam") as report:
-        asked = json.dumps([str(path.resolve()), str(options), params.model_dump()], default=str)
-        state = out / f"state-{hashlib.sha256(asked.encode()).hexdigest()[:12]}"
+        state = out / f"state-{_mark(path, options, params)}.npz"
         watch = None
         if options.view:
             from scan2sim.slam.view import Recorder
@@ -129,7 +128,8 @@ def slam_video(path: Path, out: Path, options: Options, settings: Settings) -> T
         if tracked.alone is not None:
             trajectory_io.write(out / "odometry.csv", tracked.alone, tracked.frame)
         (out / "slam.json").write_text(json.dumps(tracked.facts | {"warnings": tracked.warnings}, indent=1) + "\n")
-        state.unlink(missing_ok=True)
+        for left in out.glob("state-*"):  # those of other options, too: what they were to become is replaced
+            left.unlink()
     for warning in tracked.warnings[:20]:
         console.print(f"[yellow]warning:[/] {warning}", highlight=False, soft_wrap=True)
     console.print(json.dumps(tracked.facts, indent=1), highlight=False, markup=False)
@@ -149,6 +149,15 @@ def _need(options: Options) -> None:
         need("--backend adam", "torch", instead="or use the backend lm")
     if options.view:
         need("--view", "av")
+
+
+def _mark(path: Path, options: Options, params: OdometryParams) -> str:
+    """Of all that a run depends on; of files, their size and time."""
+    given = (path, options.gps, options.mask, options.tile, options.times, options.weights, options.matcher_weights)
+    files = [file for one in given if one for file in (sorted(one.iterdir()) if one.is_dir() else [one])]
+    stats = [(str(file.resolve()), file.stat().st_size, file.stat().st_mtime_ns) for file in files if file.exists()]
+    asked = json.dumps([str(path.resolve()), stats, str(options), params.model_dump()], default=str)
+    return hashlib.sha256(asked.encode()).hexdigest()[:12]
 
 
 def odometry_params(settings: Settings) -> OdometryParams:

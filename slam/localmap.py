@@ -120,6 +120,8 @@ class Observations:
 class LocalMap:
     """Keyframes and landmarks; `part` counts the maps begun."""
 
+    STATE = ("keyframes", "landmarks", "retired", "_others", "part", "shared")
+
     def __init__(
         self, camera: Camera, params: MapParams, pixel: float, *, gps: GpsTrack | None, backend: str, keep: bool
     ) -> None:

@@ -35,6 +35,8 @@ LOOP = (0.1, 2e-3)
 class Places:
     """Remembers keyframes; give it to `Odometry` as `remember`."""
 
+    STATE = ("thumbnail", "seen")
+
     def __init__(self, charts: Charts) -> None:
         self.charts = charts
         self.thumbnail: dict[int, F32] = {}

@@ -30,7 +30,7 @@ AWAY = np.radians(15)
 
 
 @dataclass
-class _Seen:
+class SeenInChart:
     """Features of a chart, those beyond its border included, and ids (N,) of the tracks that they are; -1: of none."""
 
     found: Found
@@ -48,6 +48,8 @@ class _Seen:
 
 class MatchingTracker(Tracker):
     """Follows features by matching; otherwise as `slam.tracking.Tracker`."""
+
+    STATE = (*Tracker.STATE, "_seen")
 
     def __init__(
         self,
@@ -76,7 +78,7 @@ class MatchingTracker(Tracker):
         super().__init__(charts, mask, count)
         check(features, matcher)
         self.features, self.matcher, self.bridge = features, matcher, bridge
-        self._seen: list[_Seen] = []
+        self._seen: list[SeenInChart] = []
 
     def look(self, grey: U8, expected: F64 | None = None) -> float:
         """See `Tracker.look`."""
@@ -135,9 +137,9 @@ class MatchingTracker(Tracker):
                 seen.ids[free[which]] = self.tracks.ids[rows]
         return count
 
-    def _detect(self, chart: int) -> _Seen:
+    def _detect(self, chart: int) -> SeenInChart:
         found = self.features.detect(self.pictures[chart], None if self._masks is None else self._masks[chart])
-        return _Seen(found, np.full(len(found.uv), -1, np.int64))
+        return SeenInChart(found, np.full(len(found.uv), -1, np.int64))
 
     def _match(self, chart: int, was: Found) -> I64:
         height, width = self.pictures[chart].shape

@@ -66,6 +66,12 @@ class Placed:
 class Odometry:
     """Feed `add` with frames; `placed` and `map` hold what came out."""
 
+    STATE = (
+        "placed", "_rng", "_pose", "_time", "_velocity", "_started", "_blind", "_waiting", "_settled", "_lost_at",
+        "_memory", "_known",
+    )  # fmt: skip
+    PARTS = ("map", "tracker", "remember")
+
     def __init__(
         self,
         camera: Camera,

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import pickle
 import time as clock
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +15,19 @@ from scan2sim.pipeline.step import Report, silent
 from scan2sim.pipeline.types import U8, Camera, Frame, Trajectory
 from scan2sim.slam.finish import Placing, finish
 from scan2sim.slam.gps import GpsTrack
-from scan2sim.slam.odometry import Odometry
+from scan2sim.slam.features import Found
+from scan2sim.slam.localmap import Keyframe, Landmarks
+from scan2sim.slam.matching import SeenInChart
+from scan2sim.slam.odometry import Odometry, Placed
+from scan2sim.slam.relocalise import Remembered, Seen
+from scan2sim.slam.state import WrongState, load, save
+from scan2sim.slam.tracking import Tracks
 from scan2sim.slam.video import Video
 
 KEEP_EVERY = 60.0
 """Seconds between states kept."""
+VALUES = (Found, Keyframe, Landmarks, Placed, Remembered, Seen, SeenInChart, Tracks)
+"""What states consist of."""
 
 
 @dataclass(frozen=True)
@@ -48,12 +55,20 @@ class Tracked:
     warnings: list[str]
 
 
-@dataclass
-class _State:
-    odometry: Odometry
-    names: list[str] = field(default_factory=list)
-    warnings: list[str] = field(default_factory=list)
-    seconds: float = 0.0
+class _Run:
+    """A run as far as it has come."""
+
+    STATE = ("names", "warnings", "seconds")
+    PARTS = ("odometry",)
+
+    def __init__(self, start: Callable[[Callable[[str], None]], Odometry]) -> None:
+        self.names: list[str] = []
+        self.warnings: list[str] = []
+        self.seconds = 0.0
+        self.odometry = start(self.warn)
+
+    def warn(self, text: str) -> None:
+        self.warnings.append(text)
 
 
 def track(
@@ -86,13 +101,10 @@ def track(
     Raises:
         DataError: fewer than two frames.
     """
-    kept = _load(state)
-    if kept is None:
-        warnings: list[str] = []
-        kept = _State(start(warnings.append), warnings=warnings)
+    kept = _begin(start, state)
     began, saved = clock.perf_counter() - kept.seconds, clock.perf_counter()
     last = kept.odometry.placed[-1].time if kept.odometry.placed else -np.inf
-    for frame in video.frames(every=every, warn=kept.warnings.append):
+    for frame in video.frames(every=every, warn=kept.warn):
         if frame.time <= last:
             continue
         if until is not None and frame.time > until:
@@ -105,7 +117,7 @@ def track(
             report(min(1.0, frame.number / video.count), f"{len(kept.names)} frames")
         if state is not None and clock.perf_counter() - saved > KEEP_EVERY:
             kept.seconds, saved = clock.perf_counter() - began, clock.perf_counter()
-            _save(state, kept)
+            save(state, kept, VALUES)
     if len(kept.names) < 2:
         raise DataError(video.path, f"has {len(kept.names)} frames", "Give a longer video")
     kept.seconds = clock.perf_counter() - began
@@ -122,7 +134,7 @@ def track(
     )
 
 
-def _facts(kept: _State, trajectory: Trajectory) -> dict[str, Any]:
+def _facts(kept: _Run, trajectory: Trajectory) -> dict[str, Any]:
     assert trajectory.unsure is not None
     way = np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1)
     shared = dict(zip(kept.odometry.map.names, np.round(kept.odometry.map.shared, 5).tolist(), strict=True))
@@ -138,24 +150,17 @@ def _facts(kept: _State, trajectory: Trajectory) -> dict[str, Any]:
     }
 
 
-def _save(path: Path, state: _State) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    work = path.with_suffix(".part")
-    with open(work, "wb") as file:
-        pickle.dump(state, file, pickle.HIGHEST_PROTOCOL)
-    work.replace(path)
-
-
-def _load(path: Path | None) -> _State | None:
-    """The state of a run that was interrupted; it is of this machine's own making."""
-    if path is None or not path.is_file():
-        return None
+def _begin(start: Callable[[Callable[[str], None]], Odometry], state: Path | None) -> _Run:
+    """A run at its beginning, or where an earlier one was interrupted."""
+    if state is None or not state.is_file():
+        return _Run(start)
     try:
-        with open(path, "rb") as file:
-            kept = pickle.load(file)
-    except (OSError, EOFError, pickle.UnpicklingError, AttributeError, ImportError):
-        return None
-    return kept if isinstance(kept, _State) else None
+        run = _Run(start)
+        load(state, run, VALUES)
+    except WrongState:
+        run = _Run(start)
+        run.warn(f"what an interrupted run left in {state.name} is damaged: begun anew")
+    return run
 
 
 def camera_of(video: Video, model: str, focal: float | None, centre: tuple[float, float] | None) -> Camera:

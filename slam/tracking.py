@@ -53,6 +53,8 @@ class Tracks:
 class Tracker:
     """Follows corners; `tracks` are those of the last frame."""
 
+    STATE: tuple[str, ...] = ("tracks", "pictures", "_next")
+
     def __init__(self, charts: Charts, mask: U8 | None, count: int) -> None:
         """`mask` (H, W): 0 where the car itself is; `count`: corners to keep alive."""
         self.charts, self.count = charts, count

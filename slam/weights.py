@@ -55,7 +55,7 @@ class Model:
 
 @dataclass(frozen=True)
 class Weights:
-    """Of a model: float32 `tensors` by name, on a device of torch. Pickled without tensors; these are read again."""
+    """Of a model: float32 `tensors` by name, on a device of torch."""
 
     path: Path
     model: Model
@@ -68,9 +68,6 @@ class Weights:
         known = self.model.published.get(self.sha256)
         told = f"as published ({known})" if known else "not a file known to the project"
         return f"{self.path.name}: {self.model.name}, SHA-256 {self.sha256}, {told}; licence: {self.model.licence}"
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return _again, (self.path, self.model, self.device, self.sha256)
 
 
 def missing() -> str | None:
@@ -116,14 +113,6 @@ def load(path: Path | None, models: Sequence[Model], *, hint: str, device: str =
     if bad:
         raise InputError(path, f"holds numbers that aren't finite, in {bad}", "Copy or download it again")
     return Weights(path, model, device, hashlib.sha256(path.read_bytes()).hexdigest(), tensors)
-
-
-def _again(path: Path, model: Model, device: str, sha256: str) -> Weights:
-    """What was pickled, from its file."""
-    weights = load(path, [model], hint=f"Put back the {model.name} file that was used", device=device)
-    if weights.sha256 != sha256:
-        raise InputError(path, "has changed since it was first used", "Put the old file back, or start anew")
-    return weights
 
 
 def _renamed(state: dict[str, Any], model: Model) -> dict[str, Any]:

@@ -277,7 +277,7 @@ def test_every_tile_holds_exactly_its_points_and_they_are_the_same_in_all(bend: 
 def test_tiles_say_what_is_their_own(cut: Path) -> None:
     made = tiles(cut)
     survey = read_survey(cut.parent)
-    assert survey == Survey(cut, "bend", tuple(cut.parent / name / "tile.toml" for name in made), 100.0, 5.0)
+    assert survey == Survey(cut, "bend", {name: cut.parent / name / "tile.toml" for name in made}, 100.0, 5.0)
     for name, tile in made.items():
         assert tile.cell is not None and tile.frame.crs == "EPSG:32632"
         for other, seed in tile.cell.neighbours.items():

@@ -1,6 +1,9 @@
 """`scan2sim slam` as a user types it: what it writes, what it says, and bad input."""
 
+import io
 import json
+import os
+import pickle
 import shutil
 
 import numpy as np
@@ -9,8 +12,10 @@ from typer.testing import CliRunner
 
 import scan2sim.slam.track as tracking
 from scan2sim.flows.cli import app
+from scan2sim.flows.slam import Options, _mark, _tracker
 from scan2sim.pipeline.errors import InputError, ScanError
 from scan2sim.pipeline.io import trajectory as trajectory_io
+from scan2sim.slam.loops import Places
 from scan2sim.slam.odometry import Odometry, OdometryParams
 from scan2sim.slam.track import track
 from scan2sim.slam.video import open_video
@@ -60,13 +65,17 @@ def test_evaluate_prints_the_missions_errors(done, corridor, tmp_path):
     assert float(figures["local_median_5_m"]) < 0.1
 
 
-def test_an_interrupted_run_goes_on_and_ends_the_same(corridor, tmp_path, monkeypatch):
+@pytest.mark.parametrize("features", ["corners", "orb"])
+def test_an_interrupted_run_goes_on_and_ends_the_same(corridor, tmp_path, monkeypatch, features):
     monkeypatch.setattr(tracking, "KEEP_EVERY", 0.0)
-    video, state = open_video(corridor.folder / "video.mp4"), tmp_path / "state"
+    video, state = open_video(corridor.folder / "video.mp4"), tmp_path / "state.npz"
     params = OdometryParams.model_validate({"features": 300})
+    places = []
 
     def start(warn):
-        return Odometry(corridor.camera, params, warn=warn)
+        tracker = _tracker(corridor.camera, None, 300, Options(features=features))
+        places.append(Places(tracker.charts))
+        return Odometry(corridor.camera, params, tracker=tracker, keep=True, remember=places[-1], warn=warn)
 
     def interrupt(odometry, grey):
         if len(odometry.placed) == 20:
@@ -77,7 +86,55 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(corridor, tmp_path, monkey
     resumed = track(video, start, state=state)
     whole = track(video, start)
     assert resumed.names == whole.names
-    assert np.allclose(resumed.trajectory.positions, whole.trajectory.positions, atol=1e-9)
+    assert np.array_equal(resumed.trajectory.positions, whole.trajectory.positions)
+    assert places[1].seen.keys() == places[2].seen.keys()
+
+
+class Trap:
+    """Makes a file when it is unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.path),)
+
+
+def damages(path):
+    """A state in all the ways in which it can't be one: by what was done to it."""
+    whole, trap = path.read_bytes(), path.with_name("trap")
+    objects = io.BytesIO()
+    np.savez(objects, tree=np.array([Trap(trap)], dtype=object), data=np.zeros(3, np.uint8))
+    foreign = io.BytesIO()
+    np.savez(foreign, tree=np.frombuffer(b'{"names": {"kind": "Popen", "args": "id"}}', np.uint8), data=np.zeros(3))
+    return {
+        "a pickle": pickle.dumps(Trap(trap)), "an array of objects": objects.getvalue(), "of others": foreign.getvalue(),
+        "half": whole[: len(whole) // 2], "empty": b"", "flipped": whole[:999] + bytes([whole[999] ^ 1]) + whole[1000:],
+    }  # fmt: skip
+
+
+def test_a_state_that_is_damaged_or_foreign_is_not_run_and_the_run_begins_anew(corridor, tmp_path, monkeypatch):
+    monkeypatch.setattr(tracking, "KEEP_EVERY", 0.0)
+    video, state = open_video(corridor.folder / "video.mp4"), tmp_path / "state.npz"
+    params = OdometryParams.model_validate({"features": 300})
+
+    def start(warn):
+        return Odometry(corridor.camera, params, warn=warn)
+
+    whole = track(video, start, until=0.5, state=state)
+    for name, damaged in damages(state).items():
+        state.write_bytes(damaged)
+        again = track(video, start, until=0.5, state=state)
+        assert [w for w in again.warnings if "damaged: begun anew" in w], name
+        assert again.names == whole.names and not (tmp_path / "trap").exists(), name
+
+
+def test_a_video_that_was_replaced_is_begun_anew(corridor, tmp_path):
+    shutil.copy(corridor.folder / "video.mp4", tmp_path / "video.mp4")
+    before = _mark(tmp_path / "video.mp4", Options(), OdometryParams())
+    assert _mark(tmp_path / "video.mp4", Options(), OdometryParams()) == before
+    (tmp_path / "video.mp4").write_bytes(b"another")
+    assert _mark(tmp_path / "video.mp4", Options(), OdometryParams()) != before
 
 
 @pytest.mark.parametrize(

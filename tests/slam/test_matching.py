@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,8 @@ from scan2sim.slam.charts import Charts
 from scan2sim.slam.features import Found
 from scan2sim.slam.geometry import exp_so3
 from scan2sim.slam.matching import MatchingTracker
+from scan2sim.slam.state import load, save
+from scan2sim.slam.track import VALUES
 
 SPHERE = Camera("equirectangular", 512, 256)
 NUMBER = 400
@@ -158,7 +159,7 @@ def test_wrong_matches_are_not_believed() -> None:
     assert len(first) > 0.5 * NUMBER and np.median(error) < 0.1
 
 
-def test_the_interface_of_a_tracker() -> None:
+def test_the_interface_of_a_tracker_whose_run_is_interrupted(tmp_path: Path) -> None:
     mask = np.full((256, 512), 255, np.uint8)
     mask[180:] = 0
     track = tracker("orb", mask=mask)
@@ -171,7 +172,9 @@ def test_the_interface_of_a_tracker() -> None:
     assert np.allclose(np.linalg.norm(track.tracks.bearing, axis=1), 1)
     track.drop(ids[:50])
     assert not np.isin(ids[:50], track.tracks.ids).any()
-    track = pickle.loads(pickle.dumps(track))  # as the state of a run is kept
+    save(tmp_path / "state.npz", track, VALUES)
+    track = tracker("orb", mask=mask)
+    load(tmp_path / "state.npz", track, VALUES)
     before = track.tracks
     turn = exp_so3(np.radians([0.0, 3.0, 0.0]))
     share = track.look(seen(SPHERE, turn), before.bearing @ turn)

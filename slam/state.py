@@ -1,0 +1,111 @@
+"""What an interrupted run goes on from, in a file of numbers and JSON: nothing that it holds is run when it is read.
+
+Objects that change name what of them does (`STATE`), and which parts of theirs have a state of their own (`PARTS`): it
+is read back into objects that were made anew, of the same camera, parameters and weights.
+"""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+
+class WrongState(ValueError):
+    """A file that holds no such state."""
+
+
+def save(path: Path, root: Any, values: Sequence[type]) -> None:
+    """Write an object's state; the file is whole or not there.
+
+    Args:
+        values: dataclasses and named tuples that the state may consist of, besides arrays and what JSON knows.
+
+    Raises:
+        TypeError: it consists of something else.
+        OSError: it can't be written.
+    """
+    data = bytearray()
+    tree = json.dumps(_state(root, values, data))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    work = path.with_suffix(".part")
+    with open(work, "wb") as file:
+        np.savez(file, tree=np.frombuffer(tree.encode(), np.uint8), data=np.frombuffer(data, np.uint8))
+    work.replace(path)
+
+
+def load(path: Path, root: Any, values: Sequence[type]) -> None:
+    """Give an object the state that a file holds.
+
+    Raises:
+        WrongState: it is damaged, or of another object; this one is of no use then.
+        OSError: it can't be read.
+    """
+    known = {kind.__name__: kind for kind in values}
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            tree, data = json.loads(file["tree"].tobytes()), file["data"].tobytes()
+        _restore(root, tree, known, data)
+    except (ValueError, KeyError, TypeError, AttributeError, EOFError, RecursionError, zipfile.BadZipFile) as error:
+        raise WrongState(f"{type(error).__name__}: {error}") from error
+
+
+def _state(part: Any, values: Sequence[type], data: bytearray) -> dict[str, Any]:
+    told = {name: _told(getattr(part, name), values, data) for name in part.STATE}
+    below = {name: getattr(part, name) for name in getattr(part, "PARTS", ())}
+    return told | {name: _state(value, values, data) for name, value in below.items() if hasattr(value, "STATE")}
+
+
+def _restore(part: Any, told: dict[str, Any], known: dict[str, type], data: bytes) -> None:
+    for name in part.STATE:
+        setattr(part, name, _value(told[name], known, data))
+    for name in getattr(part, "PARTS", ()):
+        if hasattr(getattr(part, name), "STATE"):
+            _restore(getattr(part, name), told[name], known, data)
+
+
+def _told(value: Any, values: Sequence[type], data: bytearray) -> Any:
+    """JSON of a value; what an array holds is appended to `data`."""
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
+        data += value.tobytes()
+        return {"array": value.dtype.str, "shape": value.shape, "end": len(data)}
+    if isinstance(value, np.random.Generator):
+        return {"random": value.bit_generator.state}
+    if isinstance(value, dict):
+        return {"dict": [[key, _told(one, values, data)] for key, one in value.items()]}
+    if type(value) in values:
+        names = getattr(value, "_fields", None) or value.__dataclass_fields__
+        return {"kind": type(value).__name__} | {name: _told(getattr(value, name), values, data) for name in names}
+    if type(value) in (list, tuple):
+        told = [_told(one, values, data) for one in value]
+        return told if isinstance(value, list) else {"tuple": told}
+    raise TypeError(f"{type(value).__name__} is no part of a state")
+
+
+def _value(told: Any, known: dict[str, type], data: bytes) -> Any:
+    """The value of its JSON."""
+    if isinstance(told, list):
+        return [_value(one, known, data) for one in told]
+    if not isinstance(told, dict):
+        return told
+    if "array" in told:
+        dtype, shape = np.dtype(told["array"]), told["shape"]
+        size = dtype.itemsize * int(np.prod(shape))
+        return np.frombuffer(data[told["end"] - size : told["end"]], dtype).reshape(shape).copy()
+    if "random" in told:
+        generator = np.random.default_rng()
+        generator.bit_generator.state = told["random"]
+        return generator
+    if "dict" in told:
+        return {key: _value(one, known, data) for key, one in told["dict"]}
+    if "tuple" in told:
+        return tuple(_value(one, known, data) for one in told["tuple"])
+    return known[told["kind"]](**{name: _value(one, known, data) for name, one in told.items() if name != "kind"})
