@@ -168,6 +168,16 @@ def survey(
 
 
 @app.command()
+def verify(
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="The folder that run or survey was given as --out.")],
+) -> None:
+    """Read all that was made, and say what is damaged; the next run makes that anew."""
+    from scan2sim.flows.verify import verify
+
+    verify(out)
+
+
+@app.command()
 def inspect(path: Annotated[Path, typer.Argument(help="A cloud, a tile, a mesh, or a world.")]) -> None:
     """Show one screen of facts."""
     from scan2sim.flows.inspect import inspect_path

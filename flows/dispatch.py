@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 from scan2sim.flows.execute import Frontier
 from scan2sim.flows.planning import Planned
-from scan2sim.pipeline.errors import ScanError, StepError
+from scan2sim.pipeline.errors import DamagedError, ScanError, StepError
 from scan2sim.pipeline.store import Manifest, Store
 
 PERIOD = 1.0  # seconds between two looks; what shows it may cost a tenth of one
@@ -44,7 +44,7 @@ def dispatch(
         show: told a tile's name and how many percent of its steps are done, once a second at most.
     """
     board = Board(planned, show)
-    front = Frontier(planned, store, lambda node, *_: board.end(node.label))
+    front = Frontier(planned, store, lambda node, event, *_: None if event == "again" else board.end(node.label))
     running: dict[str, tuple[Planned, Future]] = {}
     ended: SimpleQueue[str] = SimpleQueue()
     while front or running:
@@ -62,9 +62,12 @@ def dispatch(
                 outcome = future.result(raise_on_failure=False)
             except Exception as error:  # the runner has given the step up: it took several workers with it
                 outcome = error
+            if isinstance(outcome, DamagedError):
+                front.again(item, outcome.where)
+                continue
             manifest = None if isinstance(outcome, BaseException) else store.find(label, item.key)
             if manifest is not None:
-                front.done[label] = manifest
+                front.end(item, manifest)
             else:
                 cause = f"its worker failed ({type(outcome).__name__}: {outcome})"
                 lost = StepError(label, cause, "Run again: what is finished is kept; the worker's log tells more")

@@ -75,6 +75,11 @@ class RunDisplay:
             self._tasks[node.label] = self._bars.add_task(node.label, total=1.0, message="")
         elif event == "progress":
             self._bars.update(self._tasks[node.label], completed=fraction, message=escape(message))  # type: ignore[arg-type]
+        elif event == "again":
+            if node.label in self._tasks:
+                self._bars.remove_task(self._tasks.pop(node.label))  # type: ignore[arg-type]
+            self._done, self._kept = self._done - 1, self._kept - 1
+            console.print(f"[yellow]![/] {escape(message)}", highlight=False, soft_wrap=True)
         else:
             self._done += 1
             self._kept += event == "kept"

@@ -25,11 +25,11 @@ from scan2sim import __version__
 from scan2sim.flows.memory import need, share
 from scan2sim.flows.planning import Planned, check
 from scan2sim.flows.recipe import Node
-from scan2sim.pipeline.errors import BusyError, ScanError, StepError, UnavailableError, from_os_error
+from scan2sim.pipeline.errors import BusyError, DamagedError, ScanError, StepError, UnavailableError, from_os_error
 from scan2sim.pipeline.step import Report, silent
 from scan2sim.pipeline.store import Manifest, Store
 
-Event = Literal["start", "progress", "done", "kept", "failed"]
+Event = Literal["start", "progress", "done", "kept", "failed", "again"]
 Watch = Callable[[Node, Event, float, str], None]
 """Told what happens: node, event, fraction done, message."""
 Executor = Callable[["list[Planned]", Store, dict[str, ScanError]], dict[str, Manifest]]
@@ -46,7 +46,8 @@ class Frontier:
     def __init__(self, planned: Sequence[Planned], store: Store, watch: Watch) -> None:
         self.done: dict[str, Manifest] = {}
         self._store, self._watch = store, watch
-        self._waiting = {item.node.label: item for item in planned}
+        self._planned = {item.node.label: item for item in planned}
+        self._waiting = dict(self._planned)
         self._missing: set[str] = set()  # known not to be kept
         self._lost: set[str] = set()  # failed, or in need of what failed
 
@@ -71,6 +72,22 @@ class Frontier:
     def take(self, label: str) -> None:
         """The node has been started."""
         self._waiting.pop(label, None)
+
+    def end(self, item: Planned, manifest: Manifest) -> None:
+        """The node is done; what it has read was intact."""
+        self.done[item.node.label] = manifest
+        for label in (item.node.label, *item.upstream):
+            self._store.trust(label, self._planned[label].key)
+        self._watch(item.node, "done", 1.0, "")
+
+    def again(self, item: Planned, damaged: str) -> None:
+        """The node has met a result that is damaged: that is made anew, and the node waits for it."""
+        self._waiting[item.node.label] = item
+        if self.done.pop(damaged, None) is not None:
+            self._store.discard(damaged, self._planned[damaged].key)
+            self._missing.add(damaged)
+            self._waiting[damaged] = self._planned[damaged]
+        self._watch(item.node, "again", 0.0, f"the kept result of {damaged} is damaged: made anew")
 
     def fail(self, label: str) -> None:
         """The node, and whatever depends on it, will not be done."""
@@ -106,12 +123,16 @@ def execute(
             for item in front.ready():
                 if len(running) >= jobs:
                     break
-                needed = 0.0 if memory is None else need(item, store)
-                if memory is not None and running and sum(r[2] for r in running.values()) + needed > memory:
-                    continue
+                try:
+                    needed = 0.0 if memory is None else need(item, store)
+                    if memory is not None and running and sum(r[2] for r in running.values()) + needed > memory:
+                        continue
+                    started, process = _start(item, store)
+                except DamagedError as error:
+                    front.again(item, error.where)
+                    break
                 front.take(item.node.label)
                 watch(item.node, "start", 0.0, "")
-                started, process = _start(item, store)
                 running[started] = (item, process, needed)
             for connection in wait(list(running), timeout=1.0) if running else ():
                 assert isinstance(connection, Connection)
@@ -119,6 +140,8 @@ def execute(
                 label = item.node.label
                 try:
                     manifest = _receive(connection, item, process, watch)
+                except DamagedError as error:
+                    front.again(item, error.where)
                 except ScanError as error:
                     if failures is None:
                         raise
@@ -128,8 +151,7 @@ def execute(
                 else:
                     if manifest is None:
                         continue
-                    front.done[label] = manifest
-                    watch(item.node, "done", 1.0, "")
+                    front.end(item, manifest)
                 process.join()
                 del running[connection]
     finally:
@@ -211,9 +233,12 @@ def run_node(item: Planned, store: Store, inputs: dict[str, Path], report: Repor
     """Run one node in this process and keep its result.
 
     Raises:
+        DamagedError: a result that it reads isn't as it was made.
         ScanError: as the step says; a full disk as `SpaceError`; anything else as `StepError`.
     """
     node = item.node
+    item.check(store)
+    fed = item.fed(store)
     folder = store.begin(node.label)
     start = time.perf_counter()
     _forget_peak()
@@ -223,7 +248,7 @@ def run_node(item: Planned, store: Store, inputs: dict[str, Path], report: Repor
             "version": node.step.version,
             "params": node.params.model_dump(mode="json"),
             "inputs": item.keys,
-            "fed": item.fed(store),
+            "fed": fed,
             "seconds": round(time.perf_counter() - start, 3),
             "peak_mb": _peak_mb(),
         }

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from scan2sim.flows.planning import Planned
-from scan2sim.flows.publish import publish
+from scan2sim.flows.publish import SHOWN, publish, published
 from scan2sim.flows.report import figures, write_report
 from scan2sim.flows.settings import Settings
 from scan2sim.flows.survey_report import TileState, write_survey_report
@@ -24,8 +24,11 @@ from scan2sim.pipeline.store import Digests, Manifest, Store
 from scan2sim.pipeline.types import Tile
 
 TILES, PICTURE = "tiles", "picture.jpg"
+<<<<<<< HEAD
 SHOWN = {"export", "rasters", "exposure", "preview", "pictures", "score"}
 """Steps whose files, not just figures, are shown."""
+=======
+>>>>>>> 155724a (Damage to kept results and worlds is noticed and mended; scan2sim verify; names that lead out of their folder are refused)
 
 
 @dataclass(frozen=True)
@@ -72,8 +75,8 @@ def _finish_tile(one: Made, store: Store, out: Path, settings: Settings) -> None
     planned, done = list(one.planned), dict(one.done)
     keys = {item.node.label: item.key for item in planned}
     out.mkdir(parents=True, exist_ok=True)
-    if not (one.kept and (out / "report.json").is_file() and (out / "world").is_dir()):
-        for label in SHOWN & keys.keys():
+    if not (one.kept and is_finished(store, planned, out)):
+        for label in keys.keys() & set(SHOWN):
             store.read(label, keys[label])
         publish(store, planned, done, out, one.tile, settings)
         seconds = sum(done[item.node.label].seconds for item in planned if item.reason is not None)
@@ -84,8 +87,18 @@ def _finish_tile(one: Made, store: Store, out: Path, settings: Settings) -> None
     store.sweep(keys)
 
 
+<<<<<<< HEAD
 def _together(survey: Survey, done: Sequence[Made], out: Path, digests: Digests) -> None:
     """The world of all tiles, the STAC catalogue, the virtual point cloud and rasters."""
+=======
+def is_finished(store: Store, planned: Sequence[Planned], out: Path) -> bool:
+    """Whether a tile's folder shows its kept results already."""
+    return (out / "report.json").is_file() and (out / "report.html").is_file() and published(store, planned, out)
+
+
+def _together(survey: Survey, whole: Sequence[Made], out: Path, digests: Digests) -> None:
+    """The world of all tiles, the STAC catalogue and the virtual point cloud."""
+>>>>>>> 155724a (Damage to kept results and worlds is noticed and mended; scan2sim verify; names that lead out of their folder are refused)
     tiles, items = [], []
     for one in done:
         assert one.tile is not None

@@ -8,17 +8,18 @@ import re
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from scan2sim.pipeline.errors import SettingError, from_os_error
+from scan2sim.pipeline.errors import SettingError, UnavailableError, from_os_error
 
 if TYPE_CHECKING:
     from scan2sim.flows.planning import Planned
     from scan2sim.pipeline.store import Store
 
 SLOT = 0.25  # GB; memory is shared out in pieces of it
+LARGEST = 20_000  # GB, of what steps may need together
 PAUSE = 0.2  # seconds between looks for free memory
 NEEDS: dict[str, tuple[float, float]] = {
     "ingest": (0.4, 12),
@@ -61,10 +62,10 @@ def parse(text: str | None) -> float | None:
     """
     if text is None:
         return None
-    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*(GB|G|MB|M)?\s*", text, re.IGNORECASE)
+    match = re.fullmatch(r"\s*(\d{1,9}(?:\.\d{1,9})?)\s*(GB|G|MB|M)?\s*", text, re.IGNORECASE)
     size = float(match[1]) * (1e-3 if (match[2] or "G").upper().startswith("M") else 1) if match else 0.0
-    if size <= 0:
-        raise SettingError("--memory", f"`{text}` is no amount of memory", "Write 20GB, or 800MB")
+    if not 0 < size <= LARGEST:
+        raise SettingError("--memory", f"`{text[:40]}` is no amount of memory", "Write 20GB, or 800MB")
     return size
 
 
@@ -81,30 +82,61 @@ def share(total: float | None, gigabytes: float) -> Iterator[None]:
         return
     slots = max(1, int(total / SLOT))
     wanted = min(slots, max(1, round(gigabytes / SLOT)))
-    folder = Path(tempfile.gettempdir()) / f"scan2sim-memory-{os.getuid()}"
     with ExitStack() as held:
+        folder = Path(tempfile.gettempdir()) / f"scan2sim-memory-{os.getuid()}"
         try:
-            folder.mkdir(exist_ok=True)
-            with open(folder / "queue", "w") as queue:  # held while waiting: nobody small overtakes
+            with ExitStack() as stack:
+                place = _own_folder(folder, stack)
+                queue = _opened(place, "queue", stack)  # held while waiting: nobody small overtakes
                 fcntl.flock(queue, fcntl.LOCK_EX)
-                while not _taken(folder, slots, wanted, held):
+                while not _taken(place, slots, wanted, held):
                     time.sleep(PAUSE)
         except OSError as error:
             raise from_os_error(error, folder) from error
         yield
 
 
-def _taken(folder: Path, slots: int, wanted: int, held: ExitStack) -> bool:
+def _own_folder(folder: Path, stack: ExitStack) -> int:
+    """A folder of this user's alone, open; others may have put something else in its predictable place.
+
+    Raises:
+        UnavailableError: they have.
+    """
+    with suppress(FileExistsError):
+        folder.mkdir(0o700)
+    try:
+        place = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+        stack.callback(os.close, place)
+        stat = os.fstat(place)
+    except OSError:
+        stat = None
+    if stat is None or stat.st_uid != os.getuid():
+        remedy = "Have it removed, or set TMPDIR to a folder of your own, the same for all runs"
+        raise UnavailableError(folder, "is a link, a file, or another user's: runs can't share memory out", remedy)
+    os.fchmod(place, 0o700)
+    return place
+
+
+def _opened(place: int, name: str, stack: ExitStack) -> int:
+    """A file in the folder, open until the stack ends."""
+    file = os.open(name, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600, dir_fd=place)
+    stack.callback(os.close, file)
+    return file
+
+
+def _taken(place: int, slots: int, wanted: int, held: ExitStack) -> bool:
     """Try to lock `wanted` slots, all or none."""
     with ExitStack() as stack:
         count = 0
         for i in range(slots):
-            file = stack.enter_context(open(folder / f"{i:05d}", "w"))
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                count += 1
-            except BlockingIOError:
-                file.close()
+            with ExitStack() as one:
+                file = _opened(place, f"{i:05d}", one)
+                try:
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    continue
+                stack.enter_context(one.pop_all())
+            count += 1
             if count == wanted:
                 held.enter_context(stack.pop_all())
                 return True

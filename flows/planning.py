@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from scan2sim.flows.recipe import Node, Output
+<<<<<<< HEAD
 from scan2sim.pipeline import libraries
 from scan2sim.pipeline.errors import StepError
+=======
+from scan2sim.pipeline.errors import DamagedError
+>>>>>>> 155724a (Damage to kept results and worlds is noticed and mended; scan2sim verify; names that lead out of their folder are refused)
 from scan2sim.pipeline.store import Manifest, Store, digest, key_of
 
 AGAIN = ("forced", "asked", "follows")
@@ -42,7 +46,7 @@ class Planned:
         """The key by contents: of what it reads, whatever made it.
 
         Raises:
-            StepError: a result that it reads is gone.
+            DamagedError: a result that it reads is gone.
         """
         contents = dict(self.keys)
         for name, source in self.node.inputs.items():
@@ -62,7 +66,7 @@ class Planned:
         """Where the files are that it reads.
 
         Raises:
-            StepError: a result that it reads is gone.
+            DamagedError: a result that it reads is gone.
         """
         paths = {}
         for name, source in self.node.inputs.items():
@@ -73,12 +77,22 @@ class Planned:
                 paths[name] = store.source(source)
         return paths
 
+    def check(self, store: Store) -> None:
+        """See that what it reads is as it was made; what this run has made isn't read for it.
+
+        Raises:
+            DamagedError: naming the node whose result is to be made anew.
+        """
+        for name, source in self.node.inputs.items():
+            if isinstance(source, Output) and not store.intact(source.node, self._key(name)):
+                raise DamagedError(source.node)
+
     def _key(self, name: str) -> str:
         return self.keys[name].split("/")[0]
 
     def _found(self, manifest: Manifest | None, source: Output) -> Manifest:
         if manifest is None:
-            raise StepError(source.node, "its result has gone in the meantime", "Run again: it is rebuilt")
+            raise DamagedError(source.node, "its result has gone in the meantime")
         return manifest
 
 
@@ -122,6 +136,7 @@ def plan(
     return list(planned.values())
 
 
+<<<<<<< HEAD
 def check(planned: Sequence[Planned]) -> None:
     """Refuse at once a plan with steps that can't run on this machine, where a library or a package is missing.
 
@@ -134,6 +149,15 @@ def check(planned: Sequence[Planned]) -> None:
         libraries.check()
     for node in missing:
         node.step.check(node.params)
+=======
+def drop_damaged(planned: Sequence[Planned], store: Store, labels: Collection[str]) -> bool:
+    """Remove those results of these nodes that are kept, and not as they were made; whether there were any."""
+    kept = [item for item in planned if item.reason is None and item.node.label in labels]
+    damaged = [item for item in kept if not store.intact(item.node.label, item.key)]
+    for item in damaged:
+        store.discard(item.node.label, item.key)
+    return bool(damaged)
+>>>>>>> 155724a (Damage to kept results and worlds is noticed and mended; scan2sim verify; names that lead out of their folder are refused)
 
 
 def _reason(node: Node, key: str, store: Store) -> str | None:

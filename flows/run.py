@@ -15,8 +15,13 @@ from rich.markup import escape
 from scan2sim.flows import gazebo
 from scan2sim.flows.display import RunDisplay, console
 from scan2sim.flows.execute import Event, Executor, execute, locked, versions
+<<<<<<< HEAD
 from scan2sim.flows.planning import Planned, check, plan
 from scan2sim.flows.publish import publish
+=======
+from scan2sim.flows.planning import Planned, drop_damaged, plan
+from scan2sim.flows.publish import publish, to_read
+>>>>>>> 155724a (Damage to kept results and worlds is noticed and mended; scan2sim verify; names that lead out of their folder are refused)
 from scan2sim.flows.recipe import Node, recipe
 from scan2sim.flows.report import write_report
 from scan2sim.flows.settings import Settings
@@ -53,6 +58,8 @@ def run_tile(
     tile = read_tile(path)
     with locked(out):
         planned, store = _plan(tile, out, settings, force, start)
+        if drop_damaged(planned, store, to_read(store, planned, out)):
+            planned, store = _plan(tile, out, settings, force, start)
         log = Log(out / "run.log")
         log.write(f"tile {tile.path}, settings {json.dumps(settings.values)}, versions {json.dumps(versions())}")
         missing = sum(p.reason is not None for p in planned)
@@ -61,11 +68,17 @@ def run_tile(
             done = run(planned, store, failures) if run else execute_shown(planned, store, log, jobs)
             for error in failures.values():
                 raise error
-            publish(store, planned, done, out, tile, settings)
+            changed = publish(store, planned, done, out, tile, settings)
             report = write_report(tile, planned, done, store, out, seconds=time.perf_counter() - began)
         store.sweep({p.node.label: p.key for p in planned})
     show_warnings(done)
+<<<<<<< HEAD
     show_results(out / "world" / f"{tile.name}.sdf", report)
+=======
+    for warning in changed:
+        console.print(f"[yellow]warning:[/] {escape(warning)}", highlight=False, soft_wrap=True)
+    console.print(f"World:  {out / 'world'}\nReport: {report}", highlight=False, soft_wrap=True, markup=False)
+>>>>>>> 155724a (Damage to kept results and worlds is noticed and mended; scan2sim verify; names that lead out of their folder are refused)
     if missing == 0:
         console.print(
             f"[dim]nothing to do: all is as the tile and the settings say ({time.perf_counter() - began:.1f} s)"
@@ -87,7 +100,7 @@ def execute_shown(
         def watch(node: Node, event: Event, fraction: float, message: str) -> None:
             display.watch(node, event, fraction, message)
             if event != "progress":
-                log.write(f"{node.label}: {event}")
+                log.write(f"{node.label}: {event}{': ' if message else ''}{message}")
 
         jobs = jobs or default_jobs()
         done = execute(planned, store, jobs=jobs, watch=watch, failures=failures, memory=memory)

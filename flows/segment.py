@@ -9,7 +9,7 @@ import numpy as np
 
 from scan2sim.flows.display import console, progress
 from scan2sim.flows.execute import locked
-from scan2sim.flows.planning import plan
+from scan2sim.flows.planning import drop_damaged, plan
 from scan2sim.flows.recipe import Node, Output, recipe
 from scan2sim.flows.run import STORE, Log, execute_shown, show_warnings
 from scan2sim.flows.settings import Settings
@@ -39,6 +39,8 @@ def segment_tile(path: Path, out: Path, settings: Settings) -> None:
         store = Store(out / STORE)
         nodes = up_to("segment", recipe(tile, settings))
         planned = plan(nodes, store)
+        if drop_damaged(planned, store, {"ingest", "views", "label", "segment"}):
+            planned = plan(nodes, store)
         log = Log(out / "run.log")
         log.write(f"segment {tile.path}, settings {json.dumps(settings.values)}")
         with log.errors(out):

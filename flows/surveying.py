@@ -12,10 +12,11 @@ from rich.markup import escape
 
 from scan2sim.flows.display import console, progress
 from scan2sim.flows.execute import Executor, limit_cores, locked, versions
-from scan2sim.flows.finish import Made, finish
+from scan2sim.flows.finish import TILES, Made, finish, is_finished
 from scan2sim.flows.memory import parse
-from scan2sim.flows.planning import Planned, plan
+from scan2sim.flows.planning import Planned, drop_damaged, plan
 from scan2sim.flows.prepare import survey_of
+from scan2sim.flows.publish import to_read
 from scan2sim.flows.recipe import survey_recipe
 from scan2sim.flows.run import STORE, Log, default_jobs, execute_shown, show_results
 from scan2sim.flows.settings import Settings
@@ -89,7 +90,7 @@ def make_survey(place: str | Path, target: str | Path, settings: Settings, run: 
         log.write(f"survey {survey.path}, settings {json.dumps(settings.values)}, versions {json.dumps(versions())}")
         store = _store(place, target)
         digests = Digests(store.root / "digests.json")
-        made = _make(survey, settings, store, run, digests)
+        made = _make(survey, settings, store, run, digests, out)
         report = finish(survey, made, store, out, settings, digests)
         digests.save()
         failed = [one for one in made if one.error is not None]
@@ -136,12 +137,17 @@ def plan_survey(
     return plan(survey_recipe(list(tiles.values()), settings), store, digest=digest)
 
 
-def _make(survey: Survey, settings: Settings, store: Store, run: Executor, digests: Digests) -> list[Made]:
+def _make(survey: Survey, settings: Settings, store: Store, run: Executor, digests: Digests, out: Path) -> list[Made]:
     """Run all tiles; without those that fail, until none does."""
     tiles, failed = read_tiles(survey)
     unread = set(failed)
     ran: dict[tuple[str, str], str] = {}  # why, of what an earlier round of this run has made
     before: dict[str, set[str]] = {}  # what there was, of all that is run
+    first = plan_survey(tiles, store, settings, digests)
+    for name in tiles:
+        own = _own(name, first)
+        if not is_finished(store.within(name), own, out / TILES / name):
+            drop_damaged(own, store.within(name), to_read(store.within(name), own, out / TILES / name))
     while True:
         planned = plan_survey(tiles, store, settings, digests)
         planned = [replace(item, reason=item.reason or ran.get((item.node.label, item.key))) for item in planned]
@@ -171,16 +177,19 @@ def _of_tile(
     name: str, planned: Sequence[Planned], done: Mapping[str, Manifest], before: Mapping[str, set[str]]
 ) -> tuple[tuple[Planned, ...], dict[str, Manifest], bool]:
     """A tile's own nodes and results, without its name before their labels; whether any isn't as `before`."""
-    own = [item for item in planned if item.node.label.startswith(f"{name}/")]
-
-    def bare(label: str) -> str:
-        return label.removeprefix(f"{name}/")
-
+    own = _own(name, planned)
+    labels = {f"{name}/{item.node.label}" for item in own}
     return (
-        tuple(replace(item, node=replace(item.node, label=bare(item.node.label))) for item in own),
-        {bare(item.node.label): done[item.node.label] for item in own},
-        any(done[label].content not in before[label] for label in before.keys() & {item.node.label for item in own}),
+        tuple(own),
+        {item.node.label: done[f"{name}/{item.node.label}"] for item in own},
+        any(done[label].content not in before[label] for label in before.keys() & labels),
     )
+
+
+def _own(name: str, planned: Sequence[Planned]) -> list[Planned]:
+    """A tile's nodes, without its name before their labels."""
+    mine = [item for item in planned if item.node.label.startswith(f"{name}/")]
+    return [replace(item, node=replace(item.node, label=item.node.label.removeprefix(f"{name}/"))) for item in mine]
 
 
 def changes(place: str | Path, target: str | Path, settings: Settings) -> dict[str, str]:

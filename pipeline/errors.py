@@ -9,6 +9,8 @@ from __future__ import annotations
 import errno
 from pathlib import Path
 
+REBUILT = "Run again: it is rebuilt, and nothing else"
+
 
 class ScanError(Exception):
     """An error that the user can act on.
@@ -43,6 +45,13 @@ class DataError(ScanError):
 
 class StepError(ScanError):
     """A step that failed, its retry and its fallback included."""
+
+
+class DamagedError(StepError):
+    """A kept result whose bytes aren't as they were made; `where` is the label of its node, which is run again."""
+
+    def __init__(self, where: str | Path, cause: str = "its kept result is damaged", remedy: str = REBUILT) -> None:
+        super().__init__(where, cause, remedy)
 
 
 class SpaceError(ScanError):

@@ -6,7 +6,11 @@ ROOT/poisson.terrain/3f9a.../manifest.json   what was run, on what, how long, wi
 ```
 A result is written to a temporary folder and moved into place, so that a killed run leaves nothing
 half-made. A result counts as present while all its files are there with the sizes that the
-manifest gives; a deleted output is rebuilt, and nothing that depends on it (same key, same bytes).
+manifest gives, and none has changed since that was written; one that has is digested, and counts if its bytes are the
+same (it was copied, say). All bytes are digested before a step reads a result that its run hasn't made (`intact`). What
+is deleted or damaged is rebuilt, and nothing that depends on it (same key, same bytes).
+
+A manifest is sealed by its digest, and one that names files outside of its folder is none.
 """
 
 from __future__ import annotations
@@ -17,11 +21,14 @@ import os
 import shutil
 import tempfile
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from stat import S_ISREG
 from typing import Any
 
-from scan2sim.pipeline.errors import from_os_error
+from scan2sim.pipeline.errors import InputError, from_os_error
+from scan2sim.pipeline.inside import inside
 from scan2sim.pipeline.io.remote import Remote
 from scan2sim.pipeline.step import Done, Params, Step
 
@@ -40,6 +47,7 @@ class Manifest:
         content: digest of all output files.
         files: output name to path relative to the result's folder.
         sizes: bytes of every file below it.
+        digests: SHA-256 of each of them.
         facts, warnings: as the step gave them.
         seconds, peak_mb: wall time and peak memory of the step's process and its children.
     """
@@ -52,6 +60,7 @@ class Manifest:
     content: str
     files: dict[str, str]
     sizes: dict[str, int]
+    digests: dict[str, str]
     facts: dict[str, Any]
     warnings: list[str]
     seconds: float
@@ -107,12 +116,38 @@ class Digests:
             raise from_os_error(error, self._file) from None
 
 
-def content_of(folder: Path, files: Mapping[str, int]) -> str:
-    """One digest of files (paths below `folder`); what links lead to counts, not where they lead."""
+def content_of(digests: Mapping[str, str]) -> str:
+    """One digest of all files of a result, by their names and digests."""
     together = hashlib.sha256()
-    for name in sorted(files):
-        together.update(f"{name}\0{digest(folder / name)}\n".encode())
+    for name in sorted(digests):
+        together.update(f"{name}\0{digests[name]}\n".encode())
     return together.hexdigest()
+
+
+def _seal(body: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(body, sort_keys=True).encode()).hexdigest()
+
+
+def read_manifest(path: Path) -> Manifest | None:
+    """The manifest in a file; None where there is none, it isn't as it was written, or names files elsewhere."""
+    try:
+        body = json.loads(path.read_text(encoding="utf-8"))
+        if body.pop("seal") != _seal(body):
+            return None
+        manifest = Manifest(**body)
+        if manifest.sizes.keys() != manifest.digests.keys():
+            return None
+        for name in (*manifest.sizes, *manifest.files.values()):
+            inside(path.parent, name)
+        outputs = [(path.parent / name).resolve() for name in manifest.files.values()]
+        return manifest if all(file.is_relative_to(path.parent.resolve()) for file in outputs) else None
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError, InputError):
+        return None
+
+
+def damaged(folder: Path, manifest: Manifest) -> list[str]:
+    """Names of those of a result's files whose bytes aren't as they were made."""
+    return [name for name, known in manifest.digests.items() if digest(folder / name) != known]
 
 
 def key_of(step: Step, params: Params, inputs: Mapping[str, str]) -> str:
@@ -132,10 +167,13 @@ class Store:
 
     def __init__(self, root: Path, remote: Remote | None = None, sources: Remote | None = None) -> None:
         self.root, self.remote, self.sources = root, remote, sources
+        self._sound: set[Path] = set()  # folders of results that this run has made, or digested
 
     def within(self, name: str) -> Store:
         """The store of the labels that begin with `name/`."""
-        return Store(self.root / name, self.remote and self.remote.below(name), self.sources)
+        store = Store(self.root / name, self.remote and self.remote.below(name), self.sources)
+        store._sound = self._sound
+        return store
 
     def folder(self, label: str, key: str) -> Path:
         """Where the result is, or will be."""
@@ -155,6 +193,31 @@ class Store:
             return manifest if self.remote.pull(f"{label}/{key}/{name}" for name in manifest.sizes) else None
         return manifest
 
+    def intact(self, label: str, key: str) -> bool:
+        """Whether a result's files are on this machine, each with the bytes that it was made with."""
+        folder = self.folder(label, key)
+        if folder in self._sound:
+            return True
+        manifest = self.read(label, key)
+        if manifest is not None and self.remote is not None and damaged(folder, manifest):
+            shutil.rmtree(folder, ignore_errors=True)  # what was fetched: the storage has it
+            manifest = self.read(label, key)
+        if manifest is None or damaged(folder, manifest):
+            return False
+        self.trust(label, key)
+        return True
+
+    def trust(self, label: str, key: str) -> None:
+        """The result was made in this run, or found intact: it isn't looked into any more."""
+        self._sound.add(self.folder(label, key))
+
+    def discard(self, label: str, key: str) -> None:
+        """Remove a result that is of no use."""
+        self._sound.discard(self.folder(label, key))
+        if self.remote is not None:
+            self.remote.remove(f"{label}/{key}/manifest.json")
+        shutil.rmtree(self.folder(label, key), ignore_errors=True)
+
     def source(self, path: Path) -> Path:
         """A source file, fetched if it isn't on this machine and it is known where from."""
         if self.sources is not None and not path.exists() and path.is_relative_to(self.sources.local):
@@ -165,15 +228,26 @@ class Store:
         path = self.folder(label, key) / "manifest.json"
         if self.remote is not None and not path.is_file():
             self.remote.pull([f"{label}/{key}/manifest.json"])
-        try:
-            return Manifest(**json.loads(path.read_text(encoding="utf-8")))
-        except (OSError, ValueError, TypeError):
-            return None
+        manifest = read_manifest(path)
+        return manifest if manifest is not None and f"/{manifest.label}".endswith(f"/{label}") else None
 
     def _complete(self, label: str, key: str, manifest: Manifest) -> bool:
         folder = self.folder(label, key)
-        paths = ((folder / name, size) for name, size in manifest.sizes.items())
-        return all(path.is_file() and path.stat().st_size == size for path, size in paths)
+        try:
+            written = newest = (folder / "manifest.json").stat().st_mtime_ns
+            for name, size in manifest.sizes.items():
+                stat = (folder / name).stat()
+                if not S_ISREG(stat.st_mode) or stat.st_size != size:
+                    return False
+                if stat.st_mtime_ns > written and digest(folder / name) != manifest.digests[name]:
+                    return False
+                newest = max(newest, stat.st_mtime_ns)
+        except OSError:
+            return False
+        if newest > written:  # copied, fetched: not to be digested again
+            with suppress(OSError):
+                os.utime(folder / "manifest.json", ns=(newest, newest))
+        return True
 
     def begin(self, label: str) -> Path:
         """A fresh temporary folder to write a result in."""
@@ -192,11 +266,13 @@ class Store:
             about: the manifest's version, params, inputs, fed, seconds and peak_mb.
         """
         sizes = {p.relative_to(folder).as_posix(): p.stat().st_size for p in sorted(folder.rglob("*")) if p.is_file()}
+        digests = {name: digest(folder / name) for name in sizes}
         manifest = Manifest(
             label=label,
-            content=content_of(folder, sizes),
+            content=content_of(digests),
             files={name: path.relative_to(folder).as_posix() for name, path in done.files.items()},
             sizes=sizes,
+            digests=digests,
             facts=done.facts,
             warnings=done.warnings,
             **about,
@@ -233,10 +309,13 @@ class Store:
     def _place(self, manifest: Manifest, key: str, folder: Path) -> None:
         """Write the manifest into a finished folder and move it into place."""
         try:
-            text = json.dumps(asdict(manifest), indent=1)
+            body = asdict(manifest)
+            text = json.dumps(body | {"seal": _seal(body)}, indent=1)
             (folder / "manifest.json").write_text(text, encoding="utf-8")
             place = self.folder(manifest.label, key)
-            if place.exists():
+            if place.is_symlink():
+                place.unlink()
+            elif place.exists():
                 shutil.rmtree(place)
             folder.replace(place)
         except OSError as error:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from scan2sim.pipeline.errors import InputError, UnavailableError
+from scan2sim.pipeline.inside import inside
 from scan2sim.pipeline.step import Report, silent
 
 INDEX, PUSHED = ".remote.json", ".pushed.json"
@@ -56,11 +57,12 @@ class Remote:
         """Fetch files by their names in the folder, each whole or not at all; False if one isn't there.
 
         Raises:
+            InputError: a name that leads out of the folder.
             UnavailableError: the storage can't be reached or read.
         """
         files, root = self._open()
         for name in names:
-            target = self.local / name
+            target = self._path(name)
             target.parent.mkdir(parents=True, exist_ok=True)
             handle, fresh = tempfile.mkstemp(prefix=".fetch-", dir=target.parent)
             os.close(handle)
@@ -79,7 +81,7 @@ class Remote:
         """Bring the likeness up to date: what is new or changed is fetched, what is gone removed; returns it.
 
         Raises:
-            InputError: there is nothing.
+            InputError: there is nothing, or a key leads out of the folder.
             UnavailableError: the storage can't be reached or read.
         """
         files, root = self._open()
@@ -91,13 +93,15 @@ class Remote:
             raise self._unreachable(error) from error
         if not found:
             raise InputError(self.url, "there is nothing", "Check the address; `scan2sim tile --copy` makes a survey")
+        for name in found:
+            self._path(name)
         known: dict[str, str] = json.loads(index.read_text()) if index.is_file() else {}
         new = [name for name, key in found.items() if known.get(name) != key or not (self.local / name).is_file()]
         for i, name in enumerate(new):
             report(i / len(new), name)
             self.pull([name])
         for name in known.keys() - found.keys():
-            (self.local / name).unlink(missing_ok=True)
+            self._path(name).unlink(missing_ok=True)
         self.local.mkdir(parents=True, exist_ok=True)
         index.write_text(json.dumps(found))
         return self.local
@@ -115,6 +119,20 @@ class Remote:
         except Exception as error:
             raise self._unreachable(error) from error
 
+    def remove(self, name: str) -> None:
+        """Take a file out of the storage, if it is there.
+
+        Raises:
+            UnavailableError: as `push`.
+        """
+        files, root = self._open()
+        try:
+            files.rm_file(f"{root}/{name}")
+        except FileNotFoundError:
+            pass
+        except Exception as error:
+            raise self._unreachable(error) from error
+
     def push_all(self, names: Iterable[str]) -> None:
         """Store those of the files that are new or have changed since this was last done from here.
 
@@ -129,6 +147,14 @@ class Remote:
             marks[name] = [stat.st_size, stat.st_mtime_ns]
         self.push(name for name, mark in marks.items() if known.get(name) != mark)
         index.write_text(json.dumps(marks))
+
+    def _path(self, name: str) -> Path:
+        """Where a key's file is on this machine."""
+        try:
+            return inside(self.local, name)
+        except InputError:
+            remedy = "Take that key out of the storage: a survey's keys are plain paths below its folder"
+            raise InputError(f"{self.url}/{name}", "is a key that leads out of its folder", remedy) from None
 
     def _open(self) -> tuple[Any, str]:
         """The file system and the folder's path in it."""

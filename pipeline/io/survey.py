@@ -6,7 +6,7 @@ crs = "EPSG:32633"          # of all tiles
 units = "m"                 # "ft", "us-ft"; only for local coordinates
 length = 100.0              # metres of the path a tile
 buffer = 5.0                # metres that tiles' clouds reach beyond their borders
-tiles = ["my_town_0000", "my_town_0001"]     # folders beside this file, in order along the path; names of their own stand in them
+tiles = ["my_town_0000", "my_town_0001"]     # folders beside this file, in order along the path
 ```
 What of the plane is a tile's own stands in its `tile.toml` under `[cell]`.
 """

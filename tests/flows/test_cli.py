@@ -325,6 +325,47 @@ def _one_line(rest: str) -> str:
     return rest[:end].replace("\n", " ") + rest[end:]
 
 
+def flip(path: Path, *, hide: bool = False) -> None:
+    """Change a byte in the middle of a file, and leave its time as it was if it is to be hidden."""
+    stat, data = path.stat(), bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    if hide:
+        os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+
+
+def test_damage_is_noticed_told_and_mended(street: Path, world: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(world, out, symlinks=True)
+    options = ["run", street, "--out", out, "--hold-out", 4, *SMALL]
+    assert "are as they were made" in good(scan2sim("verify", out))
+    assert "nothing to do" in good(scan2sim(*options))
+
+    (page,) = list((out / "world").rglob("*building*.png"))[:1]
+    (sdf,) = (out / "world").glob("*.sdf")
+    whole = page.read_bytes(), sdf.read_bytes()
+    flip(page)
+    flip(sdf)
+    told = good(scan2sim(*options))
+    assert (page.read_bytes(), sdf.read_bytes()) == whole and f"{sdf.name}~" in " ".join(told.split())
+    assert sdf.with_name(f"{sdf.name}~").read_bytes() != sdf.read_bytes()
+
+    kept = next((out / "steps" / "decimate.terrain").glob("*/mesh.npz"))
+    whole = kept.read_bytes(), page.read_bytes()
+    flip(kept, hide=True)
+    page.unlink()
+    page.write_bytes(whole[1])
+    flip(page, hide=True)
+    result = scan2sim("verify", out)
+    assert result.returncode == 5 and "Traceback" not in result.stderr
+    assert "decimate.terrain" in result.stdout and page.name in result.stdout
+    told = good(scan2sim(*options))
+    assert (kept.read_bytes(), page.read_bytes()) == whole
+    assert [line.split()[1] for line in told.splitlines() if line.startswith("✓")] == ["decimate.terrain"]
+    good(scan2sim("verify", out))
+    bad(scan2sim("verify", tmp_path), 3, "holds no results")
+
+
 def test_bad_input_leaves_earlier_results(street: Path, world: Path, tmp_path: Path) -> None:
     shutil.copytree(world, tmp_path / "out", symlinks=True)
     shutil.copytree(street, tmp_path / "tile")

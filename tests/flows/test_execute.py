@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -15,7 +17,7 @@ import pytest
 from scan2sim.flows.execute import execute, locked
 from scan2sim.flows.planning import plan
 from scan2sim.pipeline.errors import BusyError, DataError, StepError
-from scan2sim.pipeline.store import Digests, Manifest, Store, digest
+from scan2sim.pipeline.store import Digests, Manifest, Store, _seal, digest
 from tests.conftest import ROOT
 from tests.flows.toy import chain
 
@@ -117,6 +119,70 @@ def test_a_deleted_output_is_rebuilt_and_nothing_else(run: Run, ran: Callable[[]
     assert ran() == "b"
 
 
+def number(tmp_path: Path, name: str) -> Path:
+    return next((tmp_path / "store" / name).rglob("number.txt"))
+
+
+def test_a_changed_output_is_redone_and_nothing_else(run: Run, ran: Callable[[], str], tmp_path: Path) -> None:
+    run()
+    ran()
+    number(tmp_path, "b").write_text("7")  # as many bytes
+    assert run()["d"].facts == {"total": 2}
+    assert ran() == "b" and number(tmp_path, "b").read_text() == "1"
+
+
+def test_damage_that_leaves_no_trace_is_found_when_it_is_read(run: Run, ran: Callable[[], str], tmp_path: Path) -> None:
+    run()
+    ran()
+    damaged = number(tmp_path, "a")
+    stat = damaged.stat()
+    damaged.write_text("7")
+    os.utime(damaged, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+    run()
+    assert ran() == "", "what isn't read is looked at, not into"
+    assert run(c={"value": 5})["d"].facts == {"total": 7}
+    assert ran() == "acd" and number(tmp_path, "a").read_text() == "1"
+
+
+def test_a_store_that_was_copied_is_as_good(run: Run, ran: Callable[[], str], tmp_path: Path) -> None:
+    run()
+    ran()
+    shutil.copytree(tmp_path / "store", tmp_path / "copy", copy_function=shutil.copyfile)
+    for file in (tmp_path / "copy").rglob("number.txt"):
+        os.utime(file)
+    shutil.rmtree(tmp_path / "store")
+    (tmp_path / "copy").rename(tmp_path / "store")
+    run()
+    assert ran() == ""
+
+
+def test_a_manifest_that_is_damaged_is_none(run: Run, ran: Callable[[], str], tmp_path: Path) -> None:
+    run()
+    ran()
+    path = number(tmp_path, "d").with_name("manifest.json")
+    path.write_text(path.read_text().replace('"total": 2', '"total": 3'))
+    assert run()["d"].facts == {"total": 2}
+    assert ran() == "d"
+
+
+@pytest.mark.parametrize("name", ["/etc/hostname", "../../../secret.txt", "link/secret.txt", "link.txt", "a\0b"])
+def test_a_manifest_that_leads_elsewhere_is_refused(
+    run: Run, ran: Callable[[], str], tmp_path: Path, name: str
+) -> None:
+    run()
+    ran()
+    (tmp_path / "secret.txt").write_text("1")
+    folder = number(tmp_path, "a").parent
+    (folder / "link").symlink_to(tmp_path)
+    (folder / "link.txt").symlink_to(tmp_path / "secret.txt")
+    body = json.loads((folder / "manifest.json").read_text())
+    del body["seal"]
+    body["files"] = {"number": name}
+    (folder / "manifest.json").write_text(json.dumps(body | {"seal": _seal(body)}))
+    run(b={"value": 3})
+    assert ran() == "abd"
+
+
 def test_from_a_step_reruns_it_and_what_follows(run: Run, ran: Callable[[], str]) -> None:
     run()
     ran()
@@ -162,7 +228,7 @@ def test_two_runs_do_not_share_a_folder(tmp_path: Path) -> None:
 
 def test_kill_9_leaves_nothing_half_made_and_no_process_behind(tmp_path: Path, source: Path, run: Run) -> None:
     script = (
-        "from pathlib import Path; from flows.execute import *; from flows.planning import plan\n"
+        "from pathlib import Path; from scan2sim.flows.execute import *; from scan2sim.flows.planning import plan\n"
         "from tests.flows.toy import chain\n"
         f"p = Path({str(tmp_path)!r}); s = Store(p / 'store')\n"
         "execute(plan(chain(p / 'source.txt', p / 'log', b={'does': 'hang'}), s), s, jobs=1, watch=lambda *_: None)\n"

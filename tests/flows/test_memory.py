@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -14,7 +15,7 @@ import pytest
 from scan2sim.flows.execute import execute
 from scan2sim.flows.memory import parse, share
 from scan2sim.flows.planning import plan
-from scan2sim.pipeline.errors import SettingError
+from scan2sim.pipeline.errors import ScanError, SettingError
 from scan2sim.pipeline.store import Store
 from tests.conftest import ROOT
 from tests.flows.toy import chain
@@ -27,7 +28,7 @@ def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_amounts() -> None:
     assert parse("20GB") == 20 and parse("800 MB") == 0.8 and parse("1.5") == 1.5 and parse(None) is None
-    for wrong in ("lots", "0GB", "-3"):
+    for wrong in ("lots", "0GB", "-3", "nan", "inf", "1e300GB", "9" * 400, "99999999999GB"):
         with pytest.raises(SettingError, match="no amount"):
             parse(wrong)
 
@@ -63,7 +64,7 @@ def test_more_than_there_is_runs_alone() -> None:
 def test_a_killed_process_gives_its_share_back(tmp_path: Path) -> None:
     script = (
         f"import tempfile, time; tempfile.tempdir = {str(tmp_path)!r}\n"
-        "from flows.memory import share\nwith share(1.0, 1.0): print('held', flush=True); time.sleep(60)"
+        "from scan2sim.flows.memory import share\nwith share(1.0, 1.0): print('held', flush=True); time.sleep(60)"
     )
     child = subprocess.Popen([sys.executable, "-c", script], cwd=ROOT, stdout=subprocess.PIPE)
     assert child.stdout and child.stdout.readline()
@@ -71,6 +72,34 @@ def test_a_killed_process_gives_its_share_back(tmp_path: Path) -> None:
     child.wait()
     with share(1.0, 1.0):
         pass
+
+
+@pytest.mark.parametrize("planted", ["folder", "queue", "00000", "file", "another user's"])
+def test_nothing_that_others_plant_is_followed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, planted: str) -> None:
+    victim, folder = tmp_path / "victim", tmp_path / f"scan2sim-memory-{os.getuid()}"
+    (victim / "below").mkdir(parents=True)
+    (victim / "kept.txt").write_text("precious")
+    if planted == "folder":
+        folder.symlink_to(victim / "below")
+    elif planted == "file":
+        folder.write_text("precious")
+    else:
+        folder.mkdir()
+        if planted == "another user's":
+            uid = os.getuid()
+            monkeypatch.setattr(os, "getuid", lambda: uid + 1)
+            folder.rename(tmp_path / f"scan2sim-memory-{uid + 1}")
+        else:
+            (folder / planted).symlink_to(victim / "kept.txt")
+    with pytest.raises(ScanError, match="scan2sim-memory|queue|00000"), share(1.0, 0.25):
+        pass
+    assert (victim / "kept.txt").read_text() == "precious" and not list((victim / "below").iterdir())
+
+
+def test_the_queue_is_its_users_alone(tmp_path: Path) -> None:
+    with share(1.0, 0.25):
+        (folder,) = tmp_path.glob("scan2sim-memory-*")
+        assert folder.stat().st_mode & 0o777 == 0o700
 
 
 def test_steps_that_do_not_fit_together_run_one_after_the_other(

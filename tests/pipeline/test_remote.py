@@ -88,6 +88,43 @@ def test_a_source_that_is_not_here_is_fetched(s3: str, tmp_path: Path) -> None:
     assert store.source(second.local / "cloud.laz").read_text() == "points"
 
 
+def test_what_was_damaged_here_is_fetched_again_and_there_is_made_anew(s3: str, tmp_path: Path) -> None:
+    (tmp_path / "source.txt").write_text("1")
+    log, remote = tmp_path / "log", Remote(f"{s3}/damaged", tmp_path / "here")
+
+    def machine(**changes: dict[str, object]) -> list[str]:
+        store = Store(tmp_path / "here", remote)
+        log.unlink(missing_ok=True)
+        execute(plan(chain(tmp_path / "source.txt", log, **changes), store), store, jobs=1, watch=lambda *_: None)
+        return sorted(log.read_text().split())
+
+    assert machine() == ["a", "b", "c", "d"]
+    (number,) = (tmp_path / "here" / "a").rglob("number.txt")
+    number.write_text("7")
+    assert machine(b={"value": 5}) == ["b", "d"] and number.read_text() == "1"
+    number.write_text("7")
+    remote.push([number.relative_to(remote.local).as_posix()])
+    assert machine(b={"value": 6}) == ["a", "b", "d"] and number.read_text() == "1"
+
+
+def test_a_key_that_leads_out_of_its_folder_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """S3 allows such keys; fsspec's memory is a storage that does, too."""
+    files = pytest.importorskip("fsspec").filesystem("memory")
+    here = Remote("memory://survey", tmp_path / "cache" / "here")
+    files.pipe_file("/survey/tile.toml", b"a tile")
+    assert (here.pull_all() / "tile.toml").read_bytes() == b"a tile"
+    for key in ("../escaped.txt", "a/../../../escaped.txt", "/etc/escaped.txt", "link/escaped.txt"):
+        monkeypatch.setattr(type(files), "find", lambda *_, key=key: [f"/survey/{key}"])
+        files.store[f"/survey/{key}"] = files.store["/survey/tile.toml"]
+        if "link" in key:
+            (here.local / "link").symlink_to(tmp_path)
+        with pytest.raises(InputError, match="leads out of its folder"):
+            here.pull_all()
+        with pytest.raises(InputError, match="leads out of its folder"):
+            here.pull([key])
+    assert not list(tmp_path.rglob("escaped.txt")) and not Path("/etc/escaped.txt").exists()
+
+
 def test_what_is_not_there_or_can_not_be_read_is_told(s3: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="there is nothing"):
         Remote(f"{s3}/nothing", tmp_path).pull_all()

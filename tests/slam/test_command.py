@@ -108,7 +108,7 @@ def damages(path):
     foreign = io.BytesIO()
     np.savez(foreign, tree=np.frombuffer(b'{"names": {"kind": "Popen", "args": "id"}}', np.uint8), data=np.zeros(3))
     return {
-        "a pickle": pickle.dumps(Trap(trap)), "an array of objects": objects.getvalue(), "of others": foreign.getvalue(),
+        "a pickle": pickle.dumps(Trap(trap)), "objects": objects.getvalue(), "of others": foreign.getvalue(),
         "half": whole[: len(whole) // 2], "empty": b"", "flipped": whole[:999] + bytes([whole[999] ^ 1]) + whole[1000:],
     }  # fmt: skip
 

@@ -1,0 +1,65 @@
+"""`scan2sim verify`: reads every byte of what a run or a survey has made, and says what isn't as it was made."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+from scan2sim.flows.display import console, progress
+from scan2sim.flows.execute import locked
+from scan2sim.flows.finish import TILES
+from scan2sim.flows.run import STORE
+from scan2sim.pipeline.errors import DamagedError, InputError
+from scan2sim.pipeline.store import TEMPORARY, Manifest, damaged, digest, read_manifest
+
+
+def verify(out: Path) -> None:
+    """Digest all kept results and published worlds below a run's or survey's folder, and print what is damaged.
+
+    The next `run` or `survey` makes that anew, and nothing else: a damaged file is marked as changed now, a damaged
+    manifest is one that can't be read.
+
+    Raises:
+        InputError: there are no results.
+        DamagedError: some are damaged.
+        BusyError: a run is at work there.
+    """
+    folders = [path.parent for path in sorted((out / STORE).rglob("manifest.json")) if TEMPORARY not in str(path)]
+    if not folders:
+        raise InputError(out, "holds no results of a run", "Name the folder that was given to run or survey by --out")
+    bad: list[tuple[Path, str]] = []
+    files = 0
+    with locked(out), progress("verify") as report:
+        for i, folder in enumerate(folders):
+            report(i / len(folders), folder.parent.name)
+            manifest = read_manifest(folder / "manifest.json")
+            if manifest is None:
+                bad.append((folder / "manifest.json", "isn't as it was written"))
+                continue
+            files += len(manifest.digests)
+            bad += [(folder / name, "isn't as it was made") for name in damaged(folder, manifest)]
+            if manifest.label.rpartition("/")[2] == "export":
+                bad += _world(out, folder, manifest)
+        for path, _ in bad:
+            with suppress(OSError):
+                os.utime(path, follow_symlinks=False)
+    for path, cause in bad:
+        console.print(f"[red]{path.relative_to(out)}[/] {cause}", highlight=False, soft_wrap=True)
+    if bad:
+        remedy = "Run again: what is damaged is made anew, and nothing else"
+        raise DamagedError(out, f"{len(bad)} of {files} files of {len(folders)} results are damaged", remedy)
+    console.print(f"{files} files of {len(folders)} results, and the worlds made of them, are as they were made")
+
+
+def _world(out: Path, folder: Path, manifest: Manifest) -> Iterator[tuple[Path, str]]:
+    """Files of the world that was published of a result, if it was, that are missing or others."""
+    tile = manifest.label.rpartition("/")[0]
+    world, top = (out / TILES / tile if tile else out) / "world", manifest.files["world"]
+    stamp = world / ".result"
+    if not stamp.is_file() or stamp.read_text(errors="replace") != folder.name:
+        return
+    for name, known in manifest.digests.items():
+        if Path(name).is_relative_to(top) and digest(file := world / Path(name).relative_to(top)) != known:
+            yield file, "isn't as it was published"
