@@ -48,6 +48,11 @@ def progress(title: str) -> Iterator[Report]:
         yield report
 
 
+def warn(text: str) -> None:
+    """Show a warning."""
+    console.print(f"[yellow]warning:[/] {escape(text)}", highlight=False, soft_wrap=True)
+
+
 class RunDisplay:
     """A bar for every step that runs, one for the whole, and a line for each that ends."""
 

@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from scan2sim.flows.display import warn
 from scan2sim.flows.planning import Planned
-from scan2sim.flows.publish import SHOWN, publish, published
+from scan2sim.flows.publish import publish, published, to_read
 from scan2sim.flows.report import figures, write_report
 from scan2sim.flows.settings import Settings
 from scan2sim.flows.survey_report import TileState, write_survey_report
@@ -24,11 +25,6 @@ from scan2sim.pipeline.store import Digests, Manifest, Store
 from scan2sim.pipeline.types import Tile
 
 TILES, PICTURE = "tiles", "picture.jpg"
-<<<<<<< HEAD
-SHOWN = {"export", "rasters", "exposure", "preview", "pictures", "score"}
-"""Steps whose files, not just figures, are shown."""
-=======
->>>>>>> 155724a (Damage to kept results and worlds is noticed and mended; scan2sim verify; names that lead out of their folder are refused)
 
 
 @dataclass(frozen=True)
@@ -76,9 +72,10 @@ def _finish_tile(one: Made, store: Store, out: Path, settings: Settings) -> None
     keys = {item.node.label: item.key for item in planned}
     out.mkdir(parents=True, exist_ok=True)
     if not (one.kept and is_finished(store, planned, out)):
-        for label in keys.keys() & set(SHOWN):
+        for label in keys.keys() & to_read(store, planned, out):
             store.read(label, keys[label])
-        publish(store, planned, done, out, one.tile, settings)
+        for warning in publish(store, planned, done, out, one.tile, settings):
+            warn(warning)
         seconds = sum(done[item.node.label].seconds for item in planned if item.reason is not None)
         shown = store.folder("pictures", keys["pictures"]) / done["pictures"].files["pictures"] / "driver.jpg"
         if shown.is_file():
@@ -87,18 +84,13 @@ def _finish_tile(one: Made, store: Store, out: Path, settings: Settings) -> None
     store.sweep(keys)
 
 
-<<<<<<< HEAD
-def _together(survey: Survey, done: Sequence[Made], out: Path, digests: Digests) -> None:
-    """The world of all tiles, the STAC catalogue, the virtual point cloud and rasters."""
-=======
 def is_finished(store: Store, planned: Sequence[Planned], out: Path) -> bool:
     """Whether a tile's folder shows its kept results already."""
     return (out / "report.json").is_file() and (out / "report.html").is_file() and published(store, planned, out)
 
 
-def _together(survey: Survey, whole: Sequence[Made], out: Path, digests: Digests) -> None:
-    """The world of all tiles, the STAC catalogue and the virtual point cloud."""
->>>>>>> 155724a (Damage to kept results and worlds is noticed and mended; scan2sim verify; names that lead out of their folder are refused)
+def _together(survey: Survey, done: Sequence[Made], out: Path, digests: Digests) -> None:
+    """The world of all tiles, the STAC catalogue, the virtual point cloud and rasters."""
     tiles, items = [], []
     for one in done:
         assert one.tile is not None

@@ -7,12 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from scan2sim.flows.recipe import Node, Output
-<<<<<<< HEAD
 from scan2sim.pipeline import libraries
-from scan2sim.pipeline.errors import StepError
-=======
 from scan2sim.pipeline.errors import DamagedError
->>>>>>> 155724a (Damage to kept results and worlds is noticed and mended; scan2sim verify; names that lead out of their folder are refused)
 from scan2sim.pipeline.store import Manifest, Store, digest, key_of
 
 AGAIN = ("forced", "asked", "follows")
@@ -136,7 +132,6 @@ def plan(
     return list(planned.values())
 
 
-<<<<<<< HEAD
 def check(planned: Sequence[Planned]) -> None:
     """Refuse at once a plan with steps that can't run on this machine, where a library or a package is missing.
 
@@ -149,7 +144,8 @@ def check(planned: Sequence[Planned]) -> None:
         libraries.check()
     for node in missing:
         node.step.check(node.params)
-=======
+
+
 def drop_damaged(planned: Sequence[Planned], store: Store, labels: Collection[str]) -> bool:
     """Remove those results of these nodes that are kept, and not as they were made; whether there were any."""
     kept = [item for item in planned if item.reason is None and item.node.label in labels]
@@ -157,7 +153,6 @@ def drop_damaged(planned: Sequence[Planned], store: Store, labels: Collection[st
     for item in damaged:
         store.discard(item.node.label, item.key)
     return bool(damaged)
->>>>>>> 155724a (Damage to kept results and worlds is noticed and mended; scan2sim verify; names that lead out of their folder are refused)
 
 
 def _reason(node: Node, key: str, store: Store) -> str | None:

@@ -10,18 +10,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from rich.markup import escape
-
 from scan2sim.flows import gazebo
-from scan2sim.flows.display import RunDisplay, console
+from scan2sim.flows.display import RunDisplay, console, warn
 from scan2sim.flows.execute import Event, Executor, execute, locked, versions
-<<<<<<< HEAD
-from scan2sim.flows.planning import Planned, check, plan
-from scan2sim.flows.publish import publish
-=======
-from scan2sim.flows.planning import Planned, drop_damaged, plan
+from scan2sim.flows.planning import Planned, check, drop_damaged, plan
 from scan2sim.flows.publish import publish, to_read
->>>>>>> 155724a (Damage to kept results and worlds is noticed and mended; scan2sim verify; names that lead out of their folder are refused)
 from scan2sim.flows.recipe import Node, recipe
 from scan2sim.flows.report import write_report
 from scan2sim.flows.settings import Settings
@@ -72,13 +65,9 @@ def run_tile(
             report = write_report(tile, planned, done, store, out, seconds=time.perf_counter() - began)
         store.sweep({p.node.label: p.key for p in planned})
     show_warnings(done)
-<<<<<<< HEAD
-    show_results(out / "world" / f"{tile.name}.sdf", report)
-=======
     for warning in changed:
-        console.print(f"[yellow]warning:[/] {escape(warning)}", highlight=False, soft_wrap=True)
-    console.print(f"World:  {out / 'world'}\nReport: {report}", highlight=False, soft_wrap=True, markup=False)
->>>>>>> 155724a (Damage to kept results and worlds is noticed and mended; scan2sim verify; names that lead out of their folder are refused)
+        warn(warning)
+    show_results(out / "world" / f"{tile.name}.sdf", report)
     if missing == 0:
         console.print(
             f"[dim]nothing to do: all is as the tile and the settings say ({time.perf_counter() - began:.1f} s)"
@@ -121,7 +110,7 @@ def show_warnings(done: dict[str, Manifest]) -> None:
     """What the steps warned of, on the screen."""
     for label, manifest in done.items():
         for warning in manifest.warnings:
-            console.print(f"[yellow]warning:[/] {label}: {escape(warning)}", highlight=False, soft_wrap=True)
+            warn(f"{label}: {warning}")
 
 
 def show_plan(path: Path, out: Path, settings: Settings, *, force: bool = False, start: str | None = None) -> None:

@@ -8,9 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from rich.markup import escape
-
-from scan2sim.flows.display import console, progress
+from scan2sim.flows.display import console, progress, warn
 from scan2sim.flows.execute import Executor, limit_cores, locked, versions
 from scan2sim.flows.finish import TILES, Made, finish, is_finished
 from scan2sim.flows.memory import parse
@@ -111,11 +109,6 @@ def make_survey(place: str | Path, target: str | Path, settings: Settings, run: 
             "Mend what the report names and run again: what is finished is kept",
         )
     return report
-
-
-def warn(text: str) -> None:
-    """Show a warning."""
-    console.print(f"[yellow]warning:[/] {escape(text)}", highlight=False, soft_wrap=True)
 
 
 def read_tiles(survey: Survey) -> tuple[dict[str, Tile], dict[str, ScanError]]:

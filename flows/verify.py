@@ -10,8 +10,10 @@ from pathlib import Path
 from scan2sim.flows.display import console, progress
 from scan2sim.flows.execute import locked
 from scan2sim.flows.finish import TILES
+from scan2sim.flows.publish import PLACES
 from scan2sim.flows.run import STORE
 from scan2sim.pipeline.errors import DamagedError, InputError
+from scan2sim.pipeline.io.worlds import STAMP
 from scan2sim.pipeline.store import TEMPORARY, Manifest, damaged, digest, read_manifest
 
 
@@ -40,8 +42,7 @@ def verify(out: Path) -> None:
                 continue
             files += len(manifest.digests)
             bad += [(folder / name, "isn't as it was made") for name in damaged(folder, manifest)]
-            if manifest.label.rpartition("/")[2] == "export":
-                bad += _world(out, folder, manifest)
+            bad += _published(out, folder, manifest)
         for path, _ in bad:
             with suppress(OSError):
                 os.utime(path, follow_symlinks=False)
@@ -53,13 +54,16 @@ def verify(out: Path) -> None:
     console.print(f"{files} files of {len(folders)} results, and the worlds made of them, are as they were made")
 
 
-def _world(out: Path, folder: Path, manifest: Manifest) -> Iterator[tuple[Path, str]]:
-    """Files of the world that was published of a result, if it was, that are missing or others."""
-    tile = manifest.label.rpartition("/")[0]
-    world, top = (out / TILES / tile if tile else out) / "world", manifest.files["world"]
-    stamp = world / ".result"
-    if not stamp.is_file() or stamp.read_text(errors="replace") != folder.name:
+def _published(out: Path, folder: Path, manifest: Manifest) -> Iterator[tuple[Path, str]]:
+    """Files that were published of a result, if any were, and are missing or others."""
+    tile, _, label = manifest.label.rpartition("/")
+    output, place = PLACES.get(label, ("", ""))
+    shown = (out / TILES / tile if tile else out) / place
+    if output not in manifest.files or not (shown / STAMP).is_file():
         return
+    if (shown / STAMP).read_text(errors="replace") != folder.name:
+        return  # of another result
     for name, known in manifest.digests.items():
-        if Path(name).is_relative_to(top) and digest(file := world / Path(name).relative_to(top)) != known:
+        below = Path(name).is_relative_to(manifest.files[output])
+        if below and digest(file := shown / Path(name).relative_to(manifest.files[output])) != known:
             yield file, "isn't as it was published"
