@@ -37,11 +37,9 @@ def wheels(project: Path, extra: str | None) -> dict[str, float]:
     plain |= {"PIP_CONFIG_FILE": os.devnull}
     with tempfile.TemporaryDirectory() as folder:
         subprocess.run([sys.executable, "-m", "venv", f"{folder}/venv"], check=True)
-        subprocess.run(
-            [f"{folder}/venv/bin/python", "-m", "pip", "download", "--quiet", "--disable-pip-version-check",
-             "-c", str(project / "constraints.txt"), "-d", f"{folder}/wheels", f"{project}[{extra}]" if extra else project],
-            env=plain, check=True,
-        )  # fmt: skip
+        pip = [f"{folder}/venv/bin/python", "-m", "pip", "download", "--quiet", "--disable-pip-version-check"]
+        wanted = ["-c", str(project / "constraints.txt"), f"{project}[{extra}]" if extra else str(project)]
+        subprocess.run([*pip, "-d", f"{folder}/wheels", *wanted], env=plain, check=True)
         files = [path for path in Path(folder, "wheels").iterdir() if not path.name.startswith("scan2sim")]
         sizes = {path.name.split("-")[0]: (path.stat().st_size / 1e6, _unpacked(path) / 1e6) for path in files}
     for name, (down, up) in sorted(sizes.items(), key=lambda item: -item[1][1])[:12]:
