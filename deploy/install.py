@@ -1,8 +1,8 @@
 """Sets up .venv: `make demo` and `make test` call this; the latter with `dev`, for what tests need besides.
 
 What the system lacks is installed where that is allowed (Debian and Ubuntu; root, or a sudo that asks for no
-password), and said before. Elsewhere nothing is touched: the command that installs it is printed. Old Pythons get as far
-as being told so: annotations that they don't know are quoted.
+password), and said before. Elsewhere nothing is touched: the command that installs it is printed. Old Pythons get as
+far as being told so: annotations that they don't know are quoted.
 """
 
 import importlib.util
