@@ -437,6 +437,12 @@ def import_plain_clouds(
     crs: Crs = None,
     units: Annotated[str | None, typer.Option(help="m, ft or us-ft, where the CRS doesn't say.")] = None,
     trajectory: Annotated[Path | None, typer.Option(help="CSV of the scanner's path: time,x,y,z.")] = None,
+    orthophoto: Annotated[
+        Path | None, typer.Option(help="GeoTIFF, or JPEG, PNG with a world file: drapes what it covers.")
+    ] = None,
+    footprints: Annotated[
+        Path | None, typer.Option(help="GeoJSON or GeoPackage of buildings: where walls stand.")
+    ] = None,
     classes: Classes = "",
     name: Name = None,
     link: Link = False,
@@ -451,7 +457,8 @@ def import_plain_clouds(
     with progress("import") as report:
         path = import_las(
             clouds, out, photos=photos, cameras=cameras, images=images, crs=crs, units=units, trajectory=trajectory,
-            classes=parse(classes), name=name, link=link, overwrite=overwrite, warn=told.append, report=report,
+            classes=parse(classes), orthophoto=orthophoto, footprints=footprints, name=name, link=link,
+            overwrite=overwrite, warn=told.append, report=report,
         )  # fmt: skip
     _imported(path, told)
 

@@ -96,6 +96,7 @@ class Corridor:
         spec = read_spec(tile.path)
         if spec.cell:
             raise InputError(tile.path, "was cut from a survey already", "Cut what it was cut from")
+        tile = replace(tile, views=tile.views[: len(spec.photos)])  # the orthophoto is every tile's
         headers = [clouds.read_header(cloud) for cloud in tile.clouds]
         low, high = np.min([h.low for h in headers], axis=0), np.max([h.high for h in headers], axis=0)
         notes = tuple(f"{c.name}: {note}" for c, h in zip(tile.clouds, headers, strict=True) for note in h.notes)
@@ -275,10 +276,16 @@ class _Writer:
             cameras=used,
             photos=[self._photo(i, name) for i in photos],
             trajectory=None if part is None else "trajectory.csv",
+            ortho=self._whole(spec.orthophoto, name),
+            footprints=self._whole(spec.footprints, name),
             cell=self._cell(cell),
             truth={key: self._reference(path, name) for key, path in truth.items() if path},
         )
         self._spool.drop(index)
+
+    def _whole(self, file: str | None, name: str) -> str | None:
+        """What the tile of that name calls a file of the corridor that all tiles share."""
+        return None if file is None else self._reference(self._corridor.tile.path.parent / file, name)
 
     def _cell(self, cell: Cell) -> dict[str, Any]:
         """The `[cell]` entry; its seeds in the CRS are exactly those that the cells are made of."""

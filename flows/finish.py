@@ -77,7 +77,7 @@ def _finish_tile(one: Made, store: Store, out: Path, settings: Settings) -> None
         for warning in publish(store, planned, done, out, one.tile, settings):
             warn(warning)
         seconds = sum(done[item.node.label].seconds for item in planned if item.reason is not None)
-        shown = store.folder("pictures", keys["pictures"]) / done["pictures"].files["pictures"] / "driver.jpg"
+        shown = store.folder("pictures", keys["pictures"]) / done["pictures"].files["pictures"] / "hero.jpg"
         if shown.is_file():
             shutil.copyfile(shown, out / PICTURE)
         write_report(one.tile, planned, done, store, out, seconds=seconds)

@@ -9,6 +9,8 @@ from typing import Any
 
 from scan2sim.flows.settings import Settings
 from scan2sim.pipeline.classes import GROUPS
+from scan2sim.pipeline.errors import UnavailableError
+from scan2sim.pipeline.io import geotiff
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.step import Params, Step
 from scan2sim.pipeline.steps.clip import CLIP
@@ -16,6 +18,7 @@ from scan2sim.pipeline.steps.collision import COLLISION
 from scan2sim.pipeline.steps.decimate import DECIMATE
 from scan2sim.pipeline.steps.export import EXPORT
 from scan2sim.pipeline.steps.geometry import GEOMETRY
+from scan2sim.pipeline.steps.ground import GROUND
 from scan2sim.pipeline.steps.ingest import INGEST
 from scan2sim.pipeline.steps.islands import ISLANDS
 from scan2sim.pipeline.steps.join import JOIN
@@ -31,6 +34,7 @@ from scan2sim.pipeline.steps.trim import TRIM
 from scan2sim.pipeline.steps.views import VIEWS
 from scan2sim.pipeline.steps.visibility import VISIBILITY
 from scan2sim.pipeline.steps.voxel import VOXEL
+from scan2sim.pipeline.steps.walls import WALLS
 from scan2sim.pipeline.types import Tile
 from scan2sim.segmentation.label import LABEL
 from scan2sim.segmentation.segment import SEGMENT
@@ -44,9 +48,9 @@ from scan2sim.texturing.texture import TEXTURE
 from scan2sim.texturing.unwrap import UNWRAP
 
 STEPS: tuple[Step, ...] = (
-    INGEST, PATH, VIEWS, LABEL, SEGMENT, OVERLAP, SPLIT, VOXEL, POISSON, TRIM, ISLANDS, CLIP, JOIN, DECIMATE, PLANTS,
-    UNWRAP, VISIBILITY, EXPOSURE, AGREEMENT, CHOOSE, TEXTURE, LEVEL, COLLISION, EXPORT, RASTERS, GEOMETRY, SCORE,
-    PICTURES, PREVIEW, BORDERS,
+    INGEST, PATH, VIEWS, LABEL, SEGMENT, OVERLAP, SPLIT, VOXEL, GROUND, WALLS, POISSON, TRIM, ISLANDS, CLIP, JOIN,
+    DECIMATE, PLANTS, UNWRAP, VISIBILITY, EXPOSURE, AGREEMENT, CHOOSE, TEXTURE, LEVEL, COLLISION, EXPORT, RASTERS,
+    GEOMETRY, SCORE, PICTURES, PREVIEW, BORDERS,
 )  # fmt: skip
 PER_CLASS: tuple[Step, ...] = (VOXEL, POISSON, TRIM, ISLANDS, CLIP, JOIN, DECIMATE, CHOOSE, UNWRAP, TEXTURE, LEVEL)
 
@@ -110,9 +114,10 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
     masks: dict[str, Path | Output] = {f"mask.{i}": view.mask for i, view in enumerate(tile.views) if view.mask}
     add(VIEWS, photos | masks | whole, poses=tuple(views_io.to_json(view, with_paths=False) for view in tile.views))
     seen: dict[str, Path | Output] = {"views": at("views", "views")}
-    if tile.views:
+    photographed = any(view.camera.model != "orthographic" for view in tile.views)
+    if photographed:
         add(LABEL, whole | seen | _weights(settings), **_kept(settings))
-    add(SEGMENT, whole | scanner | ({**seen, "labels": at("label", "labels")} if tile.views else {}))
+    add(SEGMENT, whole | scanner | ({**seen, "labels": at("label", "labels")} if photographed else {}))
     cloud = at("segment", "cloud")
     cell: dict[str, Any] = {"seed": tile.cell.seed, "neighbours": dict(tile.cell.neighbours)} if tile.cell else {}
     met = [name for name in cell.get("neighbours", {}) if name in (beside or ())]
@@ -127,10 +132,27 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
     groups = [g for g in GROUPS if g != "vegetation" or vegetation != "locations"]
     for part in (*GROUPS, "rest"):
         add(VOXEL, {"cloud": at("split", part)} | scanner, part)
+    made: dict[str, dict[str, Path | Output]] = {}  # by group, what no airborne scanner sees
+    around = {"name": tile.name, "buffer": tile.cell.buffer, **cell} if tile.cell else {}
+    for step, group, parts in (
+        (GROUND, "terrain", (*GROUPS, "rest")),
+        (WALLS, "building", ("building", "terrain")),
+    ):
+        when = settings.params(step).when
+        if when == "always" or (when == "auto" and not path):
+            seen_from_above = {part: at(f"voxel.{part}", "cloud") for part in parts}
+            theirs = {f"{part}.{name}": at(f"voxel.{part}", "cloud", name) for part in parts for name in met}
+            below: dict[str, Path | Output] = {}
+            if step is WALLS:
+                below = {"ground": made["terrain"]["made"]} if "terrain" in made else {}
+                below |= {"footprints": tile.footprints} if tile.footprints else {}
+            add(step, seen_from_above | theirs | below, **around)
+            made[group] = {"made": at(step.name, "made")}
     for group in groups:
         cloud, size = at(f"voxel.{group}", "cloud"), settings.params(VOXEL, group).size
-        add(POISSON, {"cloud": cloud}, group, voxel=size, aligned=bool(cell))
-        add(TRIM, {"mesh": at(f"poisson.{group}", "mesh"), "cloud": cloud}, group, voxel=size)
+        borne = {"cloud": cloud, **made.get(group, {})}
+        add(POISSON, borne, group, voxel=size, aligned=bool(cell))
+        add(TRIM, {"mesh": at(f"poisson.{group}", "mesh"), **borne}, group, voxel=size)
         add(ISLANDS, {"mesh": at(f"trim.{group}", "mesh")}, group)
         surface = at(f"islands.{group}", "mesh")
         if cell:
@@ -144,6 +166,7 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
         add(DECIMATE, {"mesh": surface}, group, keep_border=bool(cell))
     meshes = {f"mesh.{g}": at(f"decimate.{g}", "mesh") for g in groups}
     clouds = {f"cloud.{part}": at(f"voxel.{part}", "cloud") for part in (*GROUPS, "rest")}
+    invented = {f"made.{group}": points["made"] for group, points in made.items()}
     plants: dict[str, Path | Output] = {}
     if vegetation != "mesh":
         add(PLANTS, {name: at(f"voxel.{name}", "cloud") for name in ("vegetation", "terrain")}, **cell)
@@ -163,7 +186,7 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
         by_photo = {**choice, **seen} if settings.params(UNWRAP, group).backend == "photo" else {}
         add(UNWRAP, mesh | by_photo, group)
         unwrapped = {name: at(f"unwrap.{group}", name) for name in ("mesh", "pages")}
-        add(TEXTURE, {**unwrapped, **choice, **clouds, **seen}, group)
+        add(TEXTURE, {**unwrapped, **choice, **clouds, **invented, **seen}, group)
     textured: dict[str, Path | Output] = {g: at(f"texture.{g}", "textured") for g in groups}
     for group in groups if met else ():
         others = {f"neighbour.{name}": at(f"texture.{group}", "textured", name) for name in met}
@@ -177,7 +200,7 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
     truth: dict[str, Path | Output] = {}
     if tile.truth_mesh and tile.truth_points:
         truth = {"truth.mesh": tile.truth_mesh, "truth.points": tile.truth_points}
-    add(GEOMETRY, meshes | clouds | truth, **cell)
+    add(GEOMETRY, meshes | clouds | invented | truth, **cell)
     add(SCORE, textured | {name: seen[name] for name in ("views", "depth")} | truth)
     stages = {f"decimate.{g}": at(f"decimate.{g}", "mesh") for g in groups}
     if met:
@@ -225,20 +248,30 @@ def _kept(settings: Settings) -> dict[str, Any]:
 
 
 def _fineness(settings: Settings) -> dict[str, Any]:
-    """Of rasters: `export` says so."""
+    """Of rasters: `export` says so.
+
+    Raises:
+        UnavailableError: what writes them isn't installed.
+    """
+    if geotiff.missing():
+        raise UnavailableError("rasterio", "isn't installed, and export.rasters needs it", geotiff.REMEDY)
     wanted, texel = settings.params(EXPORT).rasters, settings.params(UNWRAP, "terrain").texel
     return {"pixel": texel if wanted is True else wanted, "texel": texel}
 
 
 def scanner_path(tile: Tile) -> dict[str, Any]:
-    """Parameters of the path: the trajectory, else the cameras; empty where there is neither."""
+    """Parameters of the path: the trajectory, else the cameras; empty where there is neither.
+
+    An orthophoto is taken from no place at all.
+    """
     if tile.trajectory is not None:
         return {"positions": _rows(tile.trajectory.positions), "times": tuple(tile.trajectory.times.tolist())}
-    if not tile.views:
+    views = [view for view in tile.views if view.camera.model != "orthographic"]
+    if not views:
         return {}
-    times = tuple(view.time for view in tile.views)
+    times = tuple(view.time for view in views)
     return {
-        "positions": _rows([view.centre for view in tile.views]),
+        "positions": _rows([view.centre for view in views]),
         "times": times if all(t is not None for t in times) else None,
     }
 

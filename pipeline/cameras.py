@@ -15,13 +15,16 @@ from numba import njit, prange
 
 from scan2sim.pipeline.types import F32, F64, Camera
 
-PINHOLE, OPENCV, FISHEYE, EQUIRECTANGULAR = range(4)
+PINHOLE, OPENCV, FISHEYE, EQUIRECTANGULAR, ORTHOGRAPHIC = range(5)
 MODEL_ID: dict[str, int] = {
     "pinhole": PINHOLE,
     "opencv": OPENCV,
     "fisheye": FISHEYE,
     "equirectangular": EQUIRECTANGULAR,
+    "orthographic": ORTHOGRAPHIC,
 }
+ALIKE = 1000.0
+"""An orthographic camera is rated as a photo of so many pixels' focal length whose pixels are as large."""
 # layout of the parameter array: fx fy cx cy, k1 k2 p1 p2 k3 k4 k5 k6, width height, limit
 _WIDTH, _HEIGHT, _LIMIT = 12, 13, 14
 
@@ -79,6 +82,15 @@ def pixel_rays(camera: Camera) -> F32:
     return _pixel_rays(MODEL_ID[camera.model], parameters(camera), camera.height, camera.width)
 
 
+def ray_origins(camera: Camera, uv: npt.ArrayLike) -> F64:
+    """(N, 3) where the rays through pixels (N, 2) begin, camera axes: the centre, but for an orthographic camera."""
+    uv = np.asarray(uv, np.float64).reshape(-1, 2)
+    origins = np.zeros((len(uv), 3))
+    if camera.model == "orthographic":
+        origins[:, :2] = (uv - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+    return origins
+
+
 def inside(camera: Camera, uv: npt.NDArray[np.floating]) -> npt.NDArray[np.bool_]:
     """(N,) whether pixels (N, 2) lie within the image, its half-pixel border included."""
     u, v = uv[:, 0], uv[:, 1]
@@ -86,7 +98,7 @@ def inside(camera: Camera, uv: npt.NDArray[np.floating]) -> npt.NDArray[np.bool_
 
 
 def pixel_angle(camera: Camera) -> float:
-    """Radians that a pixel spans at the image's centre."""
+    """Radians that a pixel spans at the image's centre; metres, of an orthographic camera."""
     if camera.model == "equirectangular":
         return max(2 * math.pi / camera.width, math.pi / camera.height)
     return 1.0 / min(camera.fx, camera.fy)
@@ -128,6 +140,8 @@ def project_point(model, p, x, y, z):  # type: ignore[no-untyped-def]
         return p[0] * x * scale + p[2], p[1] * y * scale + p[3], True
     if z < 1e-6:
         return 0.0, 0.0, False
+    if model == ORTHOGRAPHIC:
+        return p[0] * x + p[2], p[1] * y + p[3], True
     x, y = x / z, y / z
     if model == OPENCV:
         if x * x + y * y >= p[14] * p[14]:
@@ -143,6 +157,8 @@ def unproject_pixel(model, p, u, v):  # type: ignore[no-untyped-def]
         lon = ((u + 0.5) / p[12] - 0.5) * 2 * math.pi
         lat = ((v + 0.5) / p[13] - 0.5) * math.pi
         return math.cos(lat) * math.sin(lon), math.sin(lat), math.cos(lat) * math.cos(lon)
+    if model == ORTHOGRAPHIC:
+        return 0.0, 0.0, 1.0
     xd, yd = (u - p[2]) / p[0], (v - p[3]) / p[1]
     if model == FISHEYE:
         radius = math.sqrt(xd * xd + yd * yd)

@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from scan2sim.pipeline.cameras import EQUIRECTANGULAR, FISHEYE, project_point
+from scan2sim.pipeline.cameras import EQUIRECTANGULAR, FISHEYE, ORTHOGRAPHIC, project_point
 from scan2sim.pipeline.types import F32, F64
 
 BAND = 32
@@ -35,7 +35,7 @@ def draw_discs(
     )
     boxes = _disc_boxes(discs, model, p)
     start, index = _bands(boxes, depth.shape[0])
-    _fill(depth, rays, discs, boxes, start, index)
+    _fill(depth, rays, discs, boxes, start, index, model, p)
 
 
 @njit(cache=True, parallel=True)
@@ -60,7 +60,9 @@ def _disc_boxes(discs, model, p):  # type: ignore[no-untyped-def]
         if not ok or r < 0.5:
             continue
         angle = discs[i, 2, 0] / r
-        if model == EQUIRECTANGULAR:
+        if model == ORTHOGRAPHIC:
+            du = dv = discs[i, 2, 0] * max(p[0], p[1])
+        elif model == EQUIRECTANGULAR:
             dv = angle * height / math.pi
             du = dv / max(0.1, math.sqrt(x * x + z * z) / r)
         else:
@@ -97,7 +99,7 @@ def _bands(boxes, height):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, parallel=True)
-def _fill(depth, rays, discs, boxes, start, index):  # type: ignore[no-untyped-def]
+def _fill(depth, rays, discs, boxes, start, index, model, p):  # type: ignore[no-untyped-def]
     """Keep in every pixel the least range at which its ray meets a disc."""
     height, width = depth.shape
     for band in prange(len(start) - 1):
@@ -109,19 +111,23 @@ def _fill(depth, rays, discs, boxes, start, index):  # type: ignore[no-untyped-d
                 for column in range(boxes[i, 0], boxes[i, 2] + 1):
                     u = column % width
                     ray = rays[v, u]
-                    t = _meet_disc(ray, s)
+                    x0 = y0 = 0.0  # where the ray begins
+                    if model == ORTHOGRAPHIC:
+                        x0, y0 = (u - p[2]) / p[0], (v - p[3]) / p[1]
+                    t = _meet_disc(ray, s, x0, y0)
                     if 0 < t < depth[v, u]:  # a NaN ray meets nothing
                         depth[v, u] = t
 
 
 @njit(cache=True, inline="always")
-def _meet_disc(d, s):  # type: ignore[no-untyped-def]
-    """Range at which the unit ray d meets the disc s: centre, normal, radius; -1 if it does not."""
+def _meet_disc(d, s, x0, y0):  # type: ignore[no-untyped-def]
+    """Range at which the unit ray d from (x0, y0, 0) meets the disc s: centre, normal, radius; -1 if it does not."""
     along = d[0] * s[1, 0] + d[1] * s[1, 1] + d[2] * s[1, 2]
     if abs(along) < 0.05:  # seen edge-on
         return -1.0
-    t = (s[0, 0] * s[1, 0] + s[0, 1] * s[1, 1] + s[0, 2] * s[1, 2]) / along
-    x, y, z = d[0] * t - s[0, 0], d[1] * t - s[0, 1], d[2] * t - s[0, 2]
+    cx, cy = s[0, 0] - x0, s[0, 1] - y0
+    t = (cx * s[1, 0] + cy * s[1, 1] + s[0, 2] * s[1, 2]) / along
+    x, y, z = d[0] * t - cx, d[1] * t - cy, d[2] * t - s[0, 2]
     return t if x * x + y * y + z * z <= s[2, 0] * s[2, 0] else -1.0
 
 
@@ -132,7 +138,7 @@ def is_visible(depth, model, p, pixel, bias, x, y, z, nx, ny, nz):  # type: igno
     Args:
         depth: (H, W) range image.
         model, p: its camera (`pipeline.cameras`).
-        pixel: radians that a pixel spans.
+        pixel: radians that a pixel spans (`cameras.pixel_angle`).
         bias: metres, see `pipeline.visibility.BIAS`.
         x, y, z: the point, camera axes, metres.
         nx, ny, nz: the surface's unit normal there, camera axes, either side; zero: seen head-on.
@@ -146,6 +152,8 @@ def is_visible(depth, model, p, pixel, bias, x, y, z, nx, ny, nz):  # type: igno
         column %= width
     if column < 0 or row < 0 or column >= width or row >= height:
         return False
+    if model == ORTHOGRAPHIC:
+        return z <= depth[row, column] + bias + SLOPE_SHARE * pixel * slope_of(abs(nz))
     r = math.sqrt(x * x + y * y + z * z)
     slope = 0.0
     if nx != 0 or ny != 0 or nz != 0:

@@ -124,13 +124,13 @@ class Renderer:
                 them that meet one. A simulator filters far textures with mip-maps; one ray a pixel makes them look
                 sharper than they are. All but the colours is of the ray through the pixel's centre.
         """
-        from scan2sim.pipeline.cameras import unproject
+        from scan2sim.pipeline.cameras import ray_origins, unproject
 
         rotation, centre = np.asarray(T_world_cam)[:3, :3], np.asarray(T_world_cam)[:3, 3]
 
         def rays(column: F64, row: F64) -> tuple[F64, F64]:
-            directions = unproject(camera, np.column_stack([column, row])) @ rotation.T
-            return np.broadcast_to(centre, directions.shape), directions
+            uv = np.column_stack([column, row])
+            return centre + ray_origins(camera, uv) @ rotation.T, unproject(camera, uv) @ rotation.T
 
         return self._cast(camera.width, camera.height, rays, background, shaded, wireframe, samples)
 

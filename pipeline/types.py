@@ -22,7 +22,7 @@ F64 = npt.NDArray[np.float64]
 U8 = npt.NDArray[np.uint8]
 I32 = npt.NDArray[np.int32]
 
-CameraModel = Literal["pinhole", "opencv", "fisheye", "equirectangular"]
+CameraModel = Literal["pinhole", "opencv", "fisheye", "equirectangular", "orthographic"]
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,8 @@ class Camera:
     Attributes:
         model: "pinhole"; "opencv" (Brown-Conrady, k1 k2 p1 p2 [k3 [k4 k5 k6]]); "fisheye" (OpenCV's
             equidistant model, k1 k2 k3 k4); "equirectangular" (full sphere; column 0 looks back,
-            the centre looks along +z, the right half along +x; fx, fy, cx, cy unused).
+            the centre looks along +z, the right half along +x; fx, fy, cx, cy unused); "orthographic" (all rays
+            along +z; fx, fy in pixels a metre).
         width, height: pixels.
         fx, fy, cx, cy: pixels; the centre of the top left pixel is (0, 0), as in OpenCV.
         distortion: coefficients as `model` says.
@@ -353,6 +354,7 @@ class Tile:
         trajectory: the scanner's path, or None.
         classes: codes of the clouds and what they are here, where the user says so (`pipeline.classes`).
         cell: what of the survey that it was cut from is the tile's own, or None: all of it.
+        footprints: polygons of buildings (GeoJSON, GeoPackage), or None.
         truth_mesh: ground-truth surface (.npz `Mesh` with `label`), for generated tiles, or None.
         truth_points: ground-truth coloured surface samples (LAZ), for generated tiles, or None.
     """
@@ -365,5 +367,6 @@ class Tile:
     trajectory: Trajectory | None = None
     classes: Mapping[int, int] = field(default_factory=dict)
     cell: Cell | None = None
+    footprints: Path | None = None
     truth_mesh: Path | None = None
     truth_points: Path | None = None

@@ -186,7 +186,7 @@ def depth_map(
         pixels: the camera is scaled to at most this many, and to at most `ENLARGED` times its width.
     """
     from scan2sim.pipeline import range_image
-    from scan2sim.pipeline.cameras import MODEL_ID, parameters, pixel_rays
+    from scan2sim.pipeline.cameras import MODEL_ID, parameters, pixel_rays, ray_origins
 
     camera = camera.scaled(min(ENLARGED, math.sqrt(pixels / (camera.width * camera.height))))
     model, p, rays = MODEL_ID[camera.model], parameters(camera), pixel_rays(camera)
@@ -198,6 +198,10 @@ def depth_map(
             T_world_cam[:3, 3],
             np.nan_to_num(rays) @ T_world_cam[:3, :3].T.astype(np.float32),
         )
+        if camera.model == "orthographic":
+            v, u = np.mgrid[: camera.height, : camera.width]
+            begin = ray_origins(camera, np.column_stack([u.ravel(), v.ravel()])).reshape(*u.shape, 3)
+            cast[..., :3] += begin @ T_world_cam[:3, :3].T
         met = hides.casting.cast_rays(cast)["t_hit"].numpy()
         depth = np.where(np.isfinite(rays[..., 0]), met, np.inf).astype(np.float32)
     since = np.full(len(hides.centres), np.nan) if time is None else time - hides.times

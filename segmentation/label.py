@@ -57,6 +57,8 @@ def label(inputs: Inputs, params: LabelParams, out: Path, report: Report) -> Don
     warnings = []
     for i, view in enumerate(views):
         report(i / len(views), view.name)
+        if view.camera.model == "orthographic":  # networks know streets from the street
+            continue
         rgb = image.read_rgb(view.photo)
         if rgb is None or rgb.shape[:2] != (view.camera.height, view.camera.width):
             warnings.append(f"{view.photo} can't be read or is not of its camera's size: it tells no classes")

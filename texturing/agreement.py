@@ -133,7 +133,8 @@ def agreement(inputs: Inputs, params: AgreementParams, out: Path, report: Report
     folder.mkdir()
     views = views_io.load(inputs["views"])
     held = views_io.load_held_out(inputs["views"])
-    used = [i for i in range(len(views)) if not held[i]]
+    # an orthophoto is put together of many photos: nothing moves in it, and it fits by its georeference or not at all
+    used = [i for i, view in enumerate(views) if not held[i] and view.camera.model != "orthographic"]
     exposures, photos = Exposures.load(inputs["exposures"]), Photos(views)
 
     def depth(i: int) -> DepthMap:

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
-from scan2sim.pipeline.cameras import EQUIRECTANGULAR, project_point
+from scan2sim.pipeline.cameras import ALIKE, EQUIRECTANGULAR, ORTHOGRAPHIC, project_point
 from scan2sim.pipeline.range_image import SLOPE_SHARE, slope_of
 from scan2sim.pipeline.types import F32, F64, I32, U8
 from scan2sim.texturing.photos import OFFSET, Photo
@@ -37,7 +37,7 @@ class Look:
             beside something nearer the photo's own pixels mix both, and its weight falls to `EDGE`.
         reach: pixels of the range image by which `apart` looks around.
         R, t: (3, 3) and (3,), camera from local.
-        pixel: radians a pixel of the range image spans.
+        pixel: radians a pixel of the range image spans (`cameras.pixel_angle`).
         exposure: (5,) of `photos.Exposures.of`.
         warp: (h, w, 2) pixels to be added to where the photo is looked up; (0, 0, 2) for none.
     """
@@ -300,8 +300,9 @@ def accumulate(  # type: ignore[no-untyped-def]
             of what is finer; changed in place.
     """
     height, width = owner.shape
-    wide = model == EQUIRECTANGULAR
+    wide, parallel = model == EQUIRECTANGULAR, model == ORTHOGRAPHIC
     focal = p[12] / (2 * math.pi) if wide else min(p[0], p[1])
+    alike = ALIKE / focal
     factors = (math.exp(exposure[0]), math.exp(exposure[1]), math.exp(exposure[2]))
     coarse_x, coarse_y = low.shape[1] / p[12], low.shape[0] / p[13]
     fine_x, fine_y = depth.shape[1] / p[12], depth.shape[0] / p[13]
@@ -331,9 +332,13 @@ def accumulate(  # type: ignore[no-untyped-def]
                 u, v, ok = project_point(model, p, x, y, z)
                 if not ok or v < -0.5 or v >= p[13] - 0.5 or ((u < -0.5 or u >= p[12] - 0.5) and not wide):
                     continue
-                d2 = x * x + y * y + z * z
-                distance = math.sqrt(d2)
-                cos = -(x * n[0] + y * n[1] + z * n[2]) / distance
+                if parallel:  # how far away it is says nothing of how large its pixels are
+                    d2, distance, far, cos = alike * alike, z, 1.0, -n[2]
+                else:
+                    d2 = x * x + y * y + z * z
+                    distance = math.sqrt(d2)
+                    far = distance
+                    cos = -(x * n[0] + y * n[1] + z * n[2]) / distance
                 if cos < 0.5 * min_cos:  # the face as a whole passed; its far end may be a little flatter
                     continue
                 if not mask_allows(mask, u, v, p):
@@ -341,7 +346,7 @@ def accumulate(  # type: ignore[no-untyped-def]
                 # as `is_visible`, with the projection at hand
                 column = min(max(int((u + 0.5) * fine_x), 0), depth.shape[1] - 1)
                 row = min(max(int((v + 0.5) * fine_y), 0), depth.shape[0] - 1)
-                lean = slope_of(cos) * distance * pixel
+                lean = slope_of(cos) * far * pixel
                 if distance > depth[row, column] + bias + SLOPE_SHARE * lean:
                     continue
                 border = min(v + 0.5, p[13] - 0.5 - v)
@@ -355,7 +360,7 @@ def accumulate(  # type: ignore[no-untyped-def]
                 if warp.shape[0] > 0:
                     u, v = warped(warp, p, u, v, wide)
                 # texels wider than the photo's pixels are sampled from a halved photo
-                ratio = size * focal / distance
+                ratio = size * focal / far
                 level = 0
                 while level + 1 < len(photo) and ratio >= 1.6:
                     ratio *= 0.5

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from scan2sim.pipeline.cameras import EQUIRECTANGULAR, FISHEYE, OPENCV
+from scan2sim.pipeline.cameras import ALIKE, EQUIRECTANGULAR, FISHEYE, OPENCV, ORTHOGRAPHIC
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.range_image import MAX_SLOPE, SLOPE_SHARE
 from scan2sim.texturing.blend import EDGE, WHITE
@@ -84,9 +84,14 @@ class TorchRows:
         tx, ty = (texel % self._shape[1]).double()[:, None], (texel // self._shape[1]).double()[:, None]
         per_x, per_y = self._per_x @ R.T, self._per_y @ R.T
         at = (self._origin @ R.T + t)[f] + tx * per_x[f] + ty * per_y[f]
-        distance = at.norm(dim=1)
         normal = (self._normal @ R.T)[f]
-        cos = -(at * normal).sum(dim=1) / distance
+        focal = p[12] / (2 * math.pi) if wide else min(p[0], p[1])
+        if look.model == ORTHOGRAPHIC:  # how far away it is says nothing of how large its pixels are
+            distance, cos, far = at[:, 2], -normal[:, 2], torch.ones_like(at[:, 2])
+            alike = far * (ALIKE / focal)
+        else:
+            distance = alike = far = at.norm(dim=1)
+            cos = -(at * normal).sum(dim=1) / distance
         u, v, ok = _project(look.model, p, at)
         ok &= (v >= -0.5) & (v < p[13] - 0.5) & (cos >= 0.5 * g.min_cos)
         if not wide:
@@ -96,25 +101,24 @@ class TorchRows:
         rows, columns = look.depth.shape
         column = ((u + 0.5) * (columns / p[12])).long().clamp(0, columns - 1)
         row = ((v + 0.5) * (rows / p[13])).long().clamp(0, rows - 1)
-        lean = _slope(cos) * distance * look.pixel
+        lean = _slope(cos) * far * look.pixel
         ok &= distance <= photo.depth[row, column] + g.bias + SLOPE_SHARE * lean
         keep = torch.nonzero(ok).ravel()
         texel, f, tx, ty, u, v = (a[keep] for a in (texel, f, tx, ty, u, v))
-        row, column, lean, distance, cos = (a[keep] for a in (row, column, lean, distance, cos))
+        row, column, lean, distance, cos, far, alike = (a[keep] for a in (row, column, lean, distance, cos, far, alike))
 
         border = torch.minimum(v + 0.5, p[13] - 0.5 - v)
         if not wide:
             border = torch.minimum(border, torch.minimum(u + 0.5, p[12] - 0.5 - u))
-        whole = (cos * cos / distance**2) ** g.power * (0.02 + 0.98 * (border / g.feather).clamp(max=1.0))
+        whole = (cos * cos / alike**2) ** g.power * (0.02 + 0.98 * (border / g.feather).clamp(max=1.0))
         apart = distance > photo.apart[row, column] + g.bias + (look.reach + 0.5) * lean
         weight = torch.where(apart, whole * EDGE, whole)
         factor = torch.exp(self._to(look.exposure[:3])) * photo.vignette(u, v)[:, None]
         if look.warp.shape[0]:
             u, v = photo.warped(u, v)
-        focal = p[12] / (2 * math.pi) if wide else min(p[0], p[1])
         size = torch.maximum((per_x**2).sum(dim=1), (per_y**2).sum(dim=1)).sqrt()[f]
         chosen = (share.sum(dim=1) > 0)[which[f]]
-        colour = photo.colour(u, v, size * focal / distance, chosen if g.band >= 0 else torch.ones_like(chosen))
+        colour = photo.colour(u, v, size * focal / far, chosen if g.band >= 0 else torch.ones_like(chosen))
         burnt = colour.amax(dim=1) > WHITE
         whole, weight = torch.where(burnt, whole * EDGE, whole), torch.where(burnt, weight * EDGE, weight)
         coarse = colour if g.band < 0 else photo.coarse(u, v) if g.band > 0 else torch.zeros_like(colour)
@@ -251,6 +255,8 @@ def _project(model: int, p: F64, at: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         scale = torch.where(rxy > 1e-9, radius / rxy, 1.0 / z)
         return p[0] * x * scale + p[2], p[1] * y * scale + p[3], (theta < p[14]) & (rxy + z.abs() >= 1e-9)
     ok = z >= 1e-6
+    if model == ORTHOGRAPHIC:
+        return p[0] * x + p[2], p[1] * y + p[3], ok
     x, y = x / z, y / z
     if model == OPENCV:
         r2 = x * x + y * y

@@ -78,8 +78,9 @@ def exposure(inputs: Inputs, params: ExposureParams, out: Path, report: Report) 
     prior = Exposures.load(inputs["prior"]) if "prior" in inputs else Exposures()
     facts: dict[str, object] = {"photos": 0}
     solved = prior
-    if params.solve and len(views) > 1:
-        used = [i for i in range(len(views)) if not held[i]]
+    if params.solve and sum(view.camera.model != "orthographic" for view in views) > 1:
+        # an orthophoto's colours were balanced when it was put together
+        used = [i for i, view in enumerate(views) if not held[i] and view.camera.model != "orthographic"]
         seen = observe(views, used, lambda i: inputs["depth"] / f"{i}.npy", params, report)
         solved, spread = solve(seen, views, params, prior)
         gain = solved.gain

@@ -29,24 +29,28 @@ class Colours:
     Args:
         xyz: (N, 3) local metres, N > 0.
         rgb: (N, 3) uint8.
-        mark: what texels coloured by them are marked with (`FROM_POINTS` or `FILLED`).
+        mark: (N,) uint8 or one for all, what texels coloured by them are marked with (`FROM_POINTS` or `FILLED`).
     """
 
-    def __init__(self, xyz: F32, rgb: U8, mark: int = FROM_POINTS) -> None:
+    def __init__(self, xyz: F32, rgb: U8, mark: int | U8 = FROM_POINTS) -> None:
         from scipy.spatial import cKDTree
 
         self._tree = cKDTree(xyz, balanced_tree=False, compact_nodes=False)
         self._rgb = rgb.astype(np.float32)
-        self.mark = mark
+        self._mark = np.broadcast_to(np.asarray(mark, np.uint8), len(xyz))
 
-    def at(self, places: F32) -> tuple[F32, F32]:
-        """(M, 3) colours, the inverse-square mean of the nearest points, and (M,) distance to the nearest (m)."""
+    def at(self, places: F32) -> tuple[F32, U8]:
+        """(M, 3) colours, the inverse-square mean of the nearest points, and (M,) the nearest one's mark.
+
+        Where that is further than `REACH` it is `FILLED`.
+        """
         k = min(NEIGHBOURS, self._tree.n)
         distance, index = self._tree.query(places, k=k, workers=-1)
         distance, index = distance.reshape(len(places), k), index.reshape(len(places), k)
         weight = (1.0 / (distance**2 + 1e-4)).astype(np.float32)
         colour = np.einsum("mk,mkc->mc", weight, self._rgb[index]) / weight.sum(axis=1, keepdims=True)
-        return colour.astype(np.float32), distance[:, 0].astype(np.float32)
+        mark = np.where(distance[:, 0] <= REACH, self._mark[index[:, 0]], FILLED)
+        return colour.astype(np.float32), mark.astype(np.uint8)
 
 
 @dataclass(frozen=True)
@@ -73,8 +77,8 @@ def fill(page: Page, colours: Colours, texel: float) -> None:
     start = np.concatenate([[0], np.cumsum(shape[:, 0].astype(np.int64) * shape[:, 1])])
     if start[-1] == 0:
         return
-    colour, distance = colours.at(_places(page.flat, page.corners, shape, start, step, page.owner.shape))
-    _interpolate(page.rgb, page.seen, page.owner, page.flat, shape, start, step, colour, distance, colours.mark)
+    colour, mark = colours.at(_places(page.flat, page.corners, shape, start, step, page.owner.shape))
+    _interpolate(page.rgb, page.seen, page.owner, page.flat, shape, start, step, colour, mark)
 
 
 def seen_points(page: Page, every: int) -> tuple[F32, U8]:
@@ -155,7 +159,7 @@ def _places(flat, corners, shape, start, step, size):  # type: ignore[no-untyped
 
 
 @njit(cache=True, parallel=True)
-def _interpolate(rgb, seen, owner, flat, shape, start, step, colour, distance, mark):  # type: ignore[no-untyped-def]
+def _interpolate(rgb, seen, owner, flat, shape, start, step, colour, mark):  # type: ignore[no-untyped-def]
     height, width = owner.shape
     for f in prange(len(flat)):
         if shape[f, 0] == 0:
@@ -173,7 +177,7 @@ def _interpolate(rgb, seen, owner, flat, shape, start, step, colour, distance, m
                     upper = colour[a, k] * (1 - fx) + colour[a + 1, k] * fx
                     lower = colour[b, k] * (1 - fx) + colour[b + 1, k] * fx
                     rgb[y, x, k] = min(255.0, upper * (1 - fy) + lower * fy + 0.5)
-                seen[y, x] = mark if distance[a] <= REACH else FILLED
+                seen[y, x] = mark[a]
 
 
 @njit(cache=True, parallel=True)

@@ -7,11 +7,13 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from scan2sim.pipeline.cameras import MODEL_ID, parameters, pixel_angle
+from scan2sim.pipeline.cameras import ALIKE, MODEL_ID, ORTHOGRAPHIC, parameters, pixel_angle
 from scan2sim.pipeline.range_image import is_visible
 from scan2sim.pipeline.types import F32, U8
 from scan2sim.pipeline.visibility import DepthMap
 
+DRAPED = 0.25
+"""cos of the slope beyond which an orthophoto is no longer laid over a surface: of a facade it shows the edge alone."""
 # where a face is looked at (barycentric): its middle, near its corners, near the middles of its edges
 _SAMPLES = np.array(
     [[1 / 3, 1 / 3, 1 / 3], [0.9, 0.05, 0.05], [0.05, 0.9, 0.05], [0.05, 0.05, 0.9],
@@ -85,6 +87,10 @@ def _rate(corners, normals, depth, model, p, T, pixel, bias, max_distance, min_c
             x = T[0, 0] * wx + T[0, 1] * wy + T[0, 2] * wz + T[0, 3]
             y = T[1, 0] * wx + T[1, 1] * wy + T[1, 2] * wz + T[1, 3]
             z = T[2, 0] * wx + T[2, 1] * wy + T[2, 2] * wz + T[2, 3]
+            if model == ORTHOGRAPHIC:
+                if -nz >= max(min_cos, DRAPED) and is_visible(depth, model, p, pixel, bias, x, y, z, nx, ny, nz):
+                    total += nz * nz * (min(p[0], p[1]) / ALIKE) ** 2
+                continue
             d2 = x * x + y * y + z * z
             if d2 > max_distance * max_distance or d2 < 1e-6:
                 continue

@@ -74,7 +74,7 @@ def texture(inputs: Inputs, params: TextureParams, out: Path, report: Report) ->
 
     Inputs: `mesh` (with uv and page), `pages` (their sizes), `choice`, `views`, `depth` (folder of a depth map for
     every view), `exposures`, `agreement`, `cloud.*` (coloured points; that of the classes left out, `cloud.rest`,
-    lends no colours).
+    lends no colours), `made.*` (points that were made up, if any).
     File: `textured`, a folder with `mesh.npz`, `page_<i>.png` and `page_<i>_seen.png` (255 seen by a photo,
     128 coloured from points, 64 filled from neighbours or by class, 0 no surface).
     """
@@ -99,7 +99,7 @@ def texture(inputs: Inputs, params: TextureParams, out: Path, report: Report) ->
         mesh, views, Choice.load(inputs["choice"]), lambda i: inputs["depth"] / f"{i}.npy",
         Exposures.load(inputs["exposures"]), Agreement.load(inputs["agreement"]), params,
     )  # fmt: skip
-    colours, own = _colours_of(inputs)
+    (colours, own), made = _colours_of(inputs), _made_colours(inputs)
     texels = np.zeros((len(mesh), 4), np.int64)
     writer = Writer()
     for k, size in enumerate(sizes):
@@ -108,7 +108,7 @@ def texture(inputs: Inputs, params: TextureParams, out: Path, report: Report) ->
             faces, size["width"], size["height"],
             lambda f, m="", k=k: report((k + f) / len(sizes), f"page {k + 1} of {len(sizes)} {m}"),
         )  # fmt: skip
-        texels[faces] = _finish(page, faces, mesh, colours, own, params)
+        texels[faces] = _finish(page, faces, mesh, colours, None if own else made, params)
         writer.write(folder / f"page_{k}", page)
         del page
     writer.finish()
@@ -317,19 +317,39 @@ def shares(faces: I32, label: I32, vertices: int, views: int) -> Callable[[int],
 
 
 def _colours_of(inputs: Inputs) -> tuple[Colours | None, bool]:
-    """The points' colours, and whether they are their own (else their classes'); None where there are no points."""
+    """The points' colours, and whether they are their own (else their classes'); None where there are no points.
+
+    What is coloured by points that were made up (`made.*`) is marked as filled.
+    """
+    import numpy as np
+
     from scan2sim.pipeline.types import PointCloud
     from scan2sim.texturing.fill import FILLED, FROM_POINTS, Colours, shaded
 
-    clouds = [PointCloud.load(path) for name, path in sorted(inputs.items()) if name.startswith("cloud")]
-    rest = [name == "cloud.rest" for name in sorted(inputs) if name.startswith("cloud")]
-    clouds = [cloud for cloud, left_out in zip(clouds, rest, strict=True) if len(cloud) and not left_out]
+    names = sorted(name for name in inputs if name.startswith("cloud") and name != "cloud.rest")
+    made = sorted(name for name in inputs if name.startswith("made."))
+    clouds = [cloud for name in names + made if len(cloud := PointCloud.load(inputs[name]))]
     if not clouds:
         return None, False
     cloud = PointCloud.join(clouds)
-    if cloud.rgb is not None:
-        return Colours(cloud.xyz, cloud.rgb, FROM_POINTS), True
-    return Colours(cloud.xyz, shaded(_labels(cloud), cloud.normal), FILLED), False
+    if cloud.rgb is None:
+        return Colours(cloud.xyz, shaded(_labels(cloud), cloud.normal), FILLED), False
+    real = len(cloud) - sum(len(PointCloud.load(inputs[name])) for name in made)
+    return Colours(cloud.xyz, cloud.rgb, np.where(np.arange(len(cloud)) < real, FROM_POINTS, FILLED)), True
+
+
+def _made_colours(inputs: Inputs) -> tuple[F32, U8]:
+    """Places (N, 3) and colours (N, 3), their classes', of points that were made up."""
+    import numpy as np
+
+    from scan2sim.pipeline.types import PointCloud
+    from scan2sim.texturing.fill import shaded
+
+    clouds = [PointCloud.load(inputs[name]) for name in sorted(inputs) if name.startswith("made.")]
+    if not clouds:
+        return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
+    cloud = PointCloud.join(clouds)
+    return cloud.xyz, shaded(_labels(cloud), cloud.normal)
 
 
 def _labels(cloud: PointCloud) -> U8:
@@ -339,18 +359,28 @@ def _labels(cloud: PointCloud) -> U8:
 
 
 def _finish(
-    page: Page, faces: npt.NDArray[np.int64], mesh: Mesh, colours: Colours | None, own: bool, params: TextureParams
+    page: Page,
+    faces: npt.NDArray[np.int64],
+    mesh: Mesh,
+    colours: Colours | None,
+    made: tuple[F32, U8] | None,
+    params: TextureParams,
 ) -> npt.NDArray[np.int64]:
-    """Fill what no photo saw, pad the charts; returns (N, 4) texels of the faces, as `blend.count`."""
+    """Fill what no photo saw, pad the charts; returns (N, 4) texels of the faces, as `blend.count`.
+
+    Where points have no colours of their own, texels that photos saw stand in, but for what was made up (`made`).
+    """
     import numpy as np
 
     from scan2sim.texturing import blend, fill
 
     area = float(mesh.face_area[faces].sum())
     texel = (area / max(1, int((page.owner >= 0).sum()))) ** 0.5
-    if not own:  # neighbours that a photo saw are nearer the truth than a class's colour
+    if made is not None:  # neighbours that a photo saw are nearer the truth than a class's colour
         places, rgb = fill.seen_points(page, NEIGHBOUR_STEP)
-        colours = fill.Colours(places, rgb, fill.FILLED) if len(places) else colours
+        if len(places):
+            xyz, colour = np.concatenate([places, made[0]]), np.concatenate([rgb, made[1]])
+            colours = fill.Colours(xyz, colour, fill.FILLED)
     if colours is not None:
         fill.fill(page, colours, max(texel, 1e-6))
     else:

@@ -30,7 +30,7 @@ def common(
     own = [(path, h.crs) for path, h in zip(clouds, headers, strict=True)]
     known = [(path, c) for path, c in own if c]
     for path, other in known[1:]:
-        if not _same(known[0][1], other):
+        if not same(known[0][1], other):
             raise InputError(
                 path,
                 f"is in {name(other)}, but {known[0][0].name} is in {name(known[0][1])}",
@@ -45,7 +45,7 @@ def common(
                 'Add crs = "EPSG:..." to tile.toml, or crs = "local" for metres without georeference',
             )
         crs = known[0][1] or LOCAL
-    elif crs != LOCAL and known and not _same(crs, known[0][1]):
+    elif crs != LOCAL and known and not same(crs, known[0][1]):
         raise InputError(
             known[0][0],
             f"is in {name(known[0][1])}, but {tile.name} says {name(crs)}",
@@ -112,7 +112,8 @@ def _horizontal(crs: str):  # type: ignore[no-untyped-def]
     return parsed.sub_crs_list[0] if parsed.is_compound else parsed
 
 
-def _same(a: str | None, b: str | None) -> bool:
+def same(a: str | None, b: str | None) -> bool:
+    """Whether two codes or WKTs mean the same CRS, heights aside."""
     if a == b:
         return True
     if not a or not b or LOCAL in (a, b):

@@ -33,6 +33,7 @@ from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.io import clouds as cloud_io
 from scan2sim.pipeline.io import crs as crs_io
 from scan2sim.pipeline.io import files, las
+from scan2sim.pipeline.io import orthophoto as orthophoto_io
 from scan2sim.pipeline.io.importing import inside, place, tile_folder
 from scan2sim.pipeline.io.tile import read_tile, tile_name, write_tile
 from scan2sim.pipeline.step import Report, silent
@@ -56,6 +57,8 @@ def import_las(
     crs: str | None = None,
     units: str | None = None,
     trajectory: Path | None = None,
+    orthophoto: Path | None = None,
+    footprints: Path | None = None,
     link: bool = False,
     overwrite: bool = False,
     name: str | None = None,
@@ -75,6 +78,8 @@ def import_las(
         crs: code or WKT, "local" without georeference; the clouds' own by default.
         units: "m", "ft" or "us-ft", where the CRS doesn't say it.
         trajectory: CSV of the scanner's path: a heading, then time,x,y,z a line.
+        orthophoto: GeoTIFF, or a picture with a world file, in the clouds' CRS.
+        footprints: where buildings stand, GeoJSON or GeoPackage.
         link: link to clouds and photos instead of copying them.
         classes: codes of the clouds and what they are here, where they differ (`pipeline.classes`).
         warn: receives what was assumed of clouds that don't say it.
@@ -114,6 +119,8 @@ def import_las(
             cameras=rigs,
             photos=shots,
             trajectory=place(trajectory, folder, "trajectory.csv", link) if trajectory else None,
+            ortho=orthophoto_io.take(orthophoto, folder, link) if orthophoto else None,
+            footprints=place(footprints, folder, footprints.name, link) if footprints else None,
             units=units,
             classes=classes,
         )
@@ -213,6 +220,7 @@ def _camera(row: Row, path: Path, where: str) -> Camera:
         "pinhole": (),
         "opencv": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
         "fisheye": ("k1", "k2", "k3", "k4"),
+        "orthographic": (),
     }[model]
     unused = [k for k in CAMERA[7:] if k not in names and row.get(k) and _number(row, k, path, where) != 0]
     if unused:

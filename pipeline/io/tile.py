@@ -6,13 +6,15 @@ crs = "EPSG:32633"          # code or WKT; "local" without georeference; default
 units = "m"                 # "ft", "us-ft"; default: as the CRS says, else metres
 clouds = ["cloud.laz"]      # LAS, LAZ, COPC, PLY, E57, PCD, XYZ, CSV; coordinates in that CRS and unit
 trajectory = "path.csv"     # optional: the scanner's path, time,x,y,z or with rotations (.csv, .tum)
+orthophoto = "ortho.tif"    # optional: GeoTIFF, or JPEG, PNG, TIFF with a world file; in the CRS
+footprints = "houses.gpkg"  # optional: where buildings stand, GeoJSON or GeoPackage
 
 [classes]                   # optional: what codes of the clouds are, where they differ from docs/formats.md's
 65 = "noise"
 
 [[cameras]]
 id = "front"
-model = "opencv"            # pinhole, opencv (Brown-Conrady), fisheye, equirectangular
+model = "opencv"            # pinhole, opencv (Brown-Conrady), fisheye, equirectangular, orthographic
 size = [1920, 1080]         # pixels
 focal = [1000.0, 1000.0]    # fx, fy in pixels (not for equirectangular)
 centre = [959.5, 539.5]     # cx, cy in pixels; the centre of the top left pixel is (0, 0)
@@ -47,14 +49,16 @@ from scan2sim.pipeline.classes import mapping, name_of
 from scan2sim.pipeline.errors import InputError, SettingError
 from scan2sim.pipeline.io import clouds as cloud_io
 from scan2sim.pipeline.io import crs as crs_io
-from scan2sim.pipeline.io import files, toml
+from scan2sim.pipeline.io import files, orthophoto, toml
 from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.types import Camera, CameraModel, Frame, Tile, Trajectory, View
 
 NAME = r"^[A-Za-z0-9_]{1,100}$"
 """What tiles and surveys may be called: names become folders, files and names in SDF."""
 Vector = tuple[float, float, float]
-DISTORTION_LENGTHS = {"pinhole": (0,), "opencv": (0, 4, 5, 8), "fisheye": (0, 4), "equirectangular": (0,)}
+DISTORTION_LENGTHS = {
+    "pinhole": (0,), "opencv": (0, 4, 5, 8), "fisheye": (0, 4), "equirectangular": (0,), "orthographic": (0,),
+}  # fmt: skip
 
 
 class _Strict(BaseModel):
@@ -108,6 +112,8 @@ class TileFile(_Strict):
     clouds: tuple[str, ...] = Field(min_length=1)
     trajectory: str | None = None
     classes: dict[str, str | int] = {}
+    orthophoto: str | None = None
+    footprints: str | None = None
     cameras: tuple[CameraEntry, ...] = ()
     photos: tuple[PhotoEntry, ...] = ()
     cell: CellEntry | None = None
@@ -133,15 +139,19 @@ def read_tile(path: Path) -> Tile:
     x, y, z = np.floor([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]]).tolist()
     frame = Frame(crs, (x, y, z), unit)
     cameras = {entry.id: _camera(path, entry) for entry in spec.cameras}
+    views = [_view(path, i, entry, cameras, frame) for i, entry in enumerate(spec.photos)]
+    if spec.orthophoto:
+        views.append(orthophoto.read_view(_existing(path, spec.orthophoto, "orthophoto"), frame, float(high[2])))
     return Tile(
         path=path,
         name=spec.name,
         frame=frame,
         clouds=clouds,
-        views=tuple(_view(path, i, entry, cameras, frame) for i, entry in enumerate(spec.photos)),
+        views=tuple(views),
         trajectory=_trajectory(path, spec, frame),
         classes=_classes(path, spec),
         cell=_cell(spec.cell, unit),
+        footprints=_existing(path, spec.footprints, "footprints") if spec.footprints else None,
         truth_mesh=_existing(path, spec.truth.mesh, "truth.mesh") if spec.truth else None,
         truth_points=_existing(path, spec.truth.points, "truth.points") if spec.truth else None,
     )
@@ -156,6 +166,8 @@ def write_tile(
     cameras: dict[str, Camera],
     photos: Sequence[dict[str, Any]] = (),
     trajectory: str | None = None,
+    ortho: str | None = None,
+    footprints: str | None = None,
     units: str | None = None,
     cell: dict[str, Any] | None = None,
     truth: dict[str, str] | None = None,
@@ -174,6 +186,10 @@ def write_tile(
         body["units"] = units
     if trajectory:
         body["trajectory"] = trajectory
+    if ortho:
+        body["orthophoto"] = ortho
+    if footprints:
+        body["footprints"] = footprints
     if truth:
         body["truth"] = truth
     if cell:
@@ -194,13 +210,14 @@ def write_tile(
 
 
 def sources_of(path: Path) -> list[Path]:
-    """What a tile is made of but for its photos: the `tile.toml`, clouds, trajectory.
+    """What a tile is made of but for its photos: the `tile.toml`, clouds, trajectory, orthophoto, footprints.
 
     Raises:
         InputError: it can't be read.
     """
     spec = read_spec(path)
-    return [path, *(path.parent / name for name in (*spec.clouds, *([spec.trajectory] if spec.trajectory else [])))]
+    others = (spec.trajectory, spec.orthophoto, spec.footprints)
+    return [path, *(path.parent / name for name in (*spec.clouds, *filter(None, others)))]
 
 
 def tile_name(text: str) -> str:

@@ -11,7 +11,9 @@ from scan2sim.pipeline.classes import GROUPS, group_of
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
-    from scan2sim.pipeline.types import F32, Mesh
+    from scan2sim.pipeline.types import F32, Mesh, PointCloud
+
+FAR = 1.0  # metres from the mesh beyond which one point in twenty is worth a warning
 
 
 class GeometryParams(Params):
@@ -33,7 +35,8 @@ def geometry(inputs: Inputs, params: GeometryParams, out: Path, report: Report) 
     """Measure `mesh.*` against `cloud.*`, and against `truth.mesh` where the tile is a generated one.
 
     Facts, per class, in metres: `cloud_to_mesh_mean_m` and `cloud_to_mesh_p95_m` (from the points to
-    the nearest place on the mesh); `truth_mean_m` (from the mesh to the true surface of its class).
+    the nearest place on the mesh); `truth_mean_m` (from the mesh to the true surface of its class). `made_up` is the
+    share of the mesh's area that lies nearer to points that were made up (`made.*`) than to any of the cloud's.
     """
     import numpy as np
 
@@ -41,6 +44,7 @@ def geometry(inputs: Inputs, params: GeometryParams, out: Path, report: Report) 
     from scan2sim.pipeline.types import Mesh, PointCloud
 
     facts: dict[str, dict[str, Any]] = {}
+    warnings: list[str] = []
     truth = Mesh.load(inputs["truth.mesh"]) if "truth.mesh" in inputs else None
     for i, group in enumerate(GROUPS):
         if f"mesh.{group}" not in inputs:
@@ -62,11 +66,31 @@ def geometry(inputs: Inputs, params: GeometryParams, out: Path, report: Report) 
             "cloud_to_mesh_mean_m": float(distance.mean()),
             "cloud_to_mesh_p95_m": float(np.percentile(distance, 95)),
         }
+        if figures["cloud_to_mesh_p95_m"] > FAR:
+            warnings.append(
+                f"{group}: 5 % of the points are further than {figures['cloud_to_mesh_p95_m']:.1f} m from the mesh; "
+                "there the world lacks what was scanned (too few points for a surface, or of another class)"
+            )
+        if f"made.{group}" in inputs:
+            made = PointCloud.load(inputs[f"made.{group}"])
+            figures["made_up"] = made_up(mesh, PointCloud.load(inputs[f"cloud.{group}"]), made, params.samples)
         if truth is not None and truth.label is not None:
             error = truth_error(mesh, truth, group, params.samples)
             figures |= {} if error is None else {"truth_mean_m": error}
         facts[group] = {name: round(value, 4) for name, value in figures.items()}
-    return Done({}, facts)
+    return Done({}, facts, warnings)
+
+
+def made_up(mesh: Mesh, cloud: PointCloud, made: PointCloud, samples: int) -> float:
+    """Share of the mesh's area whose nearest point is one that was made up."""
+    from scipy.spatial import cKDTree
+
+    if not len(made):
+        return 0.0
+    places = spread(mesh, samples)
+    real, _ = cKDTree(cloud.xyz).query(places, workers=-1)
+    other, _ = cKDTree(made.xyz).query(places, workers=-1)
+    return float((other < real).mean())
 
 
 def truth_error(mesh: Mesh, truth: Mesh, group: str, samples: int, *, whatever: bool = False) -> float | None:
@@ -115,4 +139,4 @@ def spread(mesh: Mesh, count: int, seed: int = 0) -> F32:
     return ((1 - u) * a + u * (1 - v) * b + u * v * c).astype(np.float32)
 
 
-GEOMETRY = Step("geometry", 2, geometry, GeometryParams)
+GEOMETRY = Step("geometry", 3, geometry, GeometryParams)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,6 +24,7 @@ GROUP_RGB = {"terrain": (176, 158, 138), "building": (206, 160, 132), "vegetatio
 SEEN_RGB = {255: (92, 160, 96), 128: (222, 170, 70), 64: (196, 84, 76)}
 EYE_HEIGHT = 1.6  # metres above the ground, a driver's
 COARSE = 0.17  # metres a pixel of the map of points, enough for every voxel to fill its own
+SLANT = math.radians(38)  # at which an eye in the air looks down
 GLANCE = 96  # pixels across, enough to tell how much of a photo the world fills
 
 
@@ -62,8 +64,10 @@ class Album:
 
 
 def pictures(inputs: Inputs, params: PicturesParams, out: Path, report: Report) -> Done:
-    """Render classes, meshes, triangles, the textured world from above and from a driver's eye, its pages,
+    """Render classes, meshes, triangles, the textured world from above and from where it was scanned, its pages,
     what photos saw, and the world beside photos (held-out ones first).
+
+    Where there is a path, that is a driver's eye, else a bird's that has the whole tile before it.
     """
     from scan2sim.pipeline import render
     from scan2sim.pipeline.io import views as views_io
@@ -79,23 +83,23 @@ def pictures(inputs: Inputs, params: PicturesParams, out: Path, report: Report) 
     world = render.Renderer([render.textured(inputs[g]) for g in groups])
     low, high = bounds([body.mesh.vertices for body in world.bodies if len(body.mesh)] or [cloud.xyz])
     camera = render.pinhole(params.width, params.width * 9 // 16, field=75)
-    eye = driver_pose(path.positions if path is not None else None, low, high, plain)
+    eye, where = whole_pose(low, high, camera), "From the air"
+    if path is not None and len(path) > 1:
+        eye, where = driver_pose(path.positions, low, high, plain), "From a driver's eye"
 
     def above(renderer: render.Renderer, **how: Any) -> U8:
         return lying(renderer.above(low, high, width=params.width, **how).rgb)
 
-    report(0.1, "driver's eye")
-    driver = world.view(camera, eye)
-    album.add("driver", driver.rgb, "hero", "From a driver's eye", "")
-    album.add(
-        "driver_eye", driver.rgb, "world", "From a driver's eye.", "The textured world as a robot's camera sees it."
-    )
+    report(0.1, where)
+    first = world.view(camera, eye)
+    album.add("hero", first.rgb, "hero", where, "")
+    album.add("eye", first.rgb, "world", f"{where}.", "The textured world as a robot's camera sees it.")
     album.add("above", above(world), "world", "From above.", f"{high[0] - low[0]:.0f} m by {high[1] - low[1]:.0f} m.")
     report(0.3, "bird's eye")
     album.add("bird", world.view(camera, bird_pose(low, high)).rgb, "world", "From a bird's eye.", "")
     album.add(
         "seen",
-        seen_colours(driver),
+        seen_colours(first),
         "world",
         "Where colours come from.",
         "Green: photos. Yellow: the cloud's points. Red: filled.",
@@ -156,6 +160,21 @@ def bounds(parts: list[Any]) -> tuple[F64, F64]:
     xyz = np.concatenate(parts)
     low, high = np.percentile(xyz, 0.2, axis=0), np.percentile(xyz, 99.8, axis=0)
     return low.astype(np.float64), high.astype(np.float64)
+
+
+def whole_pose(low: F64, high: F64, camera: Camera) -> F64:
+    """(4, 4) pose of an eye in the air, across the longer side, from where the whole box is in the picture."""
+    from scan2sim.pipeline.render import look_at
+
+    size = high - low
+    side = np.array([-0.35, -0.94]) if size[0] >= size[1] else np.array([-0.94, -0.35])
+    toward = np.array([*side * math.cos(SLANT), math.sin(SLANT)])
+    pose = look_at(toward, np.zeros(3))
+    corners = (np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T - (low + high) / 2) @ pose[:3, :3]
+    reach = np.array([camera.width / 2 / camera.fx, camera.height / 2 / camera.fy])
+    distance = float((np.abs(corners[:, :2]) / reach - corners[:, 2:]).max())
+    pose[:3, 3] = (low + high) / 2 + toward * max(distance, 1.0)
+    return pose
 
 
 def driver_pose(path: F64 | None, low: F64, high: F64, ground: Any) -> F64:
@@ -258,4 +277,4 @@ def _compared(held: Sequence[bool], filled: Sequence[float], count: int) -> list
     return sorted(range(len(held)), key=lambda i: (not held[i], -filled[i]))[:count]
 
 
-PICTURES = Step("pictures", 2, pictures, PicturesParams)
+PICTURES = Step("pictures", 3, pictures, PicturesParams)

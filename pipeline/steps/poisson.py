@@ -43,7 +43,8 @@ class PoissonParams(Params):
 
 
 def poisson(inputs: Inputs, params: PoissonParams, out: Path, report: Report) -> Done:
-    """Reconstruct `cloud` in a child process; on a crash again on one thread, then one level coarser.
+    """Reconstruct `cloud`, with what was made up of it (`made`, optional), in a child process; on a crash again on one
+    thread, then one level coarser.
 
     Raises:
         StepError: all three failed.
@@ -54,6 +55,8 @@ def poisson(inputs: Inputs, params: PoissonParams, out: Path, report: Report) ->
     from scan2sim.pipeline.types import Mesh, PointCloud
 
     cloud = PointCloud.load(inputs["cloud"])
+    if "made" in inputs and len(cloud) and len(made := PointCloud.load(inputs["made"])):
+        cloud = PointCloud.join([cloud, made])
     if len(cloud) < MIN_POINTS:
         empty = Mesh(cloud.frame, np.empty((0, 3), np.float32), np.empty((0, 3), np.int32), np.empty(0, np.float32))
         empty.save(out / "mesh.npz")

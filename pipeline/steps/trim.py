@@ -37,7 +37,7 @@ class TrimParams(Params):
 
 
 def trim(inputs: Inputs, params: TrimParams, out: Path, report: Report) -> Done:
-    """Keep the triangles of `mesh` that the points of `cloud` bear out."""
+    """Keep the triangles of `mesh` that the points of `cloud`, or those made up (`made`, optional), bear out."""
     import numpy as np
     from scipy.spatial import cKDTree
 
@@ -50,6 +50,8 @@ def trim(inputs: Inputs, params: TrimParams, out: Path, report: Report) -> Done:
     assert mesh.density is not None
     tree = cKDTree(cloud.xyz)
     widened = max(1.0, _spacing(tree, cloud.xyz) / (FULL_VOXELS * params.voxel))
+    if "made" in inputs:
+        tree = cKDTree(np.concatenate([cloud.xyz, PointCloud.load(inputs["made"]).xyz]))
     corners = mesh.corners
     edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     long = edge > params.max_edge * widened

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from scan2sim.pipeline.types import F32, View
 
 REACH = 100.0  # metres; a photo further than this from every point sees nothing of the tile
+MARGIN = 8  # pixels of an orthophoto around the points
 SAMPLE = 500_000  # points that are looked for in the photos
 
 
@@ -60,6 +61,8 @@ def views(inputs: Inputs, params: ViewsParams, out: Path, report: Report) -> Don
             warnings.append(f"{problem}: left out, its place is textured from other photos where they see it")
         elif not _sees(view, points):
             sees_nothing.append(view.name)
+        elif view.camera.model == "orthographic":
+            kept.append(_cut(view, points, out / "photos", i))
         else:
             photo = _linked(view.photo, out / "photos", i)
             kept.append(replace(view, photo=photo, mask=mask and _linked(mask, out / "masks", i)))
@@ -91,11 +94,36 @@ def _linked(file: Path, folder: Path, index: int) -> Path:
     return link.relative_to(folder.parent)
 
 
+def _cut(view: View, points: F32, folder: Path, index: int) -> View:
+    """An orthophoto cut to what it shows of the points: a survey's may cover a town."""
+    from dataclasses import replace
+
+    import numpy as np
+
+    from scan2sim.pipeline.cameras import project
+    from scan2sim.pipeline.io import image
+
+    T_cam_world, camera = np.linalg.inv(view.T_world_cam), view.camera
+    uv, _ = project(camera, points @ T_cam_world[:3, :3].T + T_cam_world[:3, 3])
+    size = np.array([camera.width, camera.height])
+    low = np.clip(np.floor(uv.min(axis=0)) - MARGIN, 0, size - 1).astype(int)
+    high = np.clip(np.ceil(uv.max(axis=0)) + MARGIN, low + 1, size).astype(int)
+    rgb = image.read_rgb(view.photo)
+    assert rgb is not None  # `_problem` has read it
+    folder.mkdir(exist_ok=True)
+    file = folder / f"{index:05d}_{view.photo.stem}.png"
+    image.write(file, rgb[low[1] : high[1], low[0] : high[0]])
+    width, height = (high - low).tolist()
+    part = replace(camera, width=width, height=height, cx=camera.cx - float(low[0]), cy=camera.cy - float(low[1]))
+    return replace(view, camera=part, photo=file.relative_to(folder.parent))
+
+
 def held_out(views: Sequence[View], every: int) -> list[bool]:
     """Which views are held out: every nth, counted camera after camera, so that every camera has its turn."""
     held = [False] * len(views)
     cameras = list(dict.fromkeys(view.camera for view in views))
-    in_turn = sorted(range(len(views)), key=lambda i: cameras.index(views[i].camera))
+    photos = [i for i, view in enumerate(views) if view.camera.model != "orthographic"]
+    in_turn = sorted(photos, key=lambda i: cameras.index(views[i].camera))
     for i in in_turn[every // 2 :: every] if every else ():
         held[i] = True
     return held
@@ -136,7 +164,8 @@ def _sees(view: View, points: F32) -> bool:
 
     T_cam_world = np.linalg.inv(view.T_world_cam)
     local = points @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]
-    local = local[np.einsum("ij,ij->i", local, local) < REACH**2]
+    if view.camera.model != "orthographic":
+        local = local[np.einsum("ij,ij->i", local, local) < REACH**2]
     if len(local) == 0:
         return False
     uv, valid = project(view.camera, local)
@@ -144,4 +173,4 @@ def _sees(view: View, points: F32) -> bool:
     return bool((inside & valid).any())
 
 
-VIEWS = Step("views", 2, views, ViewsParams)
+VIEWS = Step("views", 3, views, ViewsParams)

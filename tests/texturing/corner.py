@@ -59,10 +59,12 @@ def paint(xyz):
 
 def photograph(camera, pose, meshes=(GROUND, BOX), gain=1.0):
     """(H, W, 3) uint8: the paint as a camera sees it."""
-    from scan2sim.pipeline.cameras import pixel_rays
+    from scan2sim.pipeline.cameras import pixel_rays, ray_origins
 
     image = Renderer([Body(mesh) for mesh in meshes]).view(camera, pose)
-    hit = pose[:3, 3] + (pixel_rays(camera) @ pose[:3, :3].T) * np.where(image.hit, image.range, 0)[..., None]
+    v, u = np.mgrid[: camera.height, : camera.width]
+    begin = ray_origins(camera, np.column_stack([u.ravel(), v.ravel()])).reshape(*u.shape, 3)
+    hit = (begin + pixel_rays(camera) * np.where(image.hit, image.range, 0)[..., None]) @ pose[:3, :3].T + pose[:3, 3]
     rgb = np.where(image.hit[..., None], paint(hit) * gain, [200, 214, 230])
     return np.clip(np.round(rgb), 0, 255).astype(np.uint8)
 

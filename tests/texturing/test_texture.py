@@ -9,7 +9,7 @@ from PIL import Image
 
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.render import Renderer, look_at, textured
-from scan2sim.pipeline.types import Frame, Mesh
+from scan2sim.pipeline.types import Camera, Frame, Mesh
 from tests.texturing.corner import BOX, CAMERAS, GROUND, POSES, paint, photograph, points
 
 LOW, HIGH = (-5, -5, 0), (5, 5, 3)
@@ -243,3 +243,26 @@ def test_photos_of_other_kinds_are_read(street, kind):
         truth = np.repeat((truth @ [0.299, 0.587, 0.114])[..., None], 3, axis=-1)
     assert near.mean() > 0.2 and done.facts["photos"] == 4
     assert psnr(rgb[near], truth[near]) > 28
+
+
+def test_an_orthophoto_drapes_what_it_sees_and_no_facade(street):
+    down = np.diag([1.0, -1, -1, 1])
+    down[2, 3] = 30.0
+    camera = Camera("orthographic", 480, 480, 40.0, 40.0, 239.5, 239.5)  # 12 m, 2.5 cm a pixel
+    street.add(camera, down)
+    folder, done = street.run()
+    rgb, seen, truth, x, y = from_above(folder)
+    clear = apart_from_the_box(x, y) & (abs(x) < 4.9) & (abs(y) < 4.9)
+    assert (seen[clear] == 255).mean() > 0.99
+    assert psnr(rgb[clear], truth[clear]) > 30
+    under = (abs(x - 0.5) < 0.3) & (abs(y) < 0.8)
+    assert not (seen[under] == 255).any()
+    assert done.facts["photos"] == 1
+
+    street.mesh, street.folder = BOX, street.folder / "box"
+    street.folder.mkdir()
+    folder, _ = street.run()
+    side = Renderer([textured(folder)]).view(CAMERAS["pinhole"], look_at((-4, 0, 0.6), (0, 0, 0.6)))
+    assert not (side.seen[side.hit] == 255).any()
+    top = Renderer([textured(folder)]).view(camera, down)
+    assert (top.seen[top.hit] == 255).mean() > 0.98

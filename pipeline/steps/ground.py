@@ -1,0 +1,126 @@
+"""Ground: closed under roofs and crowns, where an airborne scanner saw none of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from pydantic import Field
+
+from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
+
+if TYPE_CHECKING:
+    from scan2sim.pipeline.types import PointCloud
+
+COVER = 3  # cells of the points' spacing: gaps between points of one roof or crown
+
+
+class MadeUpParams(Params):
+    """Whether what an airborne scanner can't see is made up.
+
+    Attributes:
+        when: "auto": where the tile has neither a scanner's path nor photos taken from the ground; "always", "never".
+        seed: the tile's (x, y), world metres, where it meets others; set by the recipe.
+        neighbours: names of tiles whose cells touch to their seeds, world metres; set by the recipe.
+        name: of the tile; set by the recipe.
+        buffer: metres beyond its cell up to which a tile's cloud reaches; set by the recipe.
+    """
+
+    when: Literal["auto", "always", "never"] = "auto"
+    seed: tuple[float, float] | None = None
+    neighbours: dict[str, tuple[float, float]] = Field(default_factory=dict)
+    name: str = ""
+    buffer: float = Field(5.0, ge=0, le=1000)
+
+
+class GroundParams(MadeUpParams):
+    """Which holes are closed; the rest as of the walls.
+
+    Attributes:
+        reach: metres; gaps between ground, roofs and crowns that are less than twice as wide are closed as well.
+    """
+
+    reach: float = Field(10.0, ge=0, le=50)
+
+
+def ground(inputs: Inputs, params: GroundParams, out: Path, report: Report) -> Done:
+    """Make up points of the ground where `terrain` has a hole under `building`, `vegetation` or `rest`.
+
+    The holes' heights and colours hang from their rims like a membrane. Where the tile meets others, their clouds
+    (`terrain.NAME` and so on) are looked at as well: both tiles fill a hole on their border alike.
+    File: `made`, a `PointCloud` with normals, as dense as the ground's own points are.
+    """
+    import numpy as np
+
+    from scan2sim.pipeline.border import on_grid
+    from scan2sim.pipeline.classes import CODE
+    from scan2sim.pipeline.heightfield import Raster, closed, grown, membrane, spacing
+    from scan2sim.pipeline.types import PointCloud
+
+    terrain = united(inputs, params, "terrain")
+    above = [united(inputs, params, part) for part in ("building", "vegetation", "rest")]
+    made = PointCloud(terrain.frame, np.zeros((0, 3), np.float32), normal=np.zeros((0, 3), np.float32))
+    area = 0.0
+    if len(terrain) and any(map(len, above)):
+        from scipy import ndimage
+
+        raster = Raster.over(spacing(terrain.xyz), [terrain.xyz, *(cloud.xyz for cloud in above)])
+        cover = np.any([closed(raster.covered(cloud.xyz), COVER) for cloud in above], axis=0)
+        columns = [terrain.xyz[:, 2:]] + ([] if terrain.rgb is None else [terrain.rgb])
+        known = raster.mean(terrain.xyz, np.concatenate(columns, axis=1))
+        has = np.isfinite(known[..., 0])
+        wanted = ndimage.binary_fill_holes(closed(has | cover, params.reach / raster.cell))
+        report(0.3, "membrane")
+        field = membrane(known, np.asarray(wanted))
+        new = np.isfinite(field[..., 0]) & ~grown(has, 1.5)
+        if params.seed is not None:
+            new[new] = near_cell(raster.centres(new), params, terrain)
+        xyz = on_grid(np.column_stack([raster.centres(new), field[new][:, 0]])).astype(np.float32)
+        slope = np.gradient(np.where(np.isfinite(field[..., 0]), field[..., 0], np.nanmean(field[..., 0])), raster.cell)
+        normal = np.column_stack([-slope[1][new], -slope[0][new], np.ones(len(xyz))])
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        rgb = None if terrain.rgb is None else np.rint(field[new][:, 1:]).clip(0, 255).astype(np.uint8)
+        label = np.full(len(xyz), CODE["terrain"], np.uint8)
+        made = PointCloud(terrain.frame, xyz, rgb, normal.astype(np.float32), label)
+        area = len(xyz) * raster.cell**2
+    made.save(out / "made.npz")
+    return Done({"made": out / "made.npz"}, {"points": len(made), "made_up_m2": round(area, 1)})
+
+
+def near_cell(xy: object, params: MadeUpParams, cloud: PointCloud) -> object:
+    """(N,) which local places (N, 2) lie in the tile's cell or within its buffer."""
+    import numpy as np
+
+    from scan2sim.pipeline.cells import Cell
+
+    assert params.seed is not None
+    world = np.asarray(xy) + np.asarray(cloud.frame.origin[:2])
+    return Cell(params.seed, params.neighbours).outside(world) <= params.buffer
+
+
+def united(inputs: Inputs, params: MadeUpParams, part: str) -> PointCloud:
+    """The cloud `part` with what the neighbours' clouds `part.NAME` have where they own it, in the tile's own frame."""
+    from dataclasses import replace
+
+    import numpy as np
+
+    from scan2sim.pipeline.border import on_grid
+    from scan2sim.pipeline.steps.overlap import nearest
+    from scan2sim.pipeline.types import PointCloud
+
+    own = PointCloud.load(inputs[part])
+    given = sorted(name for name in params.neighbours if f"{part}.{name}" in inputs)
+    if params.seed is None or not given:
+        return own
+    seeds = dict(sorted({params.name: params.seed, **{name: params.neighbours[name] for name in given}}.items()))
+    parts = []
+    for i, name in enumerate(seeds):  # by name, in every tile alike
+        cloud = own if name == params.name else PointCloud.load(inputs[f"{part}.{name}"])
+        world = on_grid(cloud.xyz + np.asarray(cloud.frame.origin))
+        mine = nearest(world[:, :2], list(seeds.values())) == i
+        xyz = (world - np.asarray(own.frame.origin)).astype(np.float32)
+        parts.append(replace(cloud, frame=own.frame, xyz=xyz).take(mine))
+    return PointCloud.join(parts)
+
+
+GROUND = Step("ground", 1, ground, GroundParams)

@@ -1,0 +1,72 @@
+"""Orthophotos as views."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image, TiffImagePlugin
+
+from scan2sim.pipeline.cameras import project, ray_origins, unproject
+from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.io.orthophoto import read_view
+from scan2sim.pipeline.types import Frame
+
+FEET = Frame("local", (300.0, 600.0, 10.0), 0.3048)
+UTM = Frame("EPSG:32633", (500000.0, 5400000.0, 200.0))
+
+
+def picture(path: Path, **how: object) -> Path:
+    Image.fromarray(np.zeros((40, 60, 3), np.uint8)).save(path, **how)
+    return path
+
+
+def pixel_of(view, xyz):
+    T = np.linalg.inv(view.T_world_cam)
+    uv, valid = project(view.camera, np.atleast_2d(xyz) @ T[:3, :3].T + T[:3, 3])
+    assert valid.all()
+    return uv
+
+
+@pytest.mark.parametrize("suffix", [".wld", ".jgw", ".jpgw", ".JGW"])
+def test_a_world_file_in_feet(suffix: str, tmp_path: Path) -> None:
+    file = picture(tmp_path / "map.jpg")
+    (tmp_path / f"map{suffix}").write_text("2.0\n0\n0\n-2.0\n1000\n2000\n")
+    view = read_view(file, FEET, highest=50.0)
+    corner, other = FEET.to_local([(1000, 2000, 0), (1020, 1990, 100)])
+    np.testing.assert_allclose(pixel_of(view, [corner, other]), [(0, 0), (10, 5)], atol=1e-3)
+    assert view.camera.model == "orthographic" and view.camera.fx == pytest.approx(1 / 0.6096)
+    back = view.T_world_cam[:3, :3] @ ray_origins(view.camera, [[10, 5]])[0] + view.centre
+    np.testing.assert_allclose(back[:2], other[:2], atol=1e-6)
+    np.testing.assert_allclose(view.T_world_cam[:3, :3] @ unproject(view.camera, [[3, 4]])[0], [0, 0, -1], atol=1e-9)
+
+
+@pytest.mark.parametrize(("raster", "shift"), [(1, 0.5), (2, 0.0)])
+def test_a_geotiffs_tags(raster: int, shift: float, tmp_path: Path) -> None:
+    tags = TiffImagePlugin.ImageFileDirectory_v2()
+    tags[33550], tags.tagtype[33550] = (0.2, 0.2, 0.0), 12
+    tags[33922], tags.tagtype[33922] = (0.0, 0.0, 0.0, 500000.0, 5400010.0, 0.0), 12
+    tags[34735], tags.tagtype[34735] = (1, 1, 0, 2, 1025, 0, 1, raster, 3072, 0, 1, 32633), 3
+    file = picture(tmp_path / "map.tif", tiffinfo=tags)
+    view = read_view(file, UTM, highest=230.0)
+    np.testing.assert_allclose(pixel_of(view, [(2.0, 8.0, 5.0)]), [(10 - shift, 10 - shift)], atol=1e-2)
+    with pytest.raises(InputError, match="EPSG:32633"):
+        read_view(file, Frame("EPSG:32632", UTM.origin), highest=230.0)
+
+
+@pytest.mark.parametrize("text", ["", "1 2 3", "a b c d e f", "0 0 0 0 1 2", "1 1 0 -1 5 5", "1 0 0 1 5 5",
+                                  "nan 0 0 -1 0 0"])  # fmt: skip
+def test_world_files_that_say_nothing_are_named(text: str, tmp_path: Path) -> None:
+    file = picture(tmp_path / "map.png")
+    (tmp_path / "map.pgw").write_text(text)
+    with pytest.raises(InputError, match="map.pgw"):
+        read_view(file, FEET, highest=1.0)
+
+
+def test_a_picture_that_says_not_where_it_is(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="world file"):
+        read_view(picture(tmp_path / "map.png"), FEET, highest=1.0)
+    (tmp_path / "torn.tif").write_bytes(b"II*\0")
+    with pytest.raises(InputError, match="torn"):
+        read_view(tmp_path / "torn.tif", FEET, highest=1.0)
