@@ -14,10 +14,9 @@ FROM system AS code
 RUN python -m venv /opt/venv
 COPY . .
 
-# torch for CPUs comes without gigabytes of CUDA; what it depends on comes with the rest
+# without torch, which brings gigabytes of CUDA: the main job, videos and surveys need none
 FROM code AS cpu-environment
-RUN pip install --no-cache-dir --no-deps -c constraints.txt --index-url https://download.pytorch.org/whl/cpu torch \
-    && pip install --no-cache-dir -c constraints.txt -e '.[segmentation,slam,ray,s3]'
+RUN pip install --no-cache-dir -c constraints.txt -e '.[slam,ray,s3]'
 
 FROM code AS gpu-environment
 RUN pip install --no-cache-dir -c constraints.txt -e '.[segmentation,slam,ray,s3]'

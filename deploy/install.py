@@ -1,10 +1,9 @@
 """Sets up .venv: `make demo` and `make test` call this; the latter with `dev`, for what tests need besides.
 
 What the system lacks is installed where that is allowed (Debian and Ubuntu; root, or a sudo that asks for no
-password), and said before. Elsewhere nothing is touched: the command that installs it is printed.
+password), and said before. Elsewhere nothing is touched: the command that installs it is printed. Old Pythons get as
+far as being told so: annotations that they don't know are quoted.
 """
-
-from __future__ import annotations
 
 import importlib.util
 import os
@@ -29,7 +28,7 @@ def check_python() -> None:
         )
 
 
-def lacking() -> dict[str, str]:
+def lacking() -> "dict[str, str]":
     """What the system lacks, and Debian's packages that hold it."""
     from scan2sim.pipeline import libraries
 
@@ -37,7 +36,7 @@ def lacking() -> dict[str, str]:
     return libraries.missing() | ({} if importlib.util.find_spec("ensurepip") else {"Python's venv": venv})
 
 
-def install_system_packages(wanted: dict[str, str]) -> None:
+def install_system_packages(wanted: "dict[str, str]") -> None:
     """Install what the system lacks, or stop and say what would."""
     from scan2sim.pipeline import libraries
 
@@ -56,7 +55,7 @@ def install_system_packages(wanted: dict[str, str]) -> None:
              f"  {libraries.command(wanted)}")  # fmt: skip
 
 
-def may_be_root() -> list[str] | None:
+def may_be_root() -> "list[str] | None":
     """What makes a command root's: nothing if we are, sudo if it asks for no password; None: we may not."""
     if os.geteuid() == 0:
         return []
@@ -64,7 +63,7 @@ def may_be_root() -> list[str] | None:
     return ["sudo", "-n"] if allowed else None
 
 
-def install_project(extra: str | None) -> None:
+def install_project(extra: "str | None") -> None:
     """Make .venv if there is none, and install the project with an extra into it."""
     if not (BIN / "python").exists():
         subprocess.run([sys.executable, "-m", "venv", str(ROOT / ".venv")], check=True)

@@ -9,8 +9,6 @@ from typing import Any
 
 from scan2sim.flows.settings import Settings
 from scan2sim.pipeline.classes import GROUPS
-from scan2sim.pipeline.errors import UnavailableError
-from scan2sim.pipeline.io import geotiff
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.step import Params, Step
 from scan2sim.pipeline.steps.clip import CLIP
@@ -248,13 +246,7 @@ def _kept(settings: Settings) -> dict[str, Any]:
 
 
 def _fineness(settings: Settings) -> dict[str, Any]:
-    """Of rasters: `export` says so.
-
-    Raises:
-        UnavailableError: what writes them isn't installed.
-    """
-    if geotiff.missing():
-        raise UnavailableError("rasterio", "isn't installed, and export.rasters needs it", geotiff.REMEDY)
+    """Of rasters: `export` says so."""
     wanted, texel = settings.params(EXPORT).rasters, settings.params(UNWRAP, "terrain").texel
     return {"pixel": texel if wanted is True else wanted, "texel": texel}
 

@@ -20,6 +20,7 @@ EXTRA_OF = {
     "distributed": "flows",
     "ray": "ray",
     "s3fs": "s3",
+    "rasterio": "rasters",
 }
 """A package's import name to the extra of `scan2sim` that installs it."""
 

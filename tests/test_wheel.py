@@ -97,7 +97,7 @@ def test_it_holds_the_rooms_whole_and_nothing_else(wheel: Path) -> None:
     }
     assert inside == rooms - {"scan2sim/data_samples/README.md"} | {"scan2sim/__init__.py"}
     assert any(name.endswith(".dist-info/licenses/LICENSE") for name in names)
-    assert "License-Expression: Apache-2.0\n" in metadata and "Author: scan2sim contributors\n" in metadata
+    assert "License-Expression: Apache-2.0 AND MIT\n" in metadata and "Author: scan2sim contributors\n" in metadata
 
 
 def test_a_users_folders_and_files_are_not_taken_for_ours(installed: Installed) -> None:

@@ -6,7 +6,6 @@ resampling; `write_vrt` shows them as one.
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Iterator, Sequence
@@ -32,8 +31,6 @@ KINDS = {
     "dtm": "Heights of the ground",
 }
 """Of rasters, as in their names, `<tile>_<kind>.tif`, to what they show."""
-REMEDY = "pip install 'scan2sim[rasters]'"
-"""Where rasterio isn't installed."""
 
 
 @dataclass(frozen=True)
@@ -68,11 +65,6 @@ class Grid:
         corners = np.array([[self.column, south, 0], [self.column + self.width, north, 0]], float)
         low, high = self.frame.to_local(corners * self.pixel)
         return low[:2], high[:2]
-
-
-def missing() -> str | None:
-    """What has to be installed before rasters can be written (`REMEDY`); None where nothing."""
-    return None if importlib.util.find_spec("rasterio") else "rasterio"
 
 
 def write_colours(path: Path, grid: Grid, bands: Iterable[npt.NDArray[np.uint8]]) -> None:

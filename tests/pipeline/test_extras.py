@@ -1,0 +1,79 @@
+"""What is said where an optional package is missing: before any work, with the command that installs it."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from scan2sim.flows.run import run_tile, show_plan
+from scan2sim.flows.settings import Settings
+from scan2sim.pipeline.errors import InputError, UnavailableError
+from scan2sim.pipeline.extras import EXTRA_OF
+from tests.conftest import ROOT
+
+TILE = ROOT / "data_samples" / "tile"
+
+
+def without(monkeypatch: pytest.MonkeyPatch, *packages: str) -> None:
+    """As if these weren't installed."""
+    real = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name, *more: None if name in packages else real(name, *more)
+    )
+
+
+@pytest.mark.parametrize(
+    ("setting", "package", "extra"),
+    [
+        ("label.network=segformer", "transformers", "segmentation"),
+        ("label.weights=mine.safetensors", "torch", "segmentation"),
+        ("texture.device=cuda", "torch", "segmentation"),
+        ("export.rasters=0.1", "rasterio", "rasters"),
+    ],
+)
+def test_a_setting_that_cannot_be_is_refused_before_anything_runs(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, setting: str, package: str, extra: str
+) -> None:
+    without(monkeypatch, package)
+    settings = Settings.read(None, [setting])
+    with pytest.raises(UnavailableError) as caught:
+        run_tile(TILE, tmp_path / "out", settings)
+    assert package in caught.value.cause and caught.value.remedy == f"pip install 'scan2sim[{extra}]'"
+    assert not any((tmp_path / "out" / "steps").glob("*/*"))
+    with pytest.raises(UnavailableError):
+        show_plan(TILE, tmp_path / "out", settings)
+
+
+def test_weights_that_are_not_there_are_told_before_anything_runs(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"mine\.onnx"):
+        run_tile(TILE, tmp_path / "out", Settings.read(None, [f"label.weights={tmp_path}/mine.onnx"]))
+    assert not any((tmp_path / "out" / "steps").glob("*/*"))
+
+
+def test_the_demo_needs_nothing_but_the_core(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    without(monkeypatch, *EXTRA_OF)
+    show_plan(TILE, tmp_path, Settings.read(None, ["segment.overwrite=true"]))
+
+
+def test_every_extra_is_there_and_brings_its_package() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    core = {re.split(r"[^\w.-]", line)[0] for line in project["dependencies"]}
+    for package, extra in EXTRA_OF.items():
+        brought = {re.split(r"[^\w.-]", line)[0] for line in project["optional-dependencies"][extra]}
+        assert package in brought and package not in core
+
+
+def test_hints_work_for_those_who_have_no_checkout() -> None:
+    extras = set(tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"])
+    pages = [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]
+    rooms = ("pipeline", "flows", "segmentation", "texturing", "slam", "services", "data_samples")
+    for file in [*pages, *(path for room in rooms for path in (ROOT / room).rglob("*.py"))]:
+        for line in file.read_text("utf-8").splitlines():
+            hint = re.search(r"pip install\b.*", line)
+            assert hint is None or file.name == "CONTRIBUTING.md" or " -e " not in hint[0], (file, line)
+            for named in re.findall(r"scan2sim\[([\w,]+)\]", line):
+                assert set(named.split(",")) <= extras, (file, line)
