@@ -9,7 +9,7 @@ after `python -m bench.texture`, whose scenes and depth maps it takes (`--scenes
 - pymaxflow: the same by PyMaxflow (GPL; no dependency of ours), where it is installed.
 - ours: message passing.
 
-Energies are above the bound that ours proves, in percent of it. Textures: as in `bench.texture_ablation`. Ends with
+Energies are above the bound that ours proves, in percent of it; seconds are a processor's. Textures: as in `bench.texture_ablation`. Ends with
 `RESULT {json}`: scene, solver, figures.
 """
 
@@ -198,9 +198,9 @@ def compare(scene: Scene, names: Sequence[str], *, textures: bool) -> dict[str, 
     told: dict[str, dict[str, Any]] = {}
     for name in names:
         solver = solvers()[name]
-        began = time.perf_counter()
+        began = time.process_time()
         label = solver(problem)
-        seconds = time.perf_counter() - began
+        seconds = time.process_time() - began
         apart = (label[pairs[:, 0]] != label[pairs[:, 1]]) & (label[pairs] >= 0).all(axis=1)
         told[name] = {
             "above_bound_percent": round(100 * (energy(label, *problem) / bound - 1), 3),
