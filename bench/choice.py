@@ -9,8 +9,8 @@ after `python -m bench.texture`, whose scenes and depth maps it takes (`--scenes
 - pymaxflow: the same by PyMaxflow (GPL; no dependency of ours), where it is installed.
 - ours: message passing.
 
-Energies are above the bound that ours proves, in percent of it; seconds are a processor's. Textures: as in `bench.texture_ablation`. Ends with
-`RESULT {json}`: scene, solver, figures.
+Energies are above the bound that ours proves, in percent of it; seconds are a processor's. Textures: as in
+`bench.texture_ablation`. Ends with `RESULT {json}`: scene, solver, figures.
 """
 
 from __future__ import annotations

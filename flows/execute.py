@@ -293,7 +293,7 @@ def locked(folder: Path) -> Iterator[None]:
 @cache
 def versions() -> Mapping[str, str]:
     """Versions of Python, the project and what it computes with, for the report."""
-    names = ("numpy", "open3d-cpu", "open3d", "xatlas", "pyfqmr", "laspy", "opencv-python-headless")
+    names = ("numpy", "open3d-cpu", "open3d", "xatlas", "pyfqmr", "laspy", "opencv-python-headless", "onnxruntime")
     found = {"python": sys.version.split()[0], "scan2sim": __version__}
     for name in names:
         try:

@@ -48,9 +48,9 @@ def test_prefect_is_known_to_its_flows_alone() -> None:
                 assert file.relative_to(ROOT).as_posix() in ("flows/tile.py", "flows/survey.py", "flows/reprocess.py")
 
 
-def loaded_by(code: str) -> set[str]:
-    """Which heavy modules a fresh interpreter has loaded after running `code`."""
-    script = f"import sys\n{code}\nprint(*[m for m in {HEAVY!r} if m in sys.modules])"
+def loaded_by(code: str, names: tuple[str, ...] = HEAVY) -> set[str]:
+    """Which of the modules a fresh interpreter has loaded after running `code`; and the words that it prints."""
+    script = f"import sys\n{code}\nprint(*[m for m in {names!r} if m in sys.modules])"
     return set(
         subprocess.run(
             [sys.executable, "-c", script], cwd=ROOT, check=True, capture_output=True, text=True
@@ -60,6 +60,15 @@ def loaded_by(code: str) -> set[str]:
 
 def test_the_command_starts_without_anything_heavy() -> None:
     assert loaded_by("import scan2sim.flows.cli") == set()
+
+
+def test_the_version_and_the_help_are_told_by_little() -> None:
+    told = (
+        "import sys; sys.argv[1:] = ['{}']\nfrom scan2sim.flows.cli import main\ntry: main()\nexcept SystemExit: pass"
+    )
+    more = ("pydantic", "jinja2", "fsspec", "asyncio", "http", "importlib.metadata", "multiprocessing")
+    assert not loaded_by(told.format("--version"), (*HEAVY, *more, "rich", "email")) & {*HEAVY, *more, "rich", "email"}
+    assert not loaded_by(told.format("--help"), (*HEAVY, *more)) & {*HEAVY, *more}
 
 
 def test_the_recipe_is_planned_without_anything_heavy() -> None:

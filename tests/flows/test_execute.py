@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import json
 import os
 import shutil
@@ -14,7 +15,8 @@ from pathlib import Path
 
 import pytest
 
-from scan2sim.flows.execute import execute, locked
+import scan2sim
+from scan2sim.flows.execute import execute, locked, versions
 from scan2sim.flows.planning import plan
 from scan2sim.pipeline.errors import BusyError, DataError, StepError
 from scan2sim.pipeline.store import Digests, Manifest, Store, _seal, digest
@@ -250,3 +252,11 @@ def test_kill_9_leaves_nothing_half_made_and_no_process_behind(tmp_path: Path, s
     while time.monotonic() < deadline and Path(f"/proc/{hanging}").exists():
         time.sleep(0.1)
     assert not Path(f"/proc/{hanging}").exists()
+
+
+def test_versions_are_told_without_metadata(monkeypatch: pytest.MonkeyPatch) -> None:
+    def none(name: str) -> str:
+        raise importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(importlib.metadata, "version", none)
+    assert versions.__wrapped__() == {"python": sys.version.split()[0], "scan2sim": scan2sim.__version__}
