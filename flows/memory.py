@@ -33,6 +33,7 @@ NEEDS: dict[str, tuple[float, float]] = {
     "texture": (1.2, 3),
     "level": (1.0, 3),
     "pictures": (1.3, 3),
+    "rasters": (1.3, 3),
     "score": (1.3, 3),
 }
 """Of a step: GB at least, and GB for every GB that it reads; measured on generated streets (docs/scale.md)."""

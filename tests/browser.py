@@ -83,6 +83,16 @@ class Page:
             self.do("Input.dispatchKeyEvent", type=kind, code=code, key=key)
             time.sleep(seconds if kind == "rawKeyDown" else 0)
 
+    def touch(self, selector: str, seconds: float, across: float = 0.0) -> None:
+        """Hold a finger in the middle of an element, and draw it across some pixels."""
+        box = f"document.querySelector({selector!r}).getBoundingClientRect()"
+        x, y = self.value(f"(b => [b.x + b.width / 2, b.y + b.height / 2])({box})")
+        self.do("Input.dispatchTouchEvent", type="touchStart", touchPoints=[{"x": x, "y": y}])
+        for share in (0.5, 1.0) if across else ():
+            self.do("Input.dispatchTouchEvent", type="touchMove", touchPoints=[{"x": x + share * across, "y": y}])
+        time.sleep(seconds)
+        self.do("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+
     def drag(self, start: tuple[float, float], end: tuple[float, float]) -> None:
         """Drag with the left button, viewport pixels."""
         self.do("Input.dispatchMouseEvent", type="mousePressed", x=start[0], y=start[1], button="left", clickCount=1)

@@ -150,14 +150,24 @@
       this.canvas.addEventListener("keydown", (event) => keys(event, true));
       this.canvas.addEventListener("keyup", (event) => keys(event, false));
       this.canvas.addEventListener("blur", () => this.held.clear());
-      this.canvas.addEventListener("pointerdown", () => this.canvas.focus({ preventScroll: true }));
+      let finger = null; // the pointer that looks around, and where it was
+      this.canvas.addEventListener("pointerdown", (event) => {
+        this.canvas.focus({ preventScroll: true });
+        if (!this.walking || finger) return;
+        finger = event;
+        this.canvas.setPointerCapture(event.pointerId);
+      });
       this.canvas.addEventListener("pointermove", (event) => {
-        if (!this.walking || !event.buttons) return;
+        if (!this.walking || finger?.pointerId !== event.pointerId) return;
         const pixel = (this.camera.fov * Math.PI) / 180 / this.box.clientHeight; // what is dragged stays under the finger
-        this.turn += event.movementX * pixel;
-        this.tilt = THREE.MathUtils.clamp(this.tilt + event.movementY * pixel, -1.5, 1.5);
+        this.turn += (event.clientX - finger.clientX) * pixel;
+        this.tilt = THREE.MathUtils.clamp(this.tilt + (event.clientY - finger.clientY) * pixel, -1.5, 1.5);
+        finger = event;
         this.look();
       });
+      for (const end of ["pointerup", "pointercancel"]) {
+        this.canvas.addEventListener(end, (event) => (finger = finger?.pointerId === event.pointerId ? null : finger));
+      }
     }
 
     hold(code, down) {

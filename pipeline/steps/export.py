@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from scan2sim.pipeline.classes import GROUPS
 from scan2sim.pipeline.errors import DataError, SettingError
@@ -16,6 +16,12 @@ if TYPE_CHECKING:
     from scan2sim.pipeline.types import Frame
 
 PLANT_LISTS = {"plants": "plants.geojson", "plants_csv": "plants.csv"}  # input to file in the world's folder
+
+
+def _pixel(size: bool | float) -> bool | float:
+    if not (size in (False, True) or 0.001 <= size <= 100):
+        raise ValueError("give metres a pixel from 0.001 to 100, or true or false")
+    return size
 
 
 class ExportParams(Params):
@@ -45,7 +51,7 @@ class ExportParams(Params):
     pages: Literal["png", "jpeg"] = "png"
     jpeg_quality: int = Field(90, ge=1, le=100)
     world_origin: tuple[float, float, float] | None = None
-    rasters: bool | Annotated[float, Field(ge=0.001, le=100)] = False
+    rasters: Annotated[bool | float, AfterValidator(_pixel)] = False
 
 
 def export(inputs: Inputs, params: ExportParams, out: Path, report: Report) -> Done:

@@ -23,6 +23,7 @@ from tests.browser import chromium
 from tests.conftest import ROOT
 from tests.gazebo.checker import check_world
 
+SHOWN = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(true))))"
 SMALL = ["--set", "unwrap.texel=0.05", "--set", "decimate.target=10000"]
 
 
@@ -99,11 +100,11 @@ def test_the_report_has_the_world_to_turn_and_walk_through(world: Path, tmp_path
         page.until("document.querySelector('header').dataset.state == 'open' && document.querySelector('output').value")
         street, start = page.picture()[50:450], eye()
         assert street.std() > 15, "the canvas shows more than one colour"
-        for _ in range(20):
+        while np.linalg.norm((eye() - start)[:2]) < 0.3:  # frames are few without a GPU
             page.key("KeyW", "w", 0.3)
-        assert np.linalg.norm((eye() - start)[:2]) > 0.3 and abs((eye() - start)[2]) < 0.5, "it walks on the ground"
+        assert abs((eye() - start)[2]) < 0.5, "it walks on the ground"
         page.drag((400, 300), (700, 300))
-        page.until("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(true))))")
+        page.until(SHOWN)
         assert np.abs(page.picture()[50:450].astype(int) - street).mean() > 10
         page.click("[data-to=turn]")
         page.until(f"Number(document.querySelector('output').value.split('  ')[2]) > {start[2] + 5}")
@@ -111,7 +112,13 @@ def test_the_report_has_the_world_to_turn_and_walk_through(world: Path, tmp_path
         page.open(world / "report.html", phone=True, dark=True)
         page.click("[data-open]")
         page.until("document.querySelector('header').dataset.state == 'open'")
-        assert page.value("getComputedStyle(document.querySelector('.pad')).display") == "grid"
+        page.until("document.querySelector('output').value")
+        street, start = page.picture()[50:560], eye()
+        page.touch("canvas", 0.3, across=120)
+        page.until(SHOWN)
+        assert np.abs(page.picture()[50:560].astype(int) - street).mean() > 2 and (eye() == start).all()
+        while np.linalg.norm((eye() - start)[:2]) < 0.3:
+            page.touch(".pad [data-key=KeyW]", 0.3)
         page.open(Path(shutil.copy(world / "report.html", tmp_path)))  # without what lies beside it
         page.click("[data-open]")
         page.until("document.querySelector('[role=status]').textContent.includes(\"isn't beside this page\")")

@@ -121,6 +121,17 @@ def test_an_item_tells_of_points_software_and_sizes(tmp_path: Path) -> None:
     assert one.assets["data"].media_type == "application/vnd.laszip"
 
 
+def test_an_item_names_the_rasters_that_were_made(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    made = item(out, "tile0", made_up.UTM)
+    raster = out / "tiles" / "tile0" / "tile0_dsm.tif"
+    raster.write_text("heights")
+    _, (one,) = read(stac.write(out, "town", "", [replace(made, rasters={"dsm": raster})]))
+    asset = one.assets["dsm"]
+    assert asset.media_type == "image/tiff; application=geotiff; profile=cloud-optimized"
+    assert asset.title == "Heights of the highest surface" and asset.extra_fields["file:size"] == 7
+
+
 def test_times_are_of_the_points_or_the_given_date(tmp_path: Path) -> None:
     timed = item(tmp_path, "timed", made_up.UTM, times=(ADJUSTED, ADJUSTED + 60))
     dated = item(tmp_path, "dated", made_up.UTM, times=(1000.0, 1060.0))  # of an unknown week
