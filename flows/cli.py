@@ -208,7 +208,9 @@ def sample(
             shutil.copytree(SMALL, folder, dirs_exist_ok=True)
         else:
             from scan2sim.data_samples.street import generate
+            from scan2sim.pipeline import libraries
 
+            libraries.check()
             generate(folder, length=length, points=points, photos=photos, seed=seed, report=report)
     typer.echo(f"Tile: {out / 'tile.toml'}")
 

@@ -25,6 +25,7 @@ from scan2sim import __version__
 from scan2sim.flows.memory import need, share
 from scan2sim.flows.planning import Planned, check
 from scan2sim.flows.recipe import Node
+from scan2sim.pipeline import libraries
 from scan2sim.pipeline.errors import BusyError, DamagedError, ScanError, StepError, UnavailableError, from_os_error
 from scan2sim.pipeline.step import Report, silent
 from scan2sim.pipeline.store import Manifest, Store
@@ -219,10 +220,11 @@ def run_on_worker(
         wanted: the flow's `versions()`.
 
     Raises:
-        UnavailableError: this worker has other versions.
+        UnavailableError: this worker has other versions, or lacks libraries.
         ScanError: as `run_node`.
     """
     check_version(item, wanted)
+    libraries.check()
     limit_cores(cores)
     os.environ.pop("MALLOC_TRIM_THRESHOLD_", None)  # Dask's, for processes that live on: it slows steps down
     with share(memory, need(item, store)):

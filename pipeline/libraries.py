@@ -49,7 +49,7 @@ def command(lacking: dict[str, str]) -> str:
         return f"{sudo}apt-get install --no-install-recommends {' '.join(lacking.values())}"
     for manager in ("dnf", "zypper"):  # RPM knows packages by the libraries in them
         if shutil.which(manager):
-            return f"{sudo}{manager} install " + " ".join(f"'{library}()(64bit)'" for library in lacking)
+            return f"{sudo}{manager} install " + " ".join(f"'{name}()(64bit)'" for name in lacking if ".so" in name)
     return f"your system's package manager, for {', '.join(lacking)}"
 
 
