@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,10 +15,14 @@ from typer.core import TyperGroup
 from scan2sim import __version__
 from scan2sim.pipeline.errors import INTERRUPTED, ScanError, exit_code, from_os_error
 
+PAGES = Path(__file__).parents[1] / "docs"
+"""Where the pages are that help and errors name as docs/NAME.md: they come with a wheel, too."""
+
 app = typer.Typer(
     name="scan2sim",
     help="Street scans (lidar clouds and posed photos) to textured worlds for robot simulators.",
     no_args_is_help=True,
+    epilog=f"Pages (docs/...) are in {PAGES}.",
     add_completion=False,
     pretty_exceptions_enable=False,
 )
@@ -555,7 +560,7 @@ def main() -> None:
 
         if isinstance(error, ScanError):
             typer.secho(f"error: {error.where}: {error.cause}", fg="red", err=True)
-            typer.echo(f"  {error.remedy}.", err=True)
+            typer.echo(f"  {re.sub(r'(?<![\w/])docs(?=/\w+\.md)', str(PAGES), error.remedy)}.", err=True)
         else:
             from scan2sim.flows.display import log_unexpected
 

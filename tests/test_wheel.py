@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -95,7 +96,8 @@ def test_it_holds_the_rooms_whole_and_nothing_else(wheel: Path) -> None:
         for path in (ROOT / room).rglob("*")
         if path.is_file() and "__pycache__" not in path.parts
     }
-    assert inside == rooms - {"scan2sim/data_samples/README.md"} | {"scan2sim/__init__.py"}
+    pages = {f"scan2sim/docs/{path.name}" for path in (ROOT / "docs").glob("*.md")}
+    assert inside == rooms - {"scan2sim/data_samples/README.md"} | pages | {"scan2sim/__init__.py"}
     assert any(name.endswith(".dist-info/licenses/LICENSE") for name in names)
     assert "License-Expression: Apache-2.0 AND MIT\n" in metadata and "Author: scan2sim contributors\n" in metadata
 
@@ -107,6 +109,9 @@ def test_a_users_folders_and_files_are_not_taken_for_ours(installed: Installed) 
     assert "poisson.terrain" in installed.scan2sim("plan", "tile")
     call = "from scan2sim.pipeline import isolate; print(isolate.call('operator:add', 1, 2, timeout=60))"
     assert installed.run(installed.environment / "bin" / "python", "-P", "-c", call) == "3\n"
+    told = installed.scan2sim("plan", "tile", "--set", "voxel.size=-1", code=2)
+    (page,) = re.findall(r"/\S+/docs/settings.md", told)  # hints name pages where they are
+    assert "voxel.size" in Path(page).read_text()
     (installed.user / "tile" / "cloud.laz").write_bytes(b"LASF")  # found out by the first step, in its own process
     told = installed.scan2sim("run", "tile", "--out", "out", code=3)
     assert "cloud.laz" in told and "the user's own" not in told and "Traceback" not in told
@@ -136,7 +141,7 @@ def test_a_world_is_made_from_the_wheel_alone(version: str, wheel: Path, tmp_pat
     done(pip, "install", "-c", ROOT / "constraints.txt", f"{wheel}[flows]", cwd=tmp_path)
     here = place(tmp_path / "venv", tmp_path / "user")
     here.scan2sim("sample", "--small", "tile")
-    told = here.scan2sim("run", "tile", "--out", "out", *LIGHT)
+    told = here.scan2sim("run", "tile", "--out", "out", "--set", "segment.overwrite=true", *LIGHT)
     assert "World:" in told and (here.user / "out" / "world" / "sample_street.sdf").is_file()
     told = here.scan2sim("survey", "tile", "--out", "town", "--runner", "dask", "--jobs", "2", *LIGHT)
     assert "Report:" in told and (here.user / "town" / "world").is_dir()
