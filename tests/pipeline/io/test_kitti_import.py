@@ -50,6 +50,10 @@ def stamp(seconds: float) -> str:
 
 @pytest.fixture
 def drive(tmp_path: Path) -> Drive:
+    return make_drive(tmp_path)
+
+
+def make_drive(tmp_path: Path) -> Drive:
     """A car at 11 m/s past a wall of coloured dots, turned by `YAW`; OXTS packets come 10 ms late."""
     axes = Rotation.from_matrix([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
     T_velo_imu = rigid(Rotation.from_rotvec([0.01, -0.02, 0.005]), [-0.81, 0.32, -0.8])

@@ -1,0 +1,42 @@
+"""`python -m tests.fuzz [--cases N] [--first N] [KIND ...]`: counts of what became of damaged files."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections import Counter
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from tests.fuzz.harness import Child, fuzz
+from tests.fuzz.kinds import KINDS
+
+
+def main() -> None:
+    """Print a line a kind, the failures, and all counts."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--cases", type=int, default=300)
+    parser.add_argument("--first", type=int, default=0, help="seed of the first")
+    parser.add_argument("kinds", nargs="*", default=list(KINDS))
+    given = parser.parse_args()
+    child, codes, failures, slowest, largest = Child(), Counter[str](), list[str](), 0.0, 0.0
+    for kind in given.kinds:
+        with TemporaryDirectory() as folder:
+            tally = fuzz(kind, range(given.first, given.first + given.cases), Path(folder) / "x", child)
+        told = ", ".join(f"{code}: {n}" for code, n in sorted(tally.codes.items(), key=str))
+        print(f"{kind:24s} {told}; {tally.seconds:.1f} s, {tally.mb:.0f} MB at most", flush=True)
+        for failure in tally.failures:
+            print("  " + failure.replace("\n", "\n    "), flush=True)
+        codes.update({str(code): n for code, n in tally.codes.items()})
+        failures += tally.failures
+        slowest, largest = max(slowest, tally.seconds), max(largest, tally.mb)
+    child.close()
+    body = {
+        "cases": sum(codes.values()), "codes": dict(codes), "failures": len(failures),
+        "slowest_s": round(slowest, 1), "largest_mb": round(largest),
+    }  # fmt: skip
+    print(f"RESULT {json.dumps(body)}")
+
+
+if __name__ == "__main__":
+    main()

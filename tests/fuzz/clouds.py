@@ -1,0 +1,54 @@
+"""Clouds of all formats, whole, and the damage that only they know."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from random import Random
+
+from scan2sim.flows.inspect import inspect_path
+from scan2sim.pipeline.io import clouds
+from scan2sim.pipeline.io.las_csv import import_las
+from scan2sim.pipeline.types import Frame
+from tests.fuzz.damage import REAL, WHOLE
+from tests.pipeline.io.test_cloud_formats import Format
+from tests.pipeline.io.test_clouds import FRAME, made
+
+HEADER = (
+    (24, "<B"), (25, "<B"), (94, "<H"), (96, "<I"), (100, "<I"), (104, "<B"), (105, "<H"), (107, "<I"), (131, "<d"),
+    (155, "<d"), (179, "<d"), (187, "<d"), (211, "<d"), (227, "<Q"), (235, "<Q"), (243, "<I"), (247, "<Q"),
+)  # fmt: skip
+"""Fields of a LAS header: version, sizes, counts, offsets, scales, bounds."""
+
+
+def whole(form: Format) -> Callable[[Path], list[Path]]:
+    """Makes a cloud of a format, and names its files."""
+
+    def make(folder: Path) -> list[Path]:
+        form.write(folder / form.file, made(1000))
+        return sorted(path for path in folder.rglob("*") if path.is_file())
+
+    return make
+
+
+def read(form: Format) -> Callable[[Path], None]:
+    """Reads it in all ways there are."""
+
+    def read(folder: Path) -> None:
+        path = folder / form.file
+        inspect_path(path)
+        for part in clouds.chunks(path, Frame(FRAME.crs), 300):
+            assert len(part)
+        out = folder / "tile"
+        import_las([path], out, crs=FRAME.crs, overwrite=out.exists())
+
+    return read
+
+
+def las_field(data: bytes, rng: Random) -> bytes:
+    """A field of the header that says something else."""
+    at, form = rng.choice(HEADER)
+    value: float = rng.choice(REAL) if form == "<d" else rng.choice(WHOLE) % 2 ** (8 * struct.calcsize(form))
+    body = struct.pack(form, value)
+    return data[:at] + body + data[at + len(body) :]

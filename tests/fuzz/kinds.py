@@ -1,0 +1,65 @@
+"""All that users hand in, a line each: how it is made whole, how it is read, and what damage only it knows.
+
+To have a reader fuzzed: a line in `KINDS`. A format of clouds is here once `test_cloud_formats.FORMATS` has it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from scan2sim.flows.inspect import inspect_path
+from scan2sim.pipeline.io.tile import read_tile
+from tests.fuzz import clouds, models, tables
+from tests.fuzz.damage import Damage
+from tests.pipeline.io.test_cloud_formats import FORMATS
+from tests.slam import test_gps as gps
+
+
+@dataclass(frozen=True)
+class Kind:
+    """Something that users hand in.
+
+    Attributes:
+        make: writes it whole below a folder; returns the files of it that get damaged.
+        read: reads it from that folder, as a command would; what it writes goes below the folder, too.
+        special: damage that only it knows, as often as all others.
+    """
+
+    make: Callable[[Path], list[Path]]
+    read: Callable[[Path], object]
+    special: Damage | None = None
+
+
+LAS = ("las", "laz", "copc")
+SET = "decimate.target=50000\nsplit.vegetation=both\ndecimate.building.target=2e4\nvoxel.size=0.1\n"
+KINDS: dict[str, Kind] = {
+    **{n: Kind(clouds.whole(f), clouds.read(f), clouds.las_field if n in LAS else None) for n, f in FORMATS.items()},
+    "photo jpg": Kind(*models.photo(".jpg")),
+    "photo png": Kind(*models.photo(".png")),
+    "tile.toml": Kind(tables.tile, read_tile),
+    "survey.toml": Kind(tables.survey, tables.read_survey_folder),
+    "drive.toml": Kind(tables.written("drive.toml", tables.DRIVE), tables.read_drive_file),
+    "settings.toml": Kind(tables.written("settings.toml", tables.tomli_w.dumps(tables.SETTINGS)), tables.settings),
+    "--set": Kind(tables.written("set.txt", SET), tables.assignments, tables.every_setting),
+    "photos.csv": Kind(tables.photos, tables.read_photos),
+    "cameras.toml": Kind(tables.camera_file, tables.read_camera_file),
+    "trajectory csv": Kind(*tables.trajectory(".csv")),
+    "trajectory tum": Kind(*tables.trajectory(".tum")),
+    "trajectory kitti": Kind(*tables.trajectory(".kitti")),
+    "gps gpx": Kind(*tables.track("g.gpx", gps.gpx("1.1"))),
+    "gps nmea": Kind(*tables.track("g.nmea", gps.nmea())),
+    "gps csv": Kind(*tables.track("g.csv", gps.table("time,latitude,longitude,altitude"))),
+    "gps gopro": Kind(tables.film, lambda folder: gps.read_gps(folder / "g.mp4"), tables.telemetry),
+    "video": Kind(tables.film, models.read_video),
+    "colmap txt": Kind(*models.colmap("txt")),
+    "colmap bin": Kind(*models.colmap("bin")),
+    "kitti raw": Kind(models.kitti, models.read_kitti),
+    "sweeps": Kind(models.drive, models.read_drive),
+    "sweep bin": Kind(*models.sweep(".bin")),
+    "sweep pcd": Kind(*models.sweep(".pcd")),
+    "sweep ply": Kind(*models.sweep(".ply")),
+    "result npz": Kind(models.result, lambda folder: inspect_path(folder / "r.npz")),
+    "world": Kind(models.world, models.read_world),
+}

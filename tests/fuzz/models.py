@@ -1,0 +1,125 @@
+"""What importers take, whole: photos, COLMAP models, KITTI drives, sweeps; and what is inspected: results, worlds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from scan2sim.flows.inspect import inspect_path
+from scan2sim.pipeline.errors import DataError
+from scan2sim.pipeline.io import image
+from scan2sim.pipeline.io.colmap import import_colmap
+from scan2sim.pipeline.io.kitti import import_kitti_raw
+from scan2sim.pipeline.io.merging import read_bin
+from scan2sim.pipeline.io.sweeps import Pictures, import_sweeps, read_sweep
+from scan2sim.pipeline.steps.views import _problem
+from scan2sim.pipeline.types import Camera, View
+from scan2sim.slam.video import open_video
+from tests.pipeline import made_up
+from tests.pipeline import test_sweeps as sweeps
+from tests.pipeline.io.test_colmap_import import make_model
+from tests.pipeline.io.test_kitti_import import make_drive
+
+Make, Read = Callable[[Path], list[Path]], Callable[[Path], object]
+
+
+def photo(suffix: str) -> tuple[Make, Read]:
+    """A photo, and all that looks at one."""
+    rgb = np.random.default_rng(0).integers(0, 255, (48, 64, 3)).astype(np.uint8)
+
+    def make(folder: Path) -> list[Path]:
+        cv2.imwrite(str(folder / f"p{suffix}"), rgb)
+        return [folder / f"p{suffix}"]
+
+    def read(folder: Path) -> None:
+        path = folder / f"p{suffix}"
+        _problem(View("p", Camera("pinhole", 64, 48, 50, 50, 31, 23), np.eye(4), path))
+        if image.read_rgb(path) is None:
+            raise DataError(path, "is none", "It is as it should be")
+
+    return make, read
+
+
+def colmap(form: str) -> tuple[Make, Read]:
+    """A COLMAP model."""
+
+    def make(folder: Path) -> list[Path]:
+        make_model(folder, ["SIMPLE_RADIAL", "OPENCV", "PINHOLE"])
+        return sorted((folder / form).iterdir())
+
+    def read(folder: Path) -> object:
+        out = folder / "tile"
+        return import_colmap(folder / form, folder / "images", out, overwrite=out.exists())
+
+    return make, read
+
+
+def kitti(folder: Path) -> list[Path]:
+    """A KITTI drive: calibration, time stamps, OXTS, sweeps."""
+    make_drive(folder)
+    return sorted(path for path in folder.rglob("*") if path.suffix in (".txt", ".bin"))
+
+
+def read_kitti(folder: Path) -> object:
+    """The tile of it."""
+    out = folder / "tile"
+    return import_kitti_raw(folder / "2011_09_26", out, overwrite=out.exists())
+
+
+def drive(folder: Path) -> list[Path]:
+    """Sweeps, poses, photos and extrinsics."""
+    sweeps.make(folder)
+    return sorted(path for path in folder.rglob("*") if path.is_file())
+
+
+def read_drive(folder: Path) -> object:
+    """The tile of them."""
+    out = folder / "tile"
+    pictures = Pictures(folder / "photos", sweeps.CAMERA)
+    return import_sweeps(
+        folder / "sweeps", folder / "camera.csv", out, extrinsics=sweeps.T_CAMERA_SCANNER, photos=pictures,
+        overwrite=out.exists(),
+    )  # fmt: skip
+
+
+def sweep(suffix: str) -> tuple[Make, Read]:
+    """A sweep alone."""
+    write = sweeps.to_bin if suffix == ".bin" else sweeps.to_open3d(suffix)
+
+    def make(folder: Path) -> list[Path]:
+        write(folder / "000000", sweeps.sweep(0.1, turning=False))
+        return [folder / f"000000{suffix}"]
+
+    def read(folder: Path) -> object:
+        path = folder / f"000000{suffix}"
+        return read_sweep(path), read_bin(path) if suffix == ".bin" else None
+
+    return make, read
+
+
+def result(folder: Path) -> list[Path]:
+    """A kept result."""
+    np.savez(folder / "r.npz", a=np.arange(1000), b=np.zeros((3, 4)), c=np.array(["x", "y"]))
+    return [folder / "r.npz"]
+
+
+def world(folder: Path) -> list[Path]:
+    """A world with its model, and a GLB."""
+    made_up.world(folder)
+    kinds = (".sdf", ".obj", ".dae", ".glb", ".json")
+    return sorted(path for path in folder.rglob("*") if path.suffix in kinds)
+
+
+def read_world(folder: Path) -> None:
+    """One screen of facts about each."""
+    for path in sorted(folder.rglob("*")):
+        if path.suffix in (".sdf", ".obj", ".dae", ".glb"):
+            inspect_path(path)
+
+
+def read_video(folder: Path) -> object:
+    """All its frames."""
+    return [frame.time for frame in open_video(folder / "g.mp4").frames()]

@@ -1,0 +1,173 @@
+"""Text files of users, whole: tile.toml and its like, CSVs of photos, trajectories, GPS tracks, settings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from random import Random
+
+import cv2
+import numpy as np
+import tomli_w
+
+from scan2sim.flows.prepare import read_drive
+from scan2sim.flows.recipe import PER_CLASS, STEPS
+from scan2sim.flows.settings import Settings
+from scan2sim.pipeline.io import sweeps
+from scan2sim.pipeline.io import trajectory as trajectory_io
+from scan2sim.pipeline.io.las_csv import import_las
+from scan2sim.pipeline.io.survey import read_survey, write_survey
+from scan2sim.pipeline.io.tile import read_tile
+from scan2sim.slam.gps import read_gps
+from tests.fuzz.damage import TEXT
+from tests.pipeline.io.test_las_import import cloud
+from tests.pipeline.io.test_tile import body, save
+from tests.pipeline.test_trajectory_io import UTM, made_up
+from tests.slam import test_gps as gps
+
+Make, Read = Callable[[Path], list[Path]], Callable[[Path], object]
+
+
+def written(name: str, text: str) -> Make:
+    """A file of that name and text."""
+
+    def make(folder: Path) -> list[Path]:
+        (folder / name).write_text(text, encoding="utf-8")
+        return [folder / name]
+
+    return make
+
+
+def tile(folder: Path) -> list[Path]:
+    """A tile with a camera, a photo, a trajectory, a cell and classes."""
+    (folder / "path.csv").write_text("time,x,y,z\n1,500000,5400000,101\n2,500001,5400000,101\n")
+    more = {"trajectory": "path.csv", "classes": {"65": "noise"}, "cell": {"seed": [500_010.0, 5_400_010.0]}}
+    save(folder, body(folder, **more))
+    return [folder / "tile.toml", folder / "path.csv"]
+
+
+def survey(folder: Path) -> list[Path]:
+    """A survey of a tile."""
+    (folder / "a").mkdir()
+    save(folder / "a", body(folder / "a", name="a", photos=[], cameras=[]))
+    made = write_survey(folder, name="s", crs="EPSG:32632", length=100.0, buffer=5.0, tiles=["a"])
+    return [made, folder / "a" / "tile.toml"]
+
+
+DRIVE = """
+[slam]
+video = "video.mp4"
+gps = "track.gpx"
+[sweeps]
+folder = "sweeps"
+extrinsics = "T.txt"
+max_range = 40.0
+voxel = 0.05
+[tiles]
+length = 100.0
+buffer = 5.0
+"""
+SETTINGS: dict[str, object] = {
+    "decimate": {"target": 50_000, "building": {"target": 20_000}},
+    "voxel": {"size": 0.1},
+    "split": {"vegetation": "both"},
+    "segment": {"overwrite": True, "min_classified": 0.3},
+}
+
+
+def settings(folder: Path) -> object:
+    """All parameters of all steps, as the file says."""
+    return _params(Settings.read(folder / "settings.toml"))
+
+
+def assignments(folder: Path) -> object:
+    """The same of `--set`, a line each."""
+    lines = (folder / "set.txt").read_bytes().decode("utf-8", "replace").splitlines()
+    return _params(Settings.read(None, [line for line in lines if line]))
+
+
+def _params(found: Settings) -> object:
+    found.check(STEPS, PER_CLASS)
+    whole = [step for step in STEPS if not any(f.is_required() for f in step.params.model_fields.values())]
+    return [found.params(step, group) for step in whole for group in ("terrain", "building")]
+
+
+def every_setting(data: bytes, rng: Random) -> bytes:
+    """Any parameter of any step as anything."""
+    step = rng.choice(STEPS)
+    names = list(step.params.model_fields) or ["x"]
+    value = rng.choice((*TEXT, "[1, 2]", "{a = 1}", "'x'", "1979-05-27"))
+    return f"{step.name}.{rng.choice(names)}={value}\n".encode("utf-8", "replace")
+
+
+def photos(folder: Path) -> list[Path]:
+    """A cloud, a CSV of photos, one of cameras."""
+    cloud(folder / "c.laz")
+    cv2.imwrite(str(folder / "1.png"), np.zeros((48, 64, 3), np.uint8))
+    (folder / "photos.csv").write_text(
+        "file,x,y,z,qw,qx,qy,qz,time,camera\n1.png,500010,5400010,102,1,0,0,0,3.5,front\n"
+    )
+    heading = "camera,model,width,height,fx,fy,cx,cy,k1,k2,p1,p2"
+    (folder / "cameras.csv").write_text(f"{heading}\nfront,opencv,64,48,50,50,31.5,23.5,0.1,0,0,0\n")
+    return [folder / "photos.csv", folder / "cameras.csv", folder / "1.png"]
+
+
+def read_photos(folder: Path) -> object:
+    """The tile of them."""
+    out = folder / "tile"
+    given = {"photos": folder / "photos.csv", "cameras": folder / "cameras.csv"}
+    return import_las([folder / "c.laz"], out, overwrite=out.exists(), **given)
+
+
+def trajectory(suffix: str) -> tuple[Make, Read]:
+    """A trajectory file, and its reader."""
+
+    def make(folder: Path) -> list[Path]:
+        trajectory_io.write(folder / f"t{suffix}", made_up(), UTM)
+        return [folder / f"t{suffix}"]
+
+    return make, lambda folder: trajectory_io.read(folder / f"t{suffix}", UTM)
+
+
+def camera_file(folder: Path) -> list[Path]:
+    """Cameras alone, and extrinsics."""
+    camera = {"id": "c", "model": "opencv", "size": [64, 48], "focal": [50.0, 50.0], "centre": [31.5, 23.5]}
+    (folder / "cameras.toml").write_text(tomli_w.dumps({"cameras": [camera]}))
+    np.savetxt(folder / "T.txt", np.eye(4)[:3], "%.9f")
+    return [folder / "cameras.toml", folder / "T.txt"]
+
+
+def read_camera_file(folder: Path) -> object:
+    """Both."""
+    return sweeps.read_camera(folder / "cameras.toml", 64, 48), sweeps.read_extrinsics(folder / "T.txt")
+
+
+def track(name: str, text: str) -> tuple[Make, Read]:
+    """A GPS track, and its reader."""
+    return written(name, text), lambda folder: read_gps(folder / name)
+
+
+def film(folder: Path) -> list[Path]:
+    """A GoPro's video."""
+    packets = [gps.gps5(0, stamp=7.0), gps.gps9(1), gps.gps5(2, stamp=9.0)]
+    return [gps.film(folder / "g.mp4", packets, [0.0, 1.0, 2.0])]
+
+
+def telemetry(data: bytes, rng: Random) -> bytes:
+    """Damage within the telemetry, which is a small part of the file."""
+    at = data.find(b"DEVC", rng.randrange(len(data)))
+    at = (at if at >= 0 else max(0, data.find(b"DEVC"))) + rng.randrange(700)
+    some = bytearray(data)
+    for i in range(at, min(at + rng.choice((1, 1, 4)), len(some))):
+        some[i] = rng.choice((0, 255, 63, rng.randrange(256)))
+    return bytes(some)
+
+
+def read_drive_file(folder: Path) -> object:
+    """The drive."""
+    return read_drive(folder / "drive.toml")
+
+
+def read_survey_folder(folder: Path) -> object:
+    """The survey, and its tiles."""
+    return [read_tile(path) for path in read_survey(folder).tiles]
