@@ -176,7 +176,10 @@ def _world(path: Path) -> tuple[str, Facts]:
     ]
     metadata = path.parent / "metadata.json"
     if metadata.is_file():
-        body = json.loads(metadata.read_text(encoding="utf-8"))
-        facts += [(key, json.dumps(value)) for key, value in body.items() if key not in ("crs",)]
+        try:
+            body = json.loads(metadata.read_text(encoding="utf-8"))
+            facts += [(key, json.dumps(value)) for key, value in body.items() if key not in ("crs",)]
+        except (ValueError, AttributeError, RecursionError) as error:
+            raise InputError(metadata, f"is no readable JSON ({str(error)[:100]})", "Export it again") from None
     size = sum(p.stat().st_size for p in path.parent.rglob("*") if p.is_file())
     return "world", [*facts, ("size", f"{size / 1e6:,.1f} MB")]

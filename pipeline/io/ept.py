@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import json
 import re
-import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ import numpy.typing as npt
 
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.extras import need
-from scan2sim.pipeline.io import files, points
+from scan2sim.pipeline.io import files, las, points
 from scan2sim.pipeline.io.points import PART, Points
 from scan2sim.pipeline.types import F64, Frame, PointCloud
 
@@ -90,22 +89,15 @@ def _nodes(folder: Path) -> Iterator[tuple[str, int]]:
 
 
 def _laszip(tile: Path) -> Iterator[Points]:
-    import laspy
-    from laspy.errors import LaspyException
-
-    try:
-        with laspy.open(tile) as reader:
-            names = set(reader.header.point_format.dimension_names)
-            for part in reader.chunk_iterator(PART):
-                yield Points(
-                    np.column_stack([part.x, part.y, part.z]),
-                    np.column_stack([part.red, part.green, part.blue]) if "red" in names else None,
-                    label=np.array(part.classification),
-                    time=np.array(part.gps_time) if "gps_time" in names else None,
-                    intensity=np.array(part.intensity),
-                )
-    except (LaspyException, ValueError, struct.error, OSError, RuntimeError) as error:
-        raise InputError(tile, f"is no readable LAZ file ({error})", REMEDY) from None
+    for part in las.records(tile, PART):
+        names = set(part.point_format.dimension_names)
+        yield Points(
+            np.column_stack([part.x, part.y, part.z]),
+            np.column_stack([part.red, part.green, part.blue]) if "red" in names else None,
+            label=np.array(part.classification),
+            time=np.array(part.gps_time) if "gps_time" in names else None,
+            intensity=np.array(part.intensity),
+        )
 
 
 def _packed(tile: Path, schema: list[dict[str, Any]], count: int) -> Iterator[Points]:

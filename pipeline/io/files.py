@@ -30,3 +30,12 @@ def check(path: Path, remedy: str = PUT_THERE) -> Path:
     if cause is not None:
         raise InputError(path, cause, remedy)
     return path
+
+
+def lines(path: Path, remedy: str = PUT_THERE) -> list[str]:
+    """The lines of a text file; bytes that are no UTF-8 become question marks, which no number has.
+
+    Raises:
+        InputError: it is no file.
+    """
+    return check(path, remedy).read_text(encoding="utf-8-sig", errors="replace").splitlines()

@@ -23,7 +23,7 @@ import numpy as np
 
 from scan2sim.pipeline.errors import InputError, SettingError
 from scan2sim.pipeline.io import crs as crs_io
-from scan2sim.pipeline.io import las
+from scan2sim.pipeline.io import files, las
 from scan2sim.pipeline.io.importing import place, tile_folder
 from scan2sim.pipeline.io.merging import GREY as GREY
 from scan2sim.pipeline.io.merging import borrow_colours, colour, interpolate, phase_of, read_bin
@@ -35,6 +35,8 @@ GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
 # the recording car's own returns, scanner axes: (low, high) corner in metres
 OWN_CAR: tuple[tuple[float, float, float], tuple[float, float, float]] = ((-3.2, -1.3, -2.0), (2.8, 1.3, 0.3))
 PHOTOS = (".png", ".jpg", ".jpeg")
+FARTHEST = 1e8
+"""Metres that no pose on Earth is from another."""
 SAME_DAY = "Use the synced and rectified photos with the calibration of the same day"
 
 
@@ -232,12 +234,9 @@ def numbered(folder: Path, suffixes: str | tuple[str, ...]) -> dict[int, Path]:
 
 def _calibration(drive: Path, name: str) -> dict[str, F64]:
     path = next((f / name for f in (drive, drive.parent) if (f / name).is_file()), drive.parent / name)
-    try:
-        lines = path.read_text().splitlines()
-    except FileNotFoundError:
-        raise InputError(path, "is missing", "Unpack the calibration of the drive's day beside the drive") from None
+    text = files.lines(path, "Unpack the calibration of the drive's day beside the drive")
     entries = {}
-    for key, _, rest in (line.partition(":") for line in lines):
+    for key, _, rest in (line.partition(":") for line in text):
         try:
             entries[key.strip()] = np.array(rest.split(), np.float64)
         except ValueError:
@@ -294,10 +293,7 @@ def _spans(drive: Path, numbers: list[int]) -> F64:
 
 
 def _times(path: Path, numbers: list[int]) -> F64:
-    try:
-        lines = path.read_text().splitlines()
-    except FileNotFoundError:
-        raise InputError(path, "is missing", "Unpack the drive's time stamps again") from None
+    lines = files.lines(path, "Unpack the drive's time stamps again")
     times = np.empty(len(numbers))
     for i, number in enumerate(numbers):
         line = lines[number].strip() if number < len(lines) else ""
@@ -340,8 +336,8 @@ def read_poses(path: Path, numbers: list[int]) -> F64:
     """
     try:
         rows = np.loadtxt(path, ndmin=2)
-        if rows.shape[1] != 12 or not np.isfinite(rows).all():
-            raise ValueError(f"shape {rows.shape}")
+        if rows.shape[1] != 12 or not (np.abs(rows) < FARTHEST).all():
+            raise ValueError(f"shape {rows.shape}, values up to {np.abs(rows).max(initial=0):g}")
     except FileNotFoundError:
         raise InputError(path, "is missing", "Put it there, or mend the name") from None
     except ValueError as error:
@@ -363,10 +359,9 @@ def _read_oxts(drive: Path, numbers: list[int]) -> tuple[F64, str]:
     rows = np.empty((len(numbers), 6))
     for i, number in enumerate(numbers):
         path = drive / "oxts" / "data" / f"{number:010d}.txt"
+        record = " ".join(files.lines(path, "Unpack oxts again, or give poses")).split()
         try:
-            rows[i] = np.array(path.read_text().split()[:6], np.float64)
-        except FileNotFoundError:
-            raise InputError(path, "is missing", "Unpack oxts again, or give poses") from None
+            rows[i] = np.array(record[:6], np.float64)
         except ValueError as error:
             raise InputError(path, f"is no OXTS record ({error})", "Unpack oxts again, or give poses") from None
         if not np.isfinite(rows[i]).all() or abs(rows[i, 0]) > 84 or abs(rows[i, 1]) > 180:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.errors import DataError, InputError
 from scan2sim.pipeline.io import files, las_header
 from scan2sim.pipeline.io.las_header import truncated
 from scan2sim.pipeline.types import F64, Frame, PointCloud
@@ -137,6 +137,16 @@ def class_names(path: Path) -> tuple[bool, dict[int, str]]:
     return SOFTWARE in writers, names
 
 
+def records(path: Path, size: int = CHUNK) -> Iterator[Any]:
+    """The points as laspy's records, `size` at a time.
+
+    Raises:
+        InputError: missing, truncated or damaged.
+    """
+    with _open(path) as reader:
+        yield from _parts(path, reader, size)
+
+
 def chunks(path: Path, frame: Frame, size: int = CHUNK) -> Iterator[PointCloud]:
     """The points in their order, `size` at a time, as `read` reads them.
 
@@ -181,7 +191,12 @@ def write_parts(path: Path, parts: Iterable[PointCloud], scale: float = 0.001, s
     header.generating_software = software
     with laspy.open(path, mode="w", header=header) as writer:
         for part in chain([first], rest):
-            writer.write_points(_record(part, header))
+            try:
+                writer.write_points(_record(part, header))
+            except OverflowError:
+                reach = 2**31 * scale / 1000
+                cause = f"its points are more than {reach:,.0f} km apart: LAS holds no more in steps of {scale:g} m"
+                raise DataError(path.name, cause, "Remove stray points, and check the unit") from None
 
 
 def _header(cloud: PointCloud, scale: float) -> Any:

@@ -83,7 +83,7 @@ def _walk(path: Path, file: BinaryIO, at: int, number: int, head: int, end: int)
     """Go through records that must end before byte `end`; the points a chunk, if one of them tells of LAZ's."""
     chunk = None
     for i in range(number):
-        file.seek(at)
+        file.seek(min(at, end))
         about = file.read(head)
         length = struct.unpack_from("<H" if head == VLR else "<Q", about, 20)[0] if len(about) == head else 0
         if len(about) < head or at + head + length > end:

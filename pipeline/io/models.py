@@ -21,6 +21,7 @@ from scan2sim.pipeline.errors import InputError, SettingError
 from scan2sim.pipeline.io import clouds as cloud_io
 from scan2sim.pipeline.io import crs as crs_io
 from scan2sim.pipeline.io import las, photo_gps
+from scan2sim.pipeline.io.image import size_of
 from scan2sim.pipeline.io.importing import inside, place, tile_folder
 from scan2sim.pipeline.io.tile import read_tile, tile_name, write_tile
 from scan2sim.pipeline.similarity import Similarity
@@ -110,14 +111,7 @@ class Photos:
 
     def size(self, name: str) -> tuple[int, int]:
         """Width and height of a photo, pixels as they lie in the file."""
-        from PIL import Image
-
-        path = self.find(name)
-        try:
-            with Image.open(path) as image:
-                return image.size
-        except Exception as error:  # Pillow's parsers raise whatever damage leads to
-            raise InputError(path, f"is no readable image ({error})", "Copy it again") from None
+        return size_of(self.find(name))
 
     def _known(self) -> dict[str, list[Path]]:
         if self._names is None:

@@ -23,7 +23,7 @@ from pydantic import ValidationError
 from scan2sim.pipeline.errors import DataError, InputError, SettingError
 from scan2sim.pipeline.io import clouds as cloud_io
 from scan2sim.pipeline.io import crs as crs_io
-from scan2sim.pipeline.io import las, toml
+from scan2sim.pipeline.io import files, las, toml
 from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.io.image import read_rgb
 from scan2sim.pipeline.io.importing import place, tile_folder
@@ -187,12 +187,7 @@ def read_extrinsics(path: Path) -> F64:
         InputError: it is neither, or no rigid motion.
     """
     remedy = "Write T_camera_scanner: three rows of four numbers, scanner axes to camera axes"
-    try:
-        lines = [line.partition("#")[0].strip() for line in path.read_text(encoding="utf-8").splitlines()]
-    except FileNotFoundError:
-        raise InputError(path, "is missing", "Put it there, or mend the name") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(path, f"can't be read ({error})", remedy) from None
+    lines = [line.partition("#")[0].strip() for line in files.lines(path)]
     named = {key.strip(): rest for key, colon, rest in (line.partition(":") for line in lines) if colon}
     try:
         if "Tr" in named:

@@ -14,6 +14,7 @@ from scan2sim.pipeline.io.tile import read_tile
 from tests.fuzz import clouds, models, tables
 from tests.fuzz.damage import Damage
 from tests.pipeline.io.test_cloud_formats import FORMATS
+from tests.pipeline.io.test_model_imports import WRITERS
 from tests.slam import test_gps as gps
 
 
@@ -55,6 +56,8 @@ KINDS: dict[str, Kind] = {
     "video": Kind(tables.film, models.read_video),
     "colmap txt": Kind(*models.colmap("txt")),
     "colmap bin": Kind(*models.colmap("bin")),
+    **{name: Kind(*models.model(name)) for name in WRITERS},
+    "kitti odometry": Kind(models.odometry, models.read_odometry),
     "kitti raw": Kind(models.kitti, models.read_kitti),
     "sweeps": Kind(models.drive, models.read_drive),
     "sweep bin": Kind(*models.sweep(".bin")),

@@ -11,9 +11,10 @@ import numpy as np
 from scan2sim.flows.inspect import inspect_path
 from scan2sim.pipeline.errors import DataError
 from scan2sim.pipeline.io import image
-from scan2sim.pipeline.io.colmap import import_colmap
 from scan2sim.pipeline.io.kitti import import_kitti_raw
+from scan2sim.pipeline.io.kitti_odometry import import_kitti_odometry
 from scan2sim.pipeline.io.merging import read_bin
+from scan2sim.pipeline.io.models import import_model
 from scan2sim.pipeline.io.sweeps import Pictures, import_sweeps, read_sweep
 from scan2sim.pipeline.steps.views import _problem
 from scan2sim.pipeline.types import Camera, View
@@ -22,6 +23,8 @@ from tests.pipeline import made_up
 from tests.pipeline import test_sweeps as sweeps
 from tests.pipeline.io.test_colmap_import import make_model
 from tests.pipeline.io.test_kitti_import import make_drive
+from tests.pipeline.io.test_kitti_odometry import make_sequence
+from tests.pipeline.io.test_model_imports import WRITERS, images
 
 Make, Read = Callable[[Path], list[Path]], Callable[[Path], object]
 
@@ -52,7 +55,24 @@ def colmap(form: str) -> tuple[Make, Read]:
 
     def read(folder: Path) -> object:
         out = folder / "tile"
-        return import_colmap(folder / form, folder / "images", out, overwrite=out.exists())
+        return import_model("colmap", folder / form, folder / "images", out, overwrite=out.exists())
+
+    return make, read
+
+
+def model(kind: str) -> tuple[Make, Read]:
+    """A model of another program."""
+
+    def make(folder: Path) -> list[Path]:
+        WRITERS[kind](folder)
+        files = sorted(path for path in folder.rglob("*") if path.is_file())
+        np.savetxt(folder / "dense.xyz", np.random.default_rng(0).uniform(0, 9, (50, 3)), "%.3f")
+        return files
+
+    def read(folder: Path) -> object:
+        path = next(p for p in sorted(folder.rglob("*")) if p.suffix in (".json", ".xml", ".out", ".nvm"))
+        out = folder / "tile"
+        return import_model(kind, path, images(), out, cloud=folder / "dense.xyz", overwrite=out.exists())
 
     return make, read
 
@@ -67,6 +87,18 @@ def read_kitti(folder: Path) -> object:
     """The tile of it."""
     out = folder / "tile"
     return import_kitti_raw(folder / "2011_09_26", out, overwrite=out.exists())
+
+
+def odometry(folder: Path) -> list[Path]:
+    """A sequence of KITTI's odometry."""
+    make_sequence(folder)
+    return sorted(path for path in folder.rglob("*") if path.suffix in (".txt", ".bin"))
+
+
+def read_odometry(folder: Path) -> object:
+    """The tile of it."""
+    out = folder / "tile"
+    return import_kitti_odometry(folder / "sequences" / "31", out, overwrite=out.exists())
 
 
 def drive(folder: Path) -> list[Path]:

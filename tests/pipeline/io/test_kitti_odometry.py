@@ -35,6 +35,10 @@ TR = rigid(Rotation.from_rotvec([0.01, 0.02, -0.01]).as_matrix() @ AXES, [0.0, -
 
 @pytest.fixture
 def sequence(tmp_path: Path) -> Path:
+    return make_sequence(tmp_path)
+
+
+def make_sequence(tmp_path: Path) -> Path:
     """A car that drives a curve past a wall of dots, each of another colour; as the data set is laid out."""
     folder = tmp_path / "sequences" / "31"
     for name in ("velodyne", "image_2"):

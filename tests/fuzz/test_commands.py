@@ -1,0 +1,90 @@
+"""Damaged files through the real command: exit code, words, no traceback, and what was there before as it was."""
+
+from __future__ import annotations
+
+import hashlib
+import subprocess
+import sys
+from pathlib import Path
+from random import Random
+
+import pytest
+
+from tests.fuzz.damage import damaged
+from tests.fuzz.harness import CODES
+from tests.fuzz.kinds import KINDS
+from tests.pipeline.io.test_tile import body, cloud, save
+
+SEEDS = range(12)
+IMPORTS = {
+    "laz": ["import", "clouds", "{x}/c.laz", "--crs", "EPSG:32632"],
+    "photos.csv": ["import", "clouds", "{x}/c.laz", "--photos", "{x}/photos.csv", "--cameras", "{x}/cameras.csv"],
+    "colmap bin": ["import", "colmap", "{x}/bin", "{x}/images"],
+    "kitti raw": ["import", "kitti-raw", "{x}/2011_09_26"],
+    "sweeps": ["import", "sweeps", "{x}/sweeps", "{x}/camera.csv", "--scanner-poses"],
+    "survey.toml": ["survey", "{x}"],
+    "tile.toml": ["run", "{x}"],
+}
+
+
+def scan2sim(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    """The command, in a process of its own."""
+    command = [sys.executable, "-m", "scan2sim.flows.cli", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60)
+
+
+def contents(folder: Path) -> dict[str, str]:
+    """Digest of every file below a folder, but for logs and locks."""
+    files = sorted(p for p in folder.rglob("*") if p.is_file() and p.suffix not in (".log", ".lock"))
+    return {str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
+
+
+def earlier(folder: Path) -> Path:
+    """A folder with a tile, a survey's mark, and results of an earlier run."""
+    folder.mkdir()
+    save(folder, body(folder, photos=[], cameras=[]))
+    (folder / "survey.toml").write_text("# earlier")
+    for name in ("world/town.sdf", "world/models/town/model.sdf", "report.html", "steps/ingest/k/manifest.json"):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text("earlier")
+    return folder
+
+
+@pytest.mark.parametrize("kind", IMPORTS)
+def test_the_command_says_what_is_wrong_and_leaves_what_was_there(kind: str, tmp_path: Path) -> None:
+    """The first few damages that the kind's reader refuses."""
+    x, out = tmp_path / "x", earlier(tmp_path / "out")
+    x.mkdir()
+    files, before, refused = KINDS[kind].make(x), contents(out), 0
+    for seed in SEEDS:
+        rng = Random(seed)
+        path = rng.choice(files)
+        good = path.read_bytes()
+        path.write_bytes(damaged(good, rng))
+        try:
+            KINDS[kind].read(x)
+        except Exception:
+            arguments = [argument.format(x=x) for argument in IMPORTS[kind]]
+            more = ["--overwrite"] if "import" in arguments else []
+            done = scan2sim(*arguments, "--out", out, *more)
+            assert done.returncode in CODES - {0}, done.stderr
+            assert "error: " in done.stderr and "Traceback" not in done.stderr
+            assert contents(out) == before, f"seed {seed}"
+            refused += 1
+        path.write_bytes(good)
+        if refused == 2:
+            return
+    raise AssertionError(f"only {refused} of {len(SEEDS)} damages are refused")
+
+
+def test_a_run_that_fails_on_the_way_leaves_the_world_of_before(tmp_path: Path) -> None:
+    """The tile can be read, but has too few points: known only once they are read."""
+    out = earlier(tmp_path / "out")
+    before = {name: digest for name, digest in contents(out).items() if not name.startswith("steps")}
+    (tmp_path / "tile").mkdir()
+    save(tmp_path / "tile", body(tmp_path / "tile", photos=[], cameras=[]))
+    cloud(tmp_path / "tile" / "cloud.laz", n=500)
+    done = scan2sim("run", tmp_path / "tile", "--out", out)
+    assert done.returncode == 4 and "only 500 points" in done.stderr and "Traceback" not in done.stderr
+    after = contents(out)
+    assert {name: after.get(name) for name in before} == before
