@@ -212,8 +212,9 @@ def read_gopro(path: Path) -> GpsTrack:
         raise InputError(path, "has telemetry, but no GPS", "Switch GPS on in the camera, or give a GPX")
     starts = np.array([start for start, _, _ in found])
     stamps = np.array([fixes.stamp for _, _, fixes in found])
-    if np.isfinite(stamps).all() and (np.diff(stamps) > 0).all():
-        starts = packets[0][0] + stamps - min(part.oldest for part in parts[0].values())
+    oldest = min((part.oldest for part in parts[0].values()), default=math.nan)
+    if np.isfinite([*stamps, oldest]).all() and (np.diff(stamps) > 0).all():
+        starts = packets[0][0] + stamps - oldest
     spans = np.diff(starts, append=starts[-1] + found[-1][1])
     if len(spans) > 1:
         spans = np.minimum(spans, 1.5 * np.median(spans[:-1]))  # a packet lost leaves a gap
@@ -423,7 +424,7 @@ def _packets(path: Path) -> Iterator[tuple[float, float, bytes]]:
                 if packet.pts is not None and data[:4] == b"DEVC":  # other data tracks hold time codes
                     tick = float(packet.time_base)
                     yield packet.pts * tick, (packet.duration or round(1 / tick)) * tick, data
-    except av.error.FFmpegError as error:
+    except (av.error.FFmpegError, UnicodeDecodeError) as error:
         raise InputError(path, f"is no readable video ({error})", "Copy it again") from None
 
 

@@ -91,7 +91,7 @@ def open_video(path: Path, *, fps: float = 10.0, times: Path | None = None) -> V
             count = stream.frames or (round(stream.duration * stream.time_base * rate) if stream.duration else None)
             start = _start(container.metadata.get("creation_time") or stream.metadata.get("creation_time"))
             return Video(path, stream.codec_context.width, stream.codec_context.height, count, rate, start)
-    except av.error.FFmpegError as error:
+    except (av.error.FFmpegError, UnicodeDecodeError) as error:
         raise InputError(path, f"is no readable video ({error})", "Copy or convert it again") from None
 
 

@@ -1,4 +1,4 @@
-"""Damaged files: a sentence and an exit code of the table, or a reading of them; never a traceback, soon, within memory.
+"""Damaged files: a sentence and an exit code of the table, or a reading of them; no traceback, soon, in bounds.
 
 A failure names kind and seed: `python -m tests.fuzz --first SEED --cases 1 KIND` shows it again.
 """
