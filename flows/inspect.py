@@ -126,15 +126,16 @@ def _mesh(path: Path) -> tuple[str, Facts]:
 
     try:
         loaded = trimesh.load_scene(path, process=False)
+        meshes = [part for part in loaded.geometry.values() if isinstance(part, trimesh.Trimesh)]
+        bounds = loaded.bounds
     except Exception as error:  # trimesh's parsers raise whatever the damage leads to
         raise InputError(path, f"is no readable mesh ({error})", "Export it again") from None
-    meshes = list(loaded.geometry.values())
     textures = {getattr(getattr(m.visual, "material", None), "name", None) for m in meshes} - {None}
     return "mesh", [
         ("parts", str(len(meshes))),
         ("triangles", f"{sum(len(m.faces) for m in meshes):,}"),
         ("vertices", f"{sum(len(m.vertices) for m in meshes):,}"),
-        ("extent", _bounds(*loaded.bounds) if loaded.bounds is not None else "empty"),
+        ("extent", _bounds(*bounds) if bounds is not None else "empty"),
         ("materials", ", ".join(sorted(map(str, textures))) or "none"),
     ]
 

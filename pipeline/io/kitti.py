@@ -133,6 +133,9 @@ def assemble(
     """Make a tile of a drive: sweeps merged, coloured by the photos of their own frames. As `import_kitti_raw` says."""
     numbers, sweeps, rigs, photos, spans = list(drive.sweeps), drive.sweeps, drive.rigs, drive.photos, drive.spans
     T_velo, crs = drive.T_velo.copy(), drive.crs
+    if (np.diff(spans[:, 1]) <= 0).any():
+        late = numbers[int(np.argmax(np.diff(spans[:, 1]) <= 0)) + 1]
+        raise InputError(sweeps[late], "its time stamp doesn't follow that of the sweep before", "Unpack them again")
     frame = Frame(crs, (0.0, 0.0, 0.0) if crs == "local" else tuple(np.floor(T_velo[0, :3, 3]).tolist()))
     T_velo[:, :3, 3] -= frame.origin
 
@@ -251,7 +254,7 @@ def entry(drive: Path, name: str, key: str, size: int) -> F64:
         InputError: the file is missing, or has no such entry.
     """
     values = _calibration(drive, name).get(key)
-    if values is None or values.size != size:
+    if values is None or values.size != size or not (np.abs(values) < FARTHEST).all():
         raise InputError(drive.parent / name, f"has no `{key}` of {size} numbers", "Unpack the calibration again")
     return values
 
@@ -260,6 +263,8 @@ def _rigid(drive: Path, name: str) -> F64:
     T = np.eye(4)
     T[:3, :3] = entry(drive, name, "R", 9).reshape(3, 3)
     T[:3, 3] = entry(drive, name, "T", 3)
+    if np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-3:
+        raise InputError(drive.parent / name, "its `R` is no rotation", "Unpack the calibration again")
     return T
 
 
