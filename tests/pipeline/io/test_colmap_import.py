@@ -174,3 +174,81 @@ def test_damaged_models_are_refused_or_read(tmp_path: Path, form: str) -> None:
         file.write_bytes(whole)
     assert refused > 100
     read(tmp_path / form, Photos(tmp_path / "images"))
+
+
+def fused(folder: Path) -> Path:
+    """COLMAP's own stereo fusion of six photos of a wall 5 m away, red left of x = 0, green right of it.
+
+    Its depth maps, which need a GPU to be computed, are made up; what is fused and written is COLMAP's.
+    """
+    width, height, f, n = 64, 48, 60.0, 6
+    for name in ("images", "sparse", "stereo/depth_maps", "stereo/normal_maps", "stereo/consistency_graphs"):
+        (folder / name).mkdir(parents=True)
+
+    def write(kind: str, name: str, values: np.ndarray) -> None:
+        head = f"{width}&{height}&{values.shape[2]}&".encode()
+        body = values.astype(np.float32).transpose(2, 0, 1).tobytes()
+        (folder / "stereo" / kind / f"{name}.geometric.bin").write_bytes(head + body)
+
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(camera_id=1, model="PINHOLE", width=width, height=height, params=[f, f, 32, 24])
+    model.add_camera_with_trivial_rig(camera)
+    random = np.random.default_rng(0)
+    wall = np.column_stack([random.uniform(-1, 2.5, 60), random.uniform(-1, 1, 60), np.full(60, 5.0)])
+    for i in range(n):
+        centre = np.array([0.3 * i, 0.0, 0.0])
+        pixels = pycolmap.Point2DList([pycolmap.Point2D(f * (p - centre)[:2] / 5 + [32, 24]) for p in wall])
+        image = pycolmap.Image(name=f"{i}.png", camera_id=1, image_id=i + 1, points2D=pixels)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(), -centre))
+        write("depth_maps", f"{i}.png", np.full((height, width, 1), 5.0))
+        write("normal_maps", f"{i}.png", np.tile([0.0, 0.0, -1.0], (height, width, 1)))
+        right = (np.arange(width) + 0.5 - 32) * 5 / f + centre[0] > 0
+        row = np.where(right[:, None], [20, 200, 30], [30, 20, 200]).astype(np.uint8)
+        cv2.imwrite(str(folder / "images" / f"{i}.png"), np.tile(row, (height, 1, 1)))
+    for k, point in enumerate(wall):
+        track = pycolmap.Track([pycolmap.TrackElement(i + 1, k) for i in range(n)])
+        model.add_point3D(point, track, np.array([9, 9, 9], np.uint8))
+    (folder / "stereo" / "fusion.cfg").write_text("".join(f"{i}.png\n" for i in range(n)))
+    model.write(folder / "sparse")
+    options = pycolmap.StereoFusionOptions()
+    options.min_num_pixels, options.check_num_images = 2, n - 1
+    pycolmap.stereo_fusion(folder / "fused.ply", folder, options=options, output_type="PLY")
+    return folder / "fused.ply"
+
+
+def test_colmaps_own_dense_cloud(tmp_path: Path) -> None:
+    cloud = fused(tmp_path)
+    assert b"property float nx" in cloud.read_bytes()[:300]
+    path = import_model("colmap", tmp_path / "sparse", tmp_path / "images", tmp_path / "tile", cloud=cloud)
+    tile = read_tile(path)
+    read = clouds.read(tile.clouds[0], tile.frame)
+    xyz = tile.frame.to_crs(read.xyz)
+    assert len(xyz) > 1000 and np.abs(xyz[:, 2] - 5).max() < 1e-3 and np.ptp(xyz[:, 0]) > 5
+    assert read.rgb is not None
+    left, right = read.rgb[xyz[:, 0] < -0.2], read.rgb[xyz[:, 0] > 0.2]
+    assert (left == [200, 20, 30]).all() and (right == [30, 200, 20]).all() and len(left) and len(right)
+
+
+@pytest.mark.slow
+def test_real_photos_are_placed_by_their_gps(real_data: Path, tmp_path: Path) -> None:
+    """COLMAP's own reconstruction of 29 photos of a square, whose EXIF holds a phone's GPS."""
+    images = real_data / "opensfm_lund" / "images"
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.max_image_size, extraction.sift.max_num_features = 1024, 3000
+    pycolmap.set_random_seed(0)
+    mode = pycolmap.CameraMode.SINGLE
+    pycolmap.extract_features(tmp_path / "db.db", images, camera_mode=mode, extraction_options=extraction)
+    pycolmap.match_exhaustive(tmp_path / "db.db")
+    maps = pycolmap.incremental_mapping(tmp_path / "db.db", images, tmp_path)
+    best = max(maps.values(), key=lambda found: found.num_reg_images())
+    assert best.num_reg_images() >= 20
+    (tmp_path / "model").mkdir()
+    best.write(tmp_path / "model")
+    told: list[str] = []
+    tile = read_tile(import_model("colmap", tmp_path / "model", images, tmp_path / "tile", gps=True, warn=told.append))
+    print(told)
+    assert tile.frame.crs == "EPSG:32633" and "placed by the GPS of" in told[0]
+    ups = np.array([-view.T_world_cam[:3, 1] for view in tile.views])
+    assert ups[:, 2].mean() > 0.9  # who takes photos holds the phone upright: GPS didn't know it
+    path = np.array([view.centre for view in tile.views])
+    assert 20 < np.ptp(path[:, :2], axis=0).max() < 300
