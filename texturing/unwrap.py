@@ -22,11 +22,15 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from scan2sim.pipeline.types import Mesh
+    from scan2sim.pipeline.types import Mesh, View
     from scan2sim.texturing.atlas import Backend, Chartered
 
     Index = npt.NDArray[np.int64]
 
+FAR = 1e5
+"""Metres to where an orthographic camera's rays are taken to meet."""
+PER_PIXEL = 0.5
+"""Texels of what an orthophoto drapes are this share of its pixels, or `texel` where that is coarser."""
 UTILISATION = 0.5
 """Share of a page that charts are expected to cover, when blocks are cut to pages."""
 
@@ -73,12 +77,15 @@ def unwrap(inputs: Inputs, params: UnwrapParams, out: Path, report: Report) -> D
     laid = Laid(np.zeros((len(mesh), 3, 2), np.float32), np.full(len(mesh), -1, np.int16), [], 0, 0)
     if len(mesh):
         if params.backend == "photo":
-            label, centres = _photos(inputs)
-            laid = lay_by_photo(mesh, label, centres, params)
-            seen = label >= 0
+            label, centres, pixel = _photos(inputs)
+            own = np.append(pixel, 0.0)[label]
             coarse = params.model_copy(update={"texel": params.texel * params.unseen})
-            laid = lay(mesh, laid, np.flatnonzero((laid.page < 0) & seen), params, report)
-            laid = lay(mesh, laid, np.flatnonzero((laid.page < 0) & ~seen), coarse, report)
+            draped = params.model_copy(update={"texel": max(params.texel, PER_PIXEL * float(own.max()))})
+            parts = [((label >= 0) & (own == 0), params), ((label >= 0) & (own > 0), draped)]
+            for faces, fine in parts:
+                laid = lay_by_photo(mesh, laid, np.where(faces, label, -1), centres, fine)
+            for faces, fine in (*parts, (label < 0, coarse)):
+                laid = lay(mesh, laid, np.flatnonzero((laid.page < 0) & faces), fine, report)
         else:
             laid = lay(mesh, laid, np.arange(len(mesh)), params, report)
     uv, page, pages, charts, fallbacks = laid.uv, laid.page, laid.pages, laid.charts, laid.fallbacks
@@ -110,36 +117,54 @@ class Laid:
     fallbacks: int
 
 
-def _photos(inputs: Inputs) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float64]]:
-    """The view (F,) of every face's detail, and the cameras' centres (V, 3)."""
+def _photos(inputs: Inputs) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """The view (F,) of every face's detail, the cameras' centres (V, 3), and metres a pixel (V,), 0 if by distance."""
     import numpy as np
 
     from scan2sim.pipeline.io import views as views_io
     from scan2sim.texturing.choose import Choice
 
     views = views_io.load(inputs["views"])
-    return Choice.load(inputs["choice"]).label, np.array([view.centre for view in views]).reshape(-1, 3)
+    pixel = [1 / min(v.camera.fx, v.camera.fy) if v.camera.model == "orthographic" else 0.0 for v in views]
+    centres = np.array([_eye(view) for view in views]).reshape(-1, 3)
+    return Choice.load(inputs["choice"]).label, centres, np.array(pixel, np.float64)
+
+
+def _eye(view: View) -> npt.NDArray[np.float64]:
+    """(3,) where a view's rays meet: its centre; those of an orthographic camera nearly do so far above its middle."""
+    from scan2sim.pipeline.cameras import ray_origins
+
+    if view.camera.model != "orthographic":
+        return view.centre
+    middle = ray_origins(view.camera, [[view.camera.width / 2, view.camera.height / 2]])[0]
+    return view.centre + view.T_world_cam[:3, :3] @ (middle - (0.0, 0.0, FAR))
 
 
 def lay_by_photo(
-    mesh: Mesh, label: npt.NDArray[np.int32], centres: npt.NDArray[np.float64], params: UnwrapParams
+    mesh: Mesh, laid: Laid, label: npt.NDArray[np.int32], centres: npt.NDArray[np.float64], params: UnwrapParams
 ) -> Laid:
-    """Charts as the chosen photos see them; faces that can't be laid so have no page."""
+    """Charts as the chosen photos see them, on pages after those that are there; faces that can't be laid so get none.
+
+    Args:
+        label: (F,) the photo of every face, -1 for those that are not to be laid.
+        centres: (V, 3) of the cameras.
+    """
     import numpy as np
 
     from scan2sim.texturing import photo_charts
 
-    uv, page = np.zeros((len(mesh), 3, 2), np.float32), np.full(len(mesh), -1, np.int16)
+    uv, page = laid.uv.copy(), laid.page.copy()
     charts = photo_charts.cut(mesh, label, centres, params.texel, params.page_size - 2 * params.gutter)
     place, of, pages = photo_charts.pack(charts.size, params.page_size, params.gutter)
     flat = charts.flat + place[charts.chart][:, None].astype(np.float32)
     good = ~photo_charts.overlapping(flat, of[charts.chart], pages)
     size = np.array(pages, np.float32).reshape(-1, 2)[of[charts.chart]]
     face = charts.face[good]
-    page[face] = of[charts.chart][good]
+    page[face] = of[charts.chart][good] + len(laid.pages)
     uv[face] = ((flat + 0.5) / size[:, None])[good]
     uv[face, :, 1] = 1 - uv[face, :, 1]
-    return Laid(uv, page, [{"width": w, "height": h} for w, h in pages], len(charts.size), 0)
+    pages_now = laid.pages + [{"width": w, "height": h} for w, h in pages]
+    return Laid(uv, page, pages_now, laid.charts + len(charts.size), laid.fallbacks)
 
 
 def lay(mesh: Mesh, laid: Laid, faces: Index, params: UnwrapParams, report: Report) -> Laid:

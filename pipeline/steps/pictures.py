@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import Field
 
 from scan2sim.pipeline.classes import GROUPS, colour_of
@@ -83,7 +84,8 @@ def pictures(inputs: Inputs, params: PicturesParams, out: Path, report: Report) 
     world = render.Renderer([render.textured(inputs[g]) for g in groups])
     low, high = bounds([body.mesh.vertices for body in world.bodies if len(body.mesh)] or [cloud.xyz])
     camera = render.pinhole(params.width, params.width * 9 // 16, field=75)
-    eye, where = whole_pose(low, high, camera), "From the air"
+    shown = np.concatenate([body.mesh.vertices for body in world.bodies if len(body.mesh)] or [cloud.xyz])
+    eye, where = whole_pose(shown.clip(low, high), camera), "From the air"
     if path is not None and len(path) > 1:
         eye, where = driver_pose(path.positions, low, high, plain), "From a driver's eye"
 
@@ -162,18 +164,21 @@ def bounds(parts: list[Any]) -> tuple[F64, F64]:
     return low.astype(np.float64), high.astype(np.float64)
 
 
-def whole_pose(low: F64, high: F64, camera: Camera) -> F64:
-    """(4, 4) pose of an eye in the air, across the longer side, from where the whole box is in the picture."""
+def whole_pose(points: npt.NDArray[np.floating], camera: Camera) -> F64:
+    """(4, 4) pose of an eye in the air, across the longer side, as near as all points (N, 3) are in the picture."""
     from scan2sim.pipeline.render import look_at
 
-    size = high - low
+    size = np.ptp(points, axis=0)
     side = np.array([-0.35, -0.94]) if size[0] >= size[1] else np.array([-0.94, -0.35])
-    toward = np.array([*side * math.cos(SLANT), math.sin(SLANT)])
-    pose = look_at(toward, np.zeros(3))
-    corners = (np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T - (low + high) / 2) @ pose[:3, :3]
-    reach = np.array([camera.width / 2 / camera.fx, camera.height / 2 / camera.fy])
-    distance = float((np.abs(corners[:, :2]) / reach - corners[:, 2:]).max())
-    pose[:3, 3] = (low + high) / 2 + toward * max(distance, 1.0)
+    pose = look_at(np.array([*side * math.cos(SLANT), math.sin(SLANT)]), np.zeros(3))
+    x, y, z = (points @ pose[:3, :3]).T
+    middle, back = [], []
+    for across, slope in ((x, camera.width / 2 / camera.fx), (y, camera.height / 2 / camera.fy)):
+        # a point at (across, z) is in the picture of an eye at (m, e) where |across - m| <= slope (z - e)
+        right, left = float((across - slope * z).max()), float((-across - slope * z).max())
+        middle.append((right - left) / 2)
+        back.append((right + left) / 2 / slope)
+    pose[:3, 3] = pose[:3, :3] @ np.array([*middle, -max(back)])
     return pose
 
 

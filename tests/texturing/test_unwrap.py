@@ -120,3 +120,26 @@ def test_the_same_again(tmp_path):
 
 def test_vegetation_is_textured_at_three_centimetres():
     assert UnwrapParams(**UNWRAP.per_class["vegetation"]).texel == 0.03
+
+
+def test_what_an_orthophoto_drapes_is_laid_flat_at_half_its_pixels(tmp_path):
+    from scan2sim.pipeline.io import views as views_io
+    from scan2sim.pipeline.types import Camera, View
+    from scan2sim.texturing.choose import Choice
+
+    mesh = hills()
+    down = np.diag([1.0, -1, -1, 1])
+    down[:3, 3] = 0, 6, 12
+    camera = Camera("orthographic", 30, 30, 5.0, 5.0, 0.0, 0.0)  # 20 cm a pixel
+    views_io.save(tmp_path / "views.json", [View("map", camera, down, tmp_path / "map.png")])
+    label = np.zeros(len(mesh), np.int32)
+    Choice(label[:, None], np.ones((len(mesh), 1), np.float32), label).save(tmp_path / "choice.npz")
+    mesh.save(tmp_path / "in.npz")
+    inputs = {"mesh": tmp_path / "in.npz", "views": tmp_path / "views.json", "choice": tmp_path / "choice.npz"}
+    done = unwrap(inputs, UnwrapParams(texel=0.01), tmp_path, silent)
+    laid, pages = Mesh.load(done.files["mesh"]), json.loads(done.files["pages"].read_text())
+    assert len(pages) == 1 and (laid.page == 0).all()
+    size = np.array([pages[0]["width"], pages[0]["height"]])
+    a, b, c = np.moveaxis(laid.uv * size, 1, 0)
+    area = np.abs(np.cross(np.pad(b - a, ((0, 0), (0, 1))), np.pad(c - a, ((0, 0), (0, 1)))))[:, 2] / 2
+    assert np.sqrt(laid.face_area / area) == pytest.approx(0.1, rel=0.15)
