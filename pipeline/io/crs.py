@@ -95,6 +95,11 @@ def convergence(frame: Frame) -> float:
     return float(np.radians(Proj(_horizontal(frame.crs)).get_factors(here[1], here[0]).meridian_convergence))
 
 
+def has_heights(crs: str) -> bool:
+    """Whether a CRS says of its own what heights are above (a geoid, say)."""
+    return crs != LOCAL and bool(_parsed(crs).is_compound)
+
+
 def _parsed(crs: str):  # type: ignore[no-untyped-def]  # pyproj is imported late
     from pyproj import CRS
     from pyproj.exceptions import CRSError

@@ -1,8 +1,9 @@
 """Agisoft Metashape's `cameras.xml` (Export Cameras, Agisoft XML).
 
-A camera's `transform` is camera to chunk, row by row, with OpenCV's axes. The chunk's `transform` (rotation, scale,
-translation) leads to geocentric coordinates where the chunk's `reference` is a CRS of the Earth, and to the
-reference's own coordinates where that is local. Of a calibration:
+A camera's `transform` is camera to chunk, row by row, with OpenCV's axes. Its component's `transform` (rotation, scale,
+translation), or the chunk's where it has none, leads to geocentric coordinates where the chunk's `reference` is a CRS
+of the Earth, and to the reference's own coordinates where that is local. Of several components the largest is taken. Of
+a calibration:
 
     u = w/2 + cx + x' f + x' b1 + y' b2,  v = h/2 + cy + y' f
     x' = x (1 + k1 r2 + k2 r4 + k3 r6 + k4 r8) + p1 (r2 + 2 x2) + 2 p2 x y
@@ -17,6 +18,7 @@ Source: Metashape Professional user manual 2.1, appendix D, Camera models.
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
@@ -44,6 +46,10 @@ def read(model: Path, photos: Photos) -> Model:
         wanted = [camera for camera in chunk.iterfind("cameras//camera") if camera.get("enabled", "1") in ("1", "true")]
         aligned = [camera for camera in wanted if camera.find("transform") is not None]
         components = {c.get("id"): _similarity(c.find("transform")) for c in chunk.iterfind("components/component")}
+        together = Counter(camera.get("component_id") for camera in aligned)
+        largest = together.most_common(1)[0][0] if together else None
+        apart = [camera for camera in aligned if camera.get("component_id") != largest]
+        aligned = [camera for camera in aligned if camera.get("component_id") == largest]
         cameras, shots = {}, []
         for camera in aligned:
             key = str(camera.get("sensor_id"))
@@ -54,15 +60,15 @@ def read(model: Path, photos: Photos) -> Model:
             pose = np.array(_numbers(camera.find("transform"), 16)).reshape(4, 4)
             _check_rotation(pose[:3, :3], str(camera.get("label")))
             shots.append(Shot(str(camera.get("label")), f"sensor_{key}", pose))
-        onto = _similarity(chunk.find("transform"))
-        if len(components) == 1:  # of one component this is the same as the chunk's; of several, each has its own
-            onto = onto or next(iter(components.values()))
+        onto = components.get(largest) or _similarity(chunk.find("transform"))
         reference = (chunk.findtext("reference") or "").strip()
     except (TypeError, ValueError, KeyError) as error:
         raise InputError(model, f"lacks or misstates {str(error)[:120]}", REMEDY) from None
     notes = []
-    if len(wanted) > len(aligned):
-        notes.append(f"{len(wanted) - len(aligned)} photos that have no pose of their own are left out")
+    if apart:
+        notes.append(f"{len(apart)} photos of {len(together) - 1} smaller components are left out")
+    if len(wanted) > len(aligned) + len(apart):
+        notes.append(f"{len(wanted) - len(aligned) - len(apart)} photos that have no pose of their own are left out")
     found = Model(cameras, tuple(shots), np.empty((0, 3)), notes=tuple(notes))
     if onto is None:
         return found

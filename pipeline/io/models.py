@@ -30,6 +30,8 @@ from scan2sim.pipeline.types import F64, U8, Camera, Frame, PointCloud
 
 FORMATS = ("colmap", "opensfm", "metashape", "bundler", "nvm")
 PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
+FAR = 500.0
+"""Units between cloud and photos beyond which they are hardly of the same place."""
 Up = tuple[float, float, float] | Literal["photos"]
 
 
@@ -199,7 +201,7 @@ def import_model(
             file = "cloud.laz"
         else:
             assert told is not None
-            moving = found.T_earth is None and not told.crs
+            moving = _moving(cloud, told, found, onto, warn)
             file = _cloud(cloud, folder, onto if moving else None, known, link)
         entries: list[dict[str, Any]] = []
         for i, shot in enumerate(placed.shots):
@@ -239,7 +241,10 @@ def _onto(
     if found.T_earth is not None:
         if gps or up is not None or scale != 1.0:
             raise SettingError("gps, up, scale", f"{model} says itself where it lies", "Leave them out")
-        return photo_gps.by_earth(model, found.T_earth, found.centres, crs or cloud_crs or found.crs)
+        fit = photo_gps.by_earth(model, found.T_earth, found.centres, crs or cloud_crs or found.crs)
+        for line in fit.told:
+            warn(f"{model}: {line}")
+        return fit.onto, fit.crs
     if gps:
         if up is not None or scale != 1.0:
             raise SettingError("up, scale", "GPS tells them", "Give either --gps or --upright and --scale")
@@ -248,6 +253,25 @@ def _onto(
             warn(f"{model}: {line}")
         return fit.onto, fit.crs
     return Similarity(scale, _upright(_ups(found), up), np.zeros(3)), crs or cloud_crs or crs_io.LOCAL
+
+
+def _moving(cloud: Path, told: cloud_io.Header, found: Model, onto: Similarity, warn: Callable[[str], None]) -> bool:
+    """Whether a cloud is in the model's coordinates, and moves with it, or is where the model is brought to."""
+    middle = found.centres.mean(axis=0)
+    inside_model, inside_crs = _gap(told, middle), _gap(told, onto.apply(middle[None])[0])
+    moving = not told.crs and (found.T_earth is None or inside_model < inside_crs)
+    if not told.crs and found.T_earth is not None:
+        where = "the model's coordinates, and moves with it" if moving else "the CRS already"
+        warn(f"{cloud}: has no CRS; by where the photos are, it is in {where}")
+    gap = inside_model * onto.scale if moving else inside_crs
+    if gap > FAR:
+        warn(f"{cloud}: lies {gap:,.0f} units from the photos: are they in the same coordinates?")
+    return moving
+
+
+def _gap(told: cloud_io.Header, place: F64) -> float:
+    """How far a place is from a cloud's bounding box."""
+    return float(np.linalg.norm(np.maximum(0, np.maximum(told.low - place, place - told.high))))
 
 
 def _ups(found: Model) -> F64:

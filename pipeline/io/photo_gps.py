@@ -28,24 +28,24 @@ UNSURE = np.radians(3.0)
 
 @dataclass(frozen=True)
 class Fit:
-    """A model placed by GPS.
+    """A model placed on the Earth.
 
     Attributes:
         onto: model to CRS.
         crs: its code.
-        rms: metres between the photos' places and their GPS, of those that agree.
+        rms: metres between the photos' places and their GPS, of those that agree; None without GPS.
         used: indices of these photos.
         told: for the user.
     """
 
     onto: Similarity
     crs: str
-    rms: float
+    rms: float | None
     used: list[int]
     told: tuple[str, ...]
 
 
-def by_earth(model: Path, T_earth: F64, centres: F64, crs: str | None) -> tuple[Similarity, str]:
+def by_earth(model: Path, T_earth: F64, centres: F64, crs: str | None) -> Fit:
     """Model to CRS, from a similarity (4, 4) to geocentric coordinates; exact at the middle of the (P, 3) centres.
 
     Raises:
@@ -62,7 +62,14 @@ def by_earth(model: Path, T_earth: F64, centres: F64, crs: str | None) -> tuple[
     u, stretch, vt = np.linalg.svd((places[1:] - places[0]).T * size / 100)
     scale = float(np.sort(stretch)[1])  # two of the three are the projection's, one is the height's
     rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
-    return Similarity(scale, rotation, places[0] - scale * rotation @ middle), crs
+    told = []
+    if crs_io.has_heights(crs):
+        told.append(
+            f"heights are above the ellipsoid, and {crs_io.name(crs)} has others: where they are tens of metres off, "
+            "export model and cloud with ellipsoidal heights"
+        )
+    onto = Similarity(scale, rotation, places[0] - scale * rotation @ middle)
+    return Fit(onto, crs, None, list(range(len(centres))), tuple(told))
 
 
 def by_photos(model: Path, centres: F64, ups: F64, photos: Sequence[Path], crs: str | None) -> Fit:

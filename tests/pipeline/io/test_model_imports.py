@@ -242,6 +242,36 @@ def similarity(scale: float, R: F64, t: F64) -> str:
     return f"<transform>{''.join(f'<{tag}>{row}</{tag}>' for tag, row in parts)}</transform>"
 
 
+def test_of_metashapes_components_the_largest_is_taken(tmp_path: Path) -> None:
+    moved = similarity(3.0, np.eye(3), np.array([1.0, 2, 3]))
+    parts = f'<components><component id="0">{moved}</component><component id="1"/></components>'
+    path = metashape(tmp_path / "cameras.xml", "frame", BROWN, f"{parts}{similarity(9.0, np.eye(3), np.zeros(3))}")
+    text = path.read_text()
+    first = text.index('component_id="0"')
+    path.write_text(text[:first] + 'component_id="1"' + text[first + len('component_id="0"') :])
+    model = read("metashape", path, images())
+    assert len(model.shots) == len(shots()) - 1 and "1 photos of 1 smaller components" in model.notes[0]
+    assert np.allclose(model.centres, [3 * pose[:3, 3] + [1, 2, 3] for _, pose in shots()[1:]])
+
+
+def test_a_cloud_without_a_crs_is_where_the_photos_are(tmp_path: Path) -> None:
+    """Beside a georeferenced model it may be in the model's coordinates, or in the CRS: which, is told."""
+    path = opensfm(tmp_path / "reconstruction.json", "brown", REFERENCE)
+    near = np.array([pose[:3, 3] for _, pose in shots()]) + [1.0, 2.0, 0.0]
+    for name, points, where in (("model", near, "the model's coordinates"), ("crs", on_earth(near), "the CRS already")):
+        np.savetxt(tmp_path / f"{name}.xyz", points, "%.4f")
+        told: list[str] = []
+        cloud = tmp_path / f"{name}.xyz"
+        tile = read_tile(import_model("opensfm", path, images(), tmp_path / f"t_{name}", cloud=cloud, warn=told.append))
+        read_back = clouds.read(tile.clouds[0], tile.frame)
+        assert np.abs(tile.frame.to_crs(read_back.xyz) - on_earth(near)).max() < 0.02
+        assert any(where in line for line in told) and not any("units from the photos" in line for line in told)
+    np.savetxt(tmp_path / "far.xyz", near + [90_000.0, 0, 0], "%.4f")
+    told = []
+    import_model("opensfm", path, images(), tmp_path / "t", cloud=tmp_path / "far.xyz", warn=told.append)
+    assert any("units from the photos: are they in the same coordinates?" in line for line in told)
+
+
 def test_metashape_chunks_lie_where_their_transform_says(tmp_path: Path) -> None:
     """Geocentric where the reference is a CRS of the Earth, local coordinates where it is local."""
     turn = Rotation.from_rotvec([0.4, -0.2, 1.1]).as_matrix()
