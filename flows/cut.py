@@ -18,7 +18,7 @@ import numpy as np
 from scan2sim.pipeline.cells import Cell, Seed, cells
 from scan2sim.pipeline.cutting import dense, members, seeds, sees
 from scan2sim.pipeline.errors import DataError, InputError, SettingError
-from scan2sim.pipeline.io import clouds, las
+from scan2sim.pipeline.io import clouds, las, orthophoto
 from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.io.importing import place, tile_folder
 from scan2sim.pipeline.io.spool import QUANTUM, Spool
@@ -284,8 +284,11 @@ class _Writer:
         self._spool.drop(index)
 
     def _whole(self, file: str | None, name: str) -> str | None:
-        """What the tile of that name calls a file of the corridor that all tiles share."""
-        return None if file is None else self._reference(self._corridor.tile.path.parent / file, name)
+        """What the tile of that name calls an orthophoto or footprints, which all tiles share."""
+        if file is None:
+            return None
+        source = self._corridor.tile.path.parent / file
+        return orthophoto.take(source, self._work / name) if self._options.copy else self._reference(source, name)
 
     def _cell(self, cell: Cell) -> dict[str, Any]:
         """The `[cell]` entry; its seeds in the CRS are exactly those that the cells are made of."""

@@ -173,4 +173,4 @@ def _sees(view: View, points: F32) -> bool:
     return bool((inside & valid).any())
 
 
-VIEWS = Step("views", 3, views, ViewsParams)
+VIEWS = Step("views", 2, views, ViewsParams)

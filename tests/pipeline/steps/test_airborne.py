@@ -237,3 +237,22 @@ def test_only_clouds_from_the_air_get_what_is_made_up(tmp_path: Path) -> None:
     assert {"ground", "walls"} <= {node.step.name for node in recipe(bare, Settings())}
     off = Settings({"ground": {"when": "never"}, "walls": {"when": "never"}})
     assert {"ground", "walls"}.isdisjoint(node.step.name for node in recipe(bare, off))
+
+
+def test_points_far_from_the_mesh_are_warned_of_and_made_up_area_is_told(
+    house: dict[str, Path], tmp_path: Path
+) -> None:
+    from scan2sim.pipeline.steps.geometry import GEOMETRY
+    from scan2sim.pipeline.types import Mesh
+
+    x0, y0, x1, y1, top = HOUSE
+    roof = np.float32([(x0, y0, top), (x1, y0, top), (x1, y1, top), (x0, y1, top)])
+    mesh = Mesh(FRAME, np.concatenate([roof, roof - np.float32([0, 0, 3])]),
+                np.int32([(0, 1, 2), (0, 2, 3), (4, 0, 7), (0, 3, 7)]))  # fmt: skip
+    mesh.save(tmp_path / "mesh.npz")
+    inputs = {"mesh.building": tmp_path / "mesh.npz", "cloud.building": house["building"]}
+    done = go(GEOMETRY, tmp_path / "geometry", inputs | {"made.building": house["walls"]})
+    assert done.facts["building"]["cloud_to_mesh_p95_m"] > 2  # the annex lacks
+    assert len(done.warnings) == 1 and "building" in done.warnings[0]
+    west = 8 * 3 / (8 * 3 + 10 * 8)
+    assert done.facts["building"]["made_up"] == pytest.approx(west, abs=0.06)
