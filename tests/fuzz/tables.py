@@ -170,4 +170,4 @@ def read_drive_file(folder: Path) -> object:
 
 def read_survey_folder(folder: Path) -> object:
     """The survey, and its tiles."""
-    return [read_tile(path) for path in read_survey(folder).tiles]
+    return [read_tile(path) for path in read_survey(folder).tiles.values()]
