@@ -11,8 +11,6 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pydantic import ValidationError
-
 from scan2sim.pipeline.classes import GROUPS
 from scan2sim.pipeline.errors import InputError, SettingError
 from scan2sim.pipeline.io import toml
@@ -89,14 +87,7 @@ class Settings:
         for name in {*general, *special} & set(given):
             raise SettingError(f"{step.name}.{name}", "follows from the tile or other settings", "Leave it out")
         merged = {**given, **step.per_class.get(group or "", {}), **general, **special}
-        try:
-            return step.params(**merged)
-        except ValidationError as error:
-            first = error.errors()[0]
-            where = ".".join([step.name, *(str(part) for part in first["loc"])])
-            raise SettingError(
-                where, f"{first['msg']} (got {first['input']!r})", "docs/settings.md lists them"
-            ) from None
+        return step.params.of(step.name, merged)
 
 
 def _value(text: str) -> Any:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TypeVar, get_args
 
 import numpy as np
-from pydantic import ValidationError
 
 from scan2sim.flows.display import console, progress
 from scan2sim.flows.execute import locked
@@ -169,12 +168,10 @@ def odometry_params(settings: Settings) -> OdometryParams:
     for name in settings.values:
         if name != "slam":
             raise SettingError(name, "there is no such step here", "Write --set slam.param=value")
-    try:
-        return OdometryParams(**settings.values.get("slam", {}))
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(["slam", *(str(part) for part in first["loc"])])
-        raise SettingError(where, f"{first['msg']} (got {first['input']!r})", "docs/slam.md lists them") from None
+    values = settings.values.get("slam", {})
+    if not isinstance(values, Mapping):
+        raise SettingError("slam", "must be a table of parameters", "Write --set slam.param=value")
+    return OdometryParams.of("slam", values, remedy="docs/slam.md lists them")
 
 
 def _tracker(camera: Camera, mask: np.ndarray | None, count: int, options: Options) -> Tracker:

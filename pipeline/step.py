@@ -8,15 +8,41 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from scan2sim.pipeline.errors import SettingError
+from scan2sim.pipeline.ranges import told
 
 
 class Params(BaseModel):
     """Base of every step's parameters: frozen, and unknown names are refused."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    @classmethod
+    def of(cls, where: str, values: Mapping[str, Any], *, remedy: str = "docs/settings.md lists them") -> Self:
+        """Of what a user has set.
+
+        Args:
+            where: what its names stand below, as "poisson", in messages.
+
+        Raises:
+            SettingError: naming the first value out of its range, and the range.
+        """
+        try:
+            return cls(**values)
+        except ValidationError as error:
+            first = error.errors()[0]
+            name = str(first["loc"][0]) if first["loc"] else ""
+            if name not in cls.model_fields:
+                raise SettingError(f"{where}.{name}", "there is no such setting", remedy) from None
+            if first["type"] == "missing":
+                raise SettingError(f"{where}.{name}", "is missing", remedy) from None
+            value = f"{values[name]!r:.60}"
+            cause = f"must be {told(cls.model_fields[name])} (got {value})"
+            raise SettingError(f"{where}.{name}".lstrip("."), cause, remedy) from None
 
 
 class Report(Protocol):

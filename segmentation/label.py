@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from scan2sim.pipeline.ranges import Device, File, Share
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
@@ -23,10 +24,10 @@ class LabelParams(Params):
     """
 
     network: str = "street"
-    weights: Path | None = None
-    device: str = "auto"
+    weights: File | None = None
+    device: Device = "auto"
     overwrite: bool = False
-    min_classified: float = 0.2
+    min_classified: Share = 0.2
     photos: bool = True
 
 

@@ -7,8 +7,7 @@ import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pydantic import Field
-
+from scan2sim.pipeline.ranges import Share, Voxel
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
@@ -31,9 +30,9 @@ class SegmentParams(Params):
     """
 
     overwrite: bool = False
-    min_classified: float = Field(0.2, ge=0, le=1)
-    size: float = Field(0.1, gt=0)
-    voxel: float = Field(0.2, gt=0)
+    min_classified: Share = 0.2
+    size: Voxel = 0.1
+    voxel: Voxel = 0.2
     photos: bool = True
 
 

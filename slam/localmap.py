@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
+from scan2sim.pipeline.ranges import Reach
 from scan2sim.pipeline.step import Params
 from scan2sim.pipeline.types import F64, I32, Camera
 from scan2sim.slam import shared
@@ -38,15 +40,15 @@ class MapParams(Params):
         lens_offset: estimate how far the front and back lens of a 360 camera are apart.
     """
 
-    window: int = Field(20, ge=3)
-    anchors: int = Field(5, ge=1)
-    sigma: float = Field(0.5, gt=0)
-    below: float = Field(10.0, gt=0)
-    beyond: float = Field(500.0, gt=0)
-    off: float = Field(0.7, gt=0)
-    views: int = Field(3, ge=2)
-    gps_chords: str = Field("long", pattern="^(long|adjacent|none)$")
-    gps_sigma: float = Field(1.5, gt=0)
+    window: int = Field(20, ge=3, le=500)
+    anchors: int = Field(5, ge=1, le=500)
+    sigma: float = Field(0.5, ge=0.01, le=50)
+    below: Reach = 10.0
+    beyond: float = Field(500.0, ge=1, le=1_000_000)
+    off: float = Field(0.7, ge=0.001, le=180)
+    views: int = Field(3, ge=2, le=100)
+    gps_chords: Literal["long", "adjacent", "none"] = "long"
+    gps_sigma: float = Field(1.5, ge=0.001, le=10_000)
     rolling_shutter: bool = False
     lens_offset: bool = False
 

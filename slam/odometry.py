@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
+from scan2sim.pipeline.ranges import Seed
 from scan2sim.pipeline.types import F64, U8, Camera
 from scan2sim.slam.charts import Charts
 from scan2sim.slam.geometry import angles, exp_so3, inverse, log_so3, relative_pose, rigid
@@ -47,10 +48,10 @@ class OdometryParams(MapParams):
         seed: of random samples.
     """
 
-    features: int = Field(700, ge=50)
-    parallax: float | None = Field(None, gt=0)
-    survival: float = Field(0.65, gt=0, lt=1)
-    seed: int = 0
+    features: int = Field(700, ge=50, le=20_000)
+    parallax: float | None = Field(None, ge=0.05, le=90)
+    survival: float = Field(0.65, ge=0.01, le=0.99)
+    seed: Seed = 0
 
 
 @dataclass

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import Field
 
 from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.ranges import Cosine, Depth, Reach
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
@@ -65,10 +66,10 @@ class AgreementParams(Params):
     ghosts: bool = True
     align: bool = True
     neighbours: int = Field(8, ge=2, le=16)
-    max_shift: float = Field(3.0, ge=0)
-    max_distance: float = Field(100.0, gt=0)
-    min_cos: float = Field(0.02, ge=0, lt=1)
-    bias: float = Field(0.04, ge=0)
+    max_shift: float = Field(3.0, ge=0, le=100)
+    max_distance: Reach = 100.0
+    min_cos: Cosine = 0.02
+    bias: Depth = 0.04
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
 
+from scan2sim.pipeline.ranges import Cosine, Depth, Reach
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
@@ -32,10 +33,10 @@ class ChooseParams(Params):
     """
 
     views_per_face: int = Field(8, ge=1, le=32)
-    smoothness: float = Field(0.3, ge=0)
-    max_distance: float = Field(100.0, gt=0)
-    min_cos: float = Field(0.02, ge=0, lt=1)
-    bias: float = Field(0.04, ge=0)
+    smoothness: float = Field(0.3, ge=0, le=1000)
+    max_distance: Reach = 100.0
+    min_cos: Cosine = 0.02
+    bias: Depth = 0.04
 
 
 @dataclass(frozen=True)

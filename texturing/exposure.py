@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 from pydantic import Field
 
+from scan2sim.pipeline.ranges import FileName, Reach, Stops
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
@@ -42,11 +43,11 @@ class ExposureParams(Params):
 
     solve: bool = True
     vignetting: bool = True
-    prior: str = ""
-    samples: int = Field(1500, ge=50)
-    max_distance: float = Field(100.0, gt=0)
-    spread: float = Field(1.0, gt=0)
-    tint: float = Field(0.15, gt=0)
+    prior: FileName = ""
+    samples: int = Field(1500, ge=50, le=100_000)
+    max_distance: Reach = 100.0
+    spread: Stops = 1.0
+    tint: Stops = 0.15
 
 
 OUTLIER = 0.06

@@ -36,7 +36,7 @@ class LevelParams(Params):
         reach: metres from the border over which a step between tiles is faded out.
     """
 
-    reach: float = Field(4.0, gt=0)
+    reach: float = Field(4.0, ge=0.01, le=1000)
 
 
 def level(inputs: Inputs, params: LevelParams, out: Path, report: Report) -> Done:

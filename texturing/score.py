@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import Field
 
 from scan2sim.pipeline.classes import GROUPS
+from scan2sim.pipeline.ranges import Reach
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
@@ -30,9 +31,9 @@ class ScoreParams(Params):
         near: metres from a photo within which a true sample is near to it (`truth_psnr_near_db`).
     """
 
-    truth_reach: float = Field(0.1, gt=0)
-    truth_samples: int = Field(500_000, ge=1000)
-    near: float = Field(15.0, gt=0)
+    truth_reach: Reach = 0.1
+    truth_samples: int = Field(500_000, ge=1000, le=20_000_000)
+    near: Reach = 15.0
 
 
 def score(inputs: Inputs, params: ScoreParams, out: Path, report: Report) -> Done:

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import Field
 
 from scan2sim.pipeline.extras import missing, need
+from scan2sim.pipeline.ranges import Cosine, Depth, Device
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
@@ -59,14 +60,14 @@ class TextureParams(Params):
             level the same; "auto": a GPU where torch and one are there.
     """
 
-    power: float = Field(1.5, gt=0)
+    power: float = Field(1.5, ge=0.01, le=20)
     band: int = Field(2, ge=-1, le=64)
     fade: bool = True
-    min_cos: float = Field(0.02, ge=0, lt=1)
-    bias: float = Field(0.04, ge=0)
-    feather: float = Field(0.04, gt=0, le=0.5)
-    padding: int = Field(16, ge=2)
-    device: str = "auto"
+    min_cos: Cosine = 0.02
+    bias: Depth = 0.04
+    feather: float = Field(0.04, ge=0.0001, le=0.5)
+    padding: int = Field(16, ge=2, le=256)
+    device: Device = "auto"
 
 
 def texture(inputs: Inputs, params: TextureParams, out: Path, report: Report) -> Done:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from pydantic import Field
 
 from scan2sim.pipeline.errors import StepError
+from scan2sim.pipeline.ranges import Seconds, Texel
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
@@ -52,12 +53,12 @@ class UnwrapParams(Params):
     """
 
     backend: Literal["photo", "xatlas", "uvatlas"] = "photo"
-    unseen: float = Field(4.0, ge=1)
-    texel: float = Field(0.01, gt=0)
+    unseen: float = Field(4.0, ge=1, le=100)
+    texel: Texel = 0.01
     page_size: int = Field(4096, ge=64, le=8192)
     gutter: int = Field(4, ge=1, le=64)
-    block_faces: int = Field(60_000, ge=100)
-    timeout: float = Field(60.0, gt=0)
+    block_faces: int = Field(60_000, ge=100, le=1_000_000)
+    timeout: Seconds = 60.0
 
 
 def unwrap(inputs: Inputs, params: UnwrapParams, out: Path, report: Report) -> Done:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from pydantic import Field
 
+from scan2sim.pipeline.ranges import Place
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
@@ -21,8 +22,8 @@ class CellParams(Params):
         neighbours: the names of tiles whose cells touch to their seeds, world metres.
     """
 
-    seed: tuple[float, float]
-    neighbours: dict[str, tuple[float, float]] = Field(default_factory=dict)
+    seed: Place
+    neighbours: dict[str, Place] = Field(default_factory=dict)
 
     @property
     def cell(self) -> Cell:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from pydantic import Field
 
 from scan2sim.pipeline.errors import DataError, StepError
+from scan2sim.pipeline.ranges import Seed
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ class CollisionParams(Params):
 
     triangles: int = Field(50_000, ge=100, le=MOST)
     vegetation: bool = False
-    seed: int = 0
+    seed: Seed = 0
     keep_border: bool = False
 
 

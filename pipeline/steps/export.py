@@ -9,6 +9,7 @@ from pydantic import AfterValidator, Field
 
 from scan2sim.pipeline.classes import GROUPS
 from scan2sim.pipeline.errors import DataError, SettingError
+from scan2sim.pipeline.ranges import Coordinate, Name
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
@@ -41,17 +42,19 @@ class ExportParams(Params):
             true: as fine as the ground's texels.
     """
 
-    name: str = Field("tile", pattern=r"^[A-Za-z0-9_]+$")
+    name: Name = "tile"
     obj: bool = True
     collada: bool = True
     glb: bool = True
     gazebo: bool = True
     friction: float = Field(0.9, ge=0, le=10)
-    max_visual_triangles: int = Field(200_000, ge=1_000)
+    max_visual_triangles: int = Field(200_000, ge=1_000, le=10_000_000)
     pages: Literal["png", "jpeg"] = "png"
     jpeg_quality: int = Field(90, ge=1, le=100)
-    world_origin: tuple[float, float, float] | None = None
-    rasters: Annotated[bool | float, AfterValidator(_pixel)] = False
+    world_origin: tuple[Coordinate, Coordinate, Coordinate] | None = None
+    rasters: Annotated[bool | float, AfterValidator(_pixel)] = Field(
+        False, json_schema_extra={"range": "true or false, or 0.001 to 100"}
+    )
 
 
 def export(inputs: Inputs, params: ExportParams, out: Path, report: Report) -> Done:

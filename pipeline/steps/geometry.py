@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import Field
 
 from scan2sim.pipeline.classes import GROUPS, group_of
+from scan2sim.pipeline.ranges import Place
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
@@ -26,9 +27,9 @@ class GeometryParams(Params):
         neighbours: names of tiles whose cells touch to their seeds, world metres; set by the recipe.
     """
 
-    samples: int = Field(200_000, ge=1000)
-    seed: tuple[float, float] | None = None
-    neighbours: dict[str, tuple[float, float]] = Field(default_factory=dict)
+    samples: int = Field(200_000, ge=1000, le=10_000_000)
+    seed: Place | None = None
+    neighbours: dict[str, Place] = Field(default_factory=dict)
 
 
 def geometry(inputs: Inputs, params: GeometryParams, out: Path, report: Report) -> Done:

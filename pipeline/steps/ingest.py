@@ -7,6 +7,7 @@ from pathlib import Path
 from pydantic import Field
 
 from scan2sim.pipeline.errors import DataError
+from scan2sim.pipeline.ranges import Coordinate
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 MIN_POINTS = 1000
@@ -18,8 +19,8 @@ class IngestParams(Params):
     """Where the cloud is brought to, and what its classes are; set by the recipe from the tile."""
 
     crs: str = "local"
-    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    unit: float = 1.0
+    origin: tuple[Coordinate, Coordinate, Coordinate] = (0.0, 0.0, 0.0)
+    unit: float = Field(1.0, ge=1e-6, le=1000)
     classes: dict[int, int] = Field(default_factory=dict)
 
 

@@ -16,7 +16,7 @@ class IslandsParams(Params):
         min_area: m2 of surface below which a connected piece is removed.
     """
 
-    min_area: float = Field(0.5, ge=0)
+    min_area: float = Field(0.5, ge=0, le=1_000_000)
 
 
 def islands(inputs: Inputs, params: IslandsParams, out: Path, report: Report) -> Done:

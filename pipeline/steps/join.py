@@ -21,8 +21,8 @@ class JoinParams(CellParams):
     """
 
     name: str
-    tolerance: float = Field(0.3, gt=0)
-    reach: float = Field(0.5, gt=0)
+    tolerance: float = Field(0.3, ge=0.001, le=10)
+    reach: float = Field(0.5, ge=0.001, le=100)
 
 
 def join(inputs: Inputs, params: JoinParams, out: Path, report: Report) -> Done:

@@ -27,7 +27,7 @@ class OverlapParams(CellParams):
     """
 
     name: str
-    buffer: float = Field(5.0, ge=0)
+    buffer: float = Field(5.0, ge=0, le=1000)
 
 
 def overlap(inputs: Inputs, params: OverlapParams, out: Path, report: Report) -> Done:

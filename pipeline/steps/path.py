@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from pydantic import ConfigDict
+
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 
@@ -14,6 +16,8 @@ class PathParams(Params):
         positions: (x, y, z) local metres.
         times: GPS seconds, one a position; None where unknown.
     """
+
+    model_config = ConfigDict(allow_inf_nan=True)  # times are NaN where the file doesn't say
 
     positions: tuple[tuple[float, float, float], ...]
     times: tuple[float, ...] | None = None

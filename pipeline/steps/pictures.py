@@ -38,7 +38,7 @@ class PicturesParams(Params):
     """
 
     width: int = Field(1280, ge=160, le=4096)
-    compared: int = Field(3, ge=0)
+    compared: int = Field(3, ge=0, le=100)
 
 
 @dataclass

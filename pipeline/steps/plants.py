@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from pydantic import Field
 
+from scan2sim.pipeline.ranges import Place
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
@@ -30,10 +31,10 @@ class PlantsParams(Params):
         neighbours: names of tiles whose cells touch to their seeds, world metres; set by the recipe.
     """
 
-    min_height: float = Field(0.4, gt=0)
-    min_distance: float = Field(1.5, gt=0)
-    seed: tuple[float, float] | None = None
-    neighbours: dict[str, tuple[float, float]] = Field(default_factory=dict)
+    min_height: float = Field(0.4, ge=0.01, le=100)
+    min_distance: float = Field(1.5, ge=0.1, le=1000)
+    seed: Place | None = None
+    neighbours: dict[str, Place] = Field(default_factory=dict)
 
 
 def plants(inputs: Inputs, params: PlantsParams, out: Path, report: Report) -> Done:

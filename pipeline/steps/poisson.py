@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from pydantic import Field
 
 from scan2sim.pipeline.errors import StepError
+from scan2sim.pipeline.ranges import Seconds, Voxel
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
@@ -35,10 +36,10 @@ class PoissonParams(Params):
     """
 
     depth: int | None = Field(None, ge=4, le=MAX_DEPTH)
-    voxel: float = Field(0.10, gt=0)
-    point_weight: float = Field(4.0, ge=0)
-    threads: int = Field(1, ge=0)
-    timeout: float = Field(3600, gt=0)
+    voxel: Voxel = 0.10
+    point_weight: float = Field(4.0, ge=0, le=1000)
+    threads: int = Field(1, ge=0, le=256)
+    timeout: Seconds = 3600.0
     aligned: bool = False
 
 

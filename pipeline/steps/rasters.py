@@ -11,6 +11,7 @@ from pydantic import Field
 from scan2sim.pipeline.classes import GROUPS
 from scan2sim.pipeline.errors import DataError, SettingError
 from scan2sim.pipeline.extras import need
+from scan2sim.pipeline.ranges import Name, Texel
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
@@ -36,9 +37,9 @@ class RastersParams(Params):
         texel: metres a texel of the ground: where pixels are larger, they are the mean of several rays.
     """
 
-    name: str = Field("tile", pattern=r"^[A-Za-z0-9_]+$")
+    name: Name = "tile"
     pixel: float = Field(0.05, ge=0.001, le=100)
-    texel: float = Field(0.01, gt=0)
+    texel: Texel = 0.01
 
 
 def rasters(inputs: Inputs, params: RastersParams, out: Path, report: Report) -> Done:

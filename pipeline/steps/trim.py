@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pydantic import Field
-
+from scan2sim.pipeline.ranges import Reach, Voxel
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
@@ -30,10 +29,10 @@ class TrimParams(Params):
         voxel: size that the cloud was thinned to; set by the recipe.
     """
 
-    max_edge: float = Field(0.25, gt=0)
-    max_distance: float = Field(0.25, gt=0)
-    max_spacing: float = Field(0.8, gt=0)
-    voxel: float = Field(0.10, gt=0)
+    max_edge: Reach = 0.25
+    max_distance: Reach = 0.25
+    max_spacing: Reach = 0.8
+    voxel: Voxel = 0.10
 
 
 def trim(inputs: Inputs, params: TrimParams, out: Path, report: Report) -> Done:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from scan2sim.pipeline.errors import DataError, InputError
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
@@ -19,6 +19,12 @@ MARGIN = 8  # pixels of an orthophoto around the points
 SAMPLE = 500_000  # points that are looked for in the photos
 
 
+def _not_all(every: int) -> int:
+    if every == 1:
+        raise ValueError("every photo would be kept out of texturing")
+    return every
+
+
 class ViewsParams(Params):
     """What becomes of the photos.
 
@@ -27,7 +33,9 @@ class ViewsParams(Params):
         poses: the views as JSON (`pipeline.io.views`), file names without folders; set by the recipe.
     """
 
-    hold_out: int = Field(0, ge=0)
+    hold_out: Annotated[int, AfterValidator(_not_all)] = Field(
+        0, ge=0, le=1_000_000, json_schema_extra={"range": "a whole number, 0 or 2 to 1,000,000"}
+    )
     poses: tuple[dict[str, Any], ...] = ()
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from pydantic import Field
 
+from scan2sim.pipeline.ranges import Reach
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 
@@ -18,9 +19,9 @@ class VisibilityParams(Params):
         lacking: points further than this from every mesh hide by themselves (cars, people), metres.
     """
 
-    pixels: int = Field(2_000_000, ge=10_000)
-    radius: float = Field(0.08, gt=0)
-    lacking: float = Field(0.2, gt=0)
+    pixels: int = Field(2_000_000, ge=10_000, le=64_000_000)
+    radius: float = Field(0.08, ge=0.001, le=10)
+    lacking: Reach = 0.2
 
 
 def visibility(inputs: Inputs, params: VisibilityParams, out: Path, report: Report) -> Done:

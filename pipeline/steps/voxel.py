@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from pydantic import Field
 
+from scan2sim.pipeline.ranges import Voxel
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
@@ -21,8 +22,8 @@ class VoxelParams(Params):
         neighbours: points that a normal is fitted to.
     """
 
-    size: float = Field(0.10, gt=0)
-    neighbours: int = Field(16, ge=3)
+    size: Voxel = 0.10
+    neighbours: int = Field(16, ge=3, le=64)
 
 
 def voxel(inputs: Inputs, params: VoxelParams, out: Path, report: Report) -> Done:
