@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 from scan2sim import __version__
 from scan2sim.pipeline.errors import INTERRUPTED, ScanError, exit_code, from_os_error
@@ -18,7 +18,25 @@ from scan2sim.pipeline.errors import INTERRUPTED, ScanError, exit_code, from_os_
 PAGES = Path(__file__).parents[1] / "docs"
 """Where the pages are that help and errors name as docs/NAME.md: they come with a wheel, too."""
 
-app = typer.Typer(
+
+class _Command(TyperCommand):
+    """A command whose numbers are looked at before it begins."""
+
+    def invoke(self, ctx: Any) -> Any:
+        from scan2sim.flows.numbers import check
+
+        check(ctx.params)
+        return super().invoke(ctx)
+
+
+class _App(typer.Typer):
+    """Commands as they are declared, all of them `_Command`s."""
+
+    def command(self, name: str | None = None, **options: Any) -> Any:
+        return super().command(name, cls=_Command, **options)
+
+
+app = _App(
     name="scan2sim",
     help="Street scans (lidar clouds and posed photos) to textured worlds for robot simulators.",
     no_args_is_help=True,
@@ -26,7 +44,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-imports = typer.Typer(no_args_is_help=True, help="Make a tile from your files.")
+imports = _App(no_args_is_help=True, help="Make a tile from your files.")
 app.add_typer(imports, name="import")
 
 
@@ -42,11 +60,11 @@ class _FirstIsDefault(TyperGroup):
         return list(self.commands)
 
 
-segments = typer.Typer(
+segments = _App(
     cls=_FirstIsDefault, no_args_is_help=True, help="Classes of a tile's points and photos: `segment TILE --out DIR`."
 )
 app.add_typer(segments, name="segment")
-slams = typer.Typer(
+slams = _App(
     cls=_FirstIsDefault, no_args_is_help=True, help="Where the camera of a video went: `slam VIDEO --out DIR`."
 )
 app.add_typer(slams, name="slam")

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from scan2sim.flows.numbers import check
 from scan2sim.pipeline.cells import Cell, Seed, cells
 from scan2sim.pipeline.cutting import dense, members, seeds, sees
 from scan2sim.pipeline.errors import DataError, InputError, SettingError
@@ -60,10 +61,7 @@ class Options:
 
     def check(self) -> None:
         """Raises a SettingError for what no corridor can be cut by."""
-        for key, least in (("length", 1.0), ("buffer", 0.0), ("reach", 1.0), ("photo_reach", 0.0)):
-            value = getattr(self, key)
-            if not (np.isfinite(value) and value >= least):
-                raise SettingError(key, f"{value} m is less than {least:g} m", f"Give {least:g} m or more")
+        check({name: getattr(self, name) for name in ("length", "buffer", "reach", "photo_reach")})
         if self.buffer > self.length / 2:
             raise SettingError(
                 "buffer", f"{self.buffer:g} m is more than half a tile's length", "Give a smaller one, or longer tiles"

@@ -10,12 +10,14 @@ import platform
 import shutil
 import signal
 import sys
+import tempfile
 import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache
+from multiprocessing import forkserver
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
@@ -30,6 +32,10 @@ from scan2sim.pipeline.errors import BusyError, DamagedError, ScanError, StepErr
 from scan2sim.pipeline.step import Report, silent
 from scan2sim.pipeline.store import Manifest, Store
 
+TRACKER = "ignore:resource_tracker"
+"""A filter of warnings for Python's own process that clears up after killed ones, and says so."""
+SAID = 10_000
+"""Bytes of what a failed step's libraries printed that go into the log."""
 Event = Literal["start", "progress", "done", "kept", "failed", "again"]
 Watch = Callable[[Node, Event, float, str], None]
 """Told what happens: node, event, fraction done, message."""
@@ -308,8 +314,16 @@ def versions() -> Mapping[str, str]:
 def _processes() -> Any:
     """Processes forked from a server that has the heavy libraries loaded."""
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # several nodes share the cores: don't spin
+    if TRACKER not in sys.warnoptions:
+        sys.warnoptions.append(TRACKER)
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["scan2sim.flows.preload"])
+    # Ctrl-C in a terminal reaches the server as well: until it is ready, it would die of it, and say so at length
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        forkserver.ensure_running()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
     return context
 
 
@@ -326,10 +340,16 @@ def _start(item: Planned, store: Store) -> tuple[Connection, ForkServerProcess]:
 
 
 def _child(connection: Connection, item: Planned, store: Store, inputs: dict[str, Path]) -> None:
-    """Body of a node's process: sends ("progress", fraction, message), then ("done" | "error", value, log)."""
+    """Body of a node's process: sends ("progress", fraction, message), then ("done" | "error", value, log).
+
+    What libraries print is kept from the screen, and goes into the log with an error.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent is interrupted, and stops its children
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     os.setpgrp()
+    said = tempfile.TemporaryFile() if sys.platform != "linux" else os.fdopen(os.memfd_create("said"), "w+b")
+    for stream in (1, 2):
+        os.dup2(said.fileno(), stream)
     threading.Thread(target=_end_with_the_run, daemon=True).start()
 
     def report(fraction: float, message: str = "") -> None:
@@ -338,7 +358,9 @@ def _child(connection: Connection, item: Planned, store: Store, inputs: dict[str
     try:
         connection.send(("done", run_node(item, store, inputs, report), ""))
     except ScanError as error:
-        connection.send(("error", error, traceback.format_exc()))
+        said.seek(max(0, said.seek(0, os.SEEK_END) - SAID))
+        heard = said.read().decode(errors="replace")
+        connection.send(("error", error, traceback.format_exc() + heard))
 
 
 def _end_with_the_run() -> None:

@@ -29,9 +29,11 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field
 
 from scan2sim.flows.execute import locked
+from scan2sim.flows.numbers import Focal, Pixels, Rate, Shift
 from scan2sim.pipeline.errors import InputError, from_os_error
 from scan2sim.pipeline.io import toml
 from scan2sim.pipeline.io.remote import is_remote, likeness
+from scan2sim.pipeline.ranges import Voxel
 from scan2sim.pipeline.step import Report, silent
 from scan2sim.pipeline.store import Digests
 
@@ -40,7 +42,7 @@ PREPARED = "prepared"
 
 
 class _Strict(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class SlamEntry(_Strict):
@@ -48,12 +50,12 @@ class SlamEntry(_Strict):
 
     video: Path
     gps: Path | None = None
-    gps_offset: float | None = None
+    gps_offset: Shift | None = None
     mask: Path | None = None
     camera: str = "auto"
-    focal: float | None = None
-    centre: tuple[float, float] | None = None
-    fps: float = 10.0
+    focal: Focal | None = None
+    centre: tuple[Pixels, Pixels] | None = None
+    fps: Rate = 10.0
 
 
 class SweepsEntry(_Strict):
@@ -66,18 +68,18 @@ class SweepsEntry(_Strict):
     photos: Path | None = None
     photo_times: Path | None = None
     camera: str = "auto"
-    focal: float | None = None
-    centre: tuple[float, float] | None = None
-    max_range: float = 50.0
-    voxel: float | None = None
+    focal: Focal | None = None
+    centre: tuple[Pixels, Pixels] | None = None
+    max_range: float = Field(50.0, ge=0.1, le=10_000)
+    voxel: Voxel | None = None
     crs: str = "local"
 
 
 class TilesEntry(_Strict):
     """How the corridor is cut; as the options of `scan2sim tile`."""
 
-    length: float = Field(100.0, gt=0)
-    buffer: float = Field(5.0, ge=0)
+    length: float = Field(100.0, ge=1, le=100_000)
+    buffer: float = Field(5.0, ge=0, le=1000)
 
 
 class Drive(_Strict):

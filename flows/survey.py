@@ -16,6 +16,7 @@ from prefect.cache_policies import NO_CACHE
 from prefect.client.orchestration import get_client
 from prefect.settings import PREFECT_API_URL
 
+from scan2sim.flows.ephemeral import guard
 from scan2sim.flows.prepare import survey_of
 from scan2sim.flows.settings import Settings
 from scan2sim.flows.survey_report import overview, rows
@@ -36,6 +37,7 @@ def meet_server() -> None:
     url = PREFECT_API_URL.value()
     if url is None:
         signal.signal(signal.SIGINT, _end)
+        guard()
         return
     with get_client(sync_client=True) as client:
         problem = client.api_healthcheck()

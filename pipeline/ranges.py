@@ -68,7 +68,8 @@ def _told(kind: Any, limits: Sequence[Any]) -> str:
     if origin is Literal:
         return _either([str(a) for a in arguments])
     if origin is tuple:
-        return ", ".join(_told(a, limits) for a in arguments if a is not Ellipsis)
+        each = [_told(a, limits) for a in arguments if a is not Ellipsis]
+        return f"{len(each)} numbers, {each[0]}" if Ellipsis not in arguments else f"numbers, {each[0]}"
     if kind is bool:
         return "true or false"
     if kind in (int, float):

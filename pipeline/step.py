@@ -26,7 +26,7 @@ class Params(BaseModel):
         """Of what a user has set.
 
         Args:
-            where: what its names stand below, as "poisson", in messages.
+            where: what its names stand below, as "poisson", in messages; "" for options of a command.
 
         Raises:
             SettingError: naming the first value out of its range, and the range.
@@ -38,11 +38,11 @@ class Params(BaseModel):
             name = str(first["loc"][0]) if first["loc"] else ""
             if name not in cls.model_fields:
                 raise SettingError(f"{where}.{name}", "there is no such setting", remedy) from None
-            if first["type"] == "missing":
+            if name not in values:
                 raise SettingError(f"{where}.{name}", "is missing", remedy) from None
             value = f"{values[name]!r:.60}"
             cause = f"must be {told(cls.model_fields[name])} (got {value})"
-            raise SettingError(f"{where}.{name}".lstrip("."), cause, remedy) from None
+            raise SettingError(f"{where}.{name}" if where else f"--{name.replace('_', '-')}", cause, remedy) from None
 
 
 class Report(Protocol):

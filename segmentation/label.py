@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from scan2sim.pipeline.ranges import Device, File, Share
+from scan2sim.pipeline.ranges import Device, File, Name, Share
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ class LabelParams(Params):
             cloud keeps its own classes, or where they aren't asked.
     """
 
-    network: str = "street"
+    network: Name = "street"
     weights: File | None = None
     device: Device = "auto"
     overwrite: bool = False

@@ -8,6 +8,7 @@ every block is unwrapped by itself in a child process with a time limit. One tha
 from __future__ import annotations
 
 import json
+import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
 
-from scan2sim.pipeline.errors import StepError
+from scan2sim.pipeline.errors import SettingError, StepError
 from scan2sim.pipeline.ranges import Seconds, Texel
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
@@ -32,6 +33,8 @@ FAR = 1e5
 """Metres to where an orthographic camera's rays are taken to meet."""
 PER_PIXEL = 0.5
 """Texels of what an orthophoto drapes are this share of its pixels, or `texel` where that is coarser."""
+MOST_TEXELS, MOST_PAGES = 4_000_000_000, 10_000
+"""Of a class, for what no photo sees finer as well: some 240 pages of 4096 x 4096, 12 GB."""
 UTILISATION = 0.5
 """Share of a page that charts are expected to cover, when blocks are cut to pages."""
 
@@ -68,6 +71,7 @@ def unwrap(inputs: Inputs, params: UnwrapParams, out: Path, report: Report) -> D
     Files: `mesh`, with `uv` and `page`; `pages`, JSON list of {"width", "height"} in texels.
 
     Raises:
+        SettingError: texels are too fine for so large a surface.
         StepError: neither backend can unwrap a block.
     """
     import numpy as np
@@ -83,11 +87,14 @@ def unwrap(inputs: Inputs, params: UnwrapParams, out: Path, report: Report) -> D
             coarse = params.model_copy(update={"texel": params.texel * params.unseen})
             draped = params.model_copy(update={"texel": max(params.texel, PER_PIXEL * float(own.max()))})
             parts = [((label >= 0) & (own == 0), params), ((label >= 0) & (own > 0), draped)]
+            texel = np.select([faces for faces, _ in parts], [fine.texel for _, fine in parts], coarse.texel)
+            check_size(float((mesh.face_area / texel**2).sum(dtype=np.float64)), params)
             for faces, fine in parts:
                 laid = lay_by_photo(mesh, laid, np.where(faces, label, -1), centres, fine)
             for faces, fine in (*parts, (label < 0, coarse)):
                 laid = lay(mesh, laid, np.flatnonzero((laid.page < 0) & faces), fine, report)
         else:
+            check_size(float(mesh.face_area.sum(dtype=np.float64)) / params.texel**2, params)
             laid = lay(mesh, laid, np.arange(len(mesh)), params, report)
     uv, page, pages, charts, fallbacks = laid.uv, laid.page, laid.pages, laid.charts, laid.fallbacks
     (out / "pages.json").write_text(json.dumps(pages), encoding="utf-8")
@@ -98,6 +105,19 @@ def unwrap(inputs: Inputs, params: UnwrapParams, out: Path, report: Report) -> D
         warnings.append(f"{fallbacks} of {len(pages)} blocks were unwrapped by {_other(params)}: they were refused")
     facts = _facts(done, pages) | {"charts": charts, "backend": params.backend, "fallbacks": fallbacks}
     return Done({"mesh": out / "mesh.npz", "pages": out / "pages.json"}, facts, warnings)
+
+
+def check_size(texels: float, params: UnwrapParams) -> None:
+    """Refuse so many texels that the pages would fill memory and disk.
+
+    Raises:
+        SettingError: naming the finest texel that can be.
+    """
+    most = min(MOST_TEXELS, MOST_PAGES * UTILISATION * params.page_size**2)
+    if texels > most:
+        finest = math.ceil(params.texel * math.sqrt(texels / most) * 1e4) / 1e4
+        cause = f"{params.texel:g} m a texel makes {texels:,.0f} texels of this surface, more than {most:,.0f}"
+        raise SettingError("unwrap.texel", cause, f"Set unwrap.texel={finest:g} or larger, or cut the tile")
 
 
 @dataclass(frozen=True)

@@ -56,6 +56,8 @@ from scan2sim.pipeline.types import Camera, CameraModel, Frame, Tile, Trajectory
 NAME = r"^[A-Za-z0-9_]{1,100}$"
 """What tiles and surveys may be called: names become folders, files and names in SDF."""
 Vector = tuple[float, float, float]
+FARTHEST, STRONGEST = 1e6, 1e6
+"""Pixels that a camera's centre may be from its first, and coefficients of its distortion."""
 DISTORTION_LENGTHS = {
     "pinhole": (0,), "opencv": (0, 4, 5, 8), "fisheye": (0, 4), "equirectangular": (0,), "orthographic": (0,),
 }  # fmt: skip
@@ -139,6 +141,9 @@ def read_tile(path: Path) -> Tile:
     x, y, z = np.floor([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]]).tolist()
     frame = Frame(crs, (x, y, z), unit)
     cameras = {entry.id: _camera(path, entry) for entry in spec.cameras}
+    if len(cameras) < len(spec.cameras):
+        twice = next(c.id for i, c in enumerate(spec.cameras) if c.id in {other.id for other in spec.cameras[:i]})
+        raise InputError(path, f"has two cameras `{twice}`", "Give each an id of its own")
     views = [_view(path, i, entry, cameras, frame) for i, entry in enumerate(spec.photos)]
     if spec.orthophoto:
         views.append(orthophoto.read_view(_existing(path, spec.orthophoto, "orthophoto"), frame, float(high[2])))
@@ -254,8 +259,16 @@ def _camera(tile: Path, entry: CameraEntry) -> Camera:
     where = f"camera `{entry.id}`"
     if min(entry.size) < 1:
         raise InputError(tile, f"{where}: size {entry.size} is not positive", "Give the photo's size in pixels")
-    if entry.model != "equirectangular" and not (np.isfinite(entry.focal).all() and min(entry.focal) > 0):
+    if entry.model != "equirectangular" and not (
+        np.isfinite(entry.focal).all() and min(entry.focal) > 0 and max(entry.focal) <= FARTHEST
+    ):
         raise InputError(tile, f"{where}: focal {entry.focal} is not positive", "Give fx and fy in pixels")
+    if not (np.isfinite(entry.centre).all() and np.abs(entry.centre).max() <= FARTHEST):
+        raise InputError(tile, f"{where}: centre {entry.centre} is no place in a photo", "Give cx and cy in pixels")
+    if not (np.isfinite(entry.distortion).all() and np.abs(entry.distortion).max(initial=0) <= STRONGEST):
+        raise InputError(
+            tile, f"{where}: distortion {entry.distortion} is none of a lens", f"Give numbers within {STRONGEST:,.0f}"
+        )
     if len(entry.distortion) not in DISTORTION_LENGTHS[entry.model]:
         lengths = " or ".join(map(str, DISTORTION_LENGTHS[entry.model]))
         raise InputError(

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
+from scan2sim.pipeline.ranges import Place
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
@@ -27,8 +28,8 @@ class MadeUpParams(Params):
     """
 
     when: Literal["auto", "always", "never"] = "auto"
-    seed: tuple[float, float] | None = None
-    neighbours: dict[str, tuple[float, float]] = Field(default_factory=dict)
+    seed: Place | None = None
+    neighbours: dict[str, Place] = Field(default_factory=dict)
     name: str = ""
     buffer: float = Field(5.0, ge=0, le=1000)
 

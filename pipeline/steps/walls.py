@@ -35,10 +35,10 @@ class WallsParams(MadeUpParams):
         tolerance: metres by which a straight side may miss the roof's outline (at least a cell of the points' spacing).
     """
 
-    least_height: float = Field(0.5, gt=0, le=100)
-    least_area: float = Field(4.0, gt=0, le=10_000)
-    step: float = Field(1.0, gt=0, le=100)
-    tolerance: float = Field(0.5, gt=0, le=10)
+    least_height: float = Field(0.5, ge=0.01, le=100)
+    least_area: float = Field(4.0, ge=0.01, le=10_000)
+    step: float = Field(1.0, ge=0.01, le=100)
+    tolerance: float = Field(0.5, ge=0.01, le=10)
 
 
 def walls(inputs: Inputs, params: WallsParams, out: Path, report: Report) -> Done:

@@ -210,6 +210,45 @@ def test_a_bug_and_a_killed_process_become_step_errors(run: Run) -> None:
         run(b={"does": "die"})
 
 
+@pytest.mark.parametrize("how", ["litter", "bug", "SIGINT"])
+def test_whatever_ends_a_run_nothing_but_its_message_is_shown(tmp_path: Path, source: Path, how: str) -> None:
+    script = (
+        "import sys; from pathlib import Path; from scan2sim.flows.execute import *\n"
+        "from scan2sim.flows.planning import plan; from tests.flows.toy import chain\n"
+        f"p, does = Path({str(tmp_path)!r}), {'hang' if how == 'SIGINT' else how!r}\n"
+        "store = Store(p / 'store')\n"
+        "nodes = chain(p / 'source.txt', p / 'log', b={'does': does}, c={'does': 'hang'})\n"
+        "try: execute(plan(nodes, store), store, jobs=2, watch=lambda *_: None)\n"
+        "except ScanError as error: sys.exit(str(error))\n"
+        "except KeyboardInterrupt: sys.exit('interrupted')\n"
+    )
+    child = subprocess.Popen(
+        [sys.executable, "-c", script], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        start_new_session=True,
+    )  # fmt: skip
+    if how == "SIGINT":
+        while child.poll() is None and not (tmp_path / "pid_b").exists():
+            time.sleep(0.05)
+        os.killpg(child.pid, signal.SIGINT)  # as a terminal does
+    said = "".join(child.communicate(timeout=120))
+    assert len(said.splitlines()) == 1 and "Traceback" not in said, said
+    message = {"litter": "was killed", "bug": "failed unexpectedly", "SIGINT": "interrupted"}[how]
+    assert message in said
+
+
+def test_ctrl_c_before_anything_runs_is_quiet_too(tmp_path: Path, source: Path) -> None:
+    script = (
+        "import os, signal, sys; from scan2sim.flows import execute\n"
+        "try:\n"
+        "    execute._processes(); os.killpg(0, signal.SIGINT); import time; time.sleep(20)\n"
+        "except KeyboardInterrupt: sys.exit('interrupted')\n"
+    )
+    child = subprocess.run(
+        [sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, timeout=60, start_new_session=True
+    )
+    assert (child.stdout + child.stderr).strip() == "interrupted"
+
+
 def test_plan_says_why(tmp_path: Path, source: Path, run: Run) -> None:
     run()
     store = Store(tmp_path / "store")

@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, get_args, get_type_hints
 
 import pytest
+from typer.main import get_command
+from typer.testing import CliRunner
 
+from scan2sim.flows.cli import app
+from scan2sim.flows.numbers import Numbers
 from scan2sim.flows.recipe import PER_CLASS, STEPS
 from scan2sim.flows.settings import Settings
 from scan2sim.pipeline.errors import SettingError
+from scan2sim.pipeline.ranges import told
+from scan2sim.pipeline.step import Params
 from scan2sim.pipeline.steps.decimate import DECIMATE
 from scan2sim.pipeline.steps.split import SPLIT
 from scan2sim.pipeline.steps.trim import TRIM
+from scan2sim.slam.odometry import OdometryParams
+from scan2sim.texturing.unwrap import UnwrapParams, check_size
+from tests.conftest import ROOT
 
 
 def test_defaults_are_the_missions_numbers() -> None:
@@ -65,3 +76,104 @@ def test_a_broken_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "s.toml").write_text("[decimate\n")
     with pytest.raises(SettingError, match="TOML"):
         Settings.read(tmp_path / "s.toml")
+
+
+# every setting: what is no number, or beyond all measure, is refused by its name and range, or is harmless
+
+MODELS: dict[str, type[Params]] = {
+    **{step.name: step.params for step in STEPS}, "slam": OdometryParams, "": Numbers,
+}  # fmt: skip
+SETTINGS = [(where, name) for where, model in MODELS.items() for name in model.model_fields]
+WILD = (
+    float("nan"), float("inf"), float("-inf"), -1, -1e300, 0, 1e300, 1e-300, 10**30, "9" * 6000, "wild", "a\0b",
+    "x" * 100_000, [], {}, [float("nan")] * 3, [1e300] * 2, True, None,
+)  # fmt: skip
+BY_RECIPE = {"path.positions", "path.times"}
+"""Read from files, which are checked where they are read."""
+
+
+@pytest.mark.parametrize(("where", "name"), SETTINGS)
+def test_wild_values_are_refused_by_name_and_range(where: str, name: str) -> None:
+    model = MODELS[where]
+    given = {k: v for k, v in {"seed": (0, 0), "name": "a", "positions": ()}.items() if k in model.model_fields}
+    required = {k: v for k, v in given.items() if model.model_fields[k].is_required()}
+    for value in WILD:
+        try:
+            made = model.of(where, required | {name: value})
+        except SettingError as error:
+            told_name = f"{where}.{name}" if where else f"--{name.replace('_', '-')}"
+            assert error.where == told_name and told(model.model_fields[name]) in error.cause, (value, error)
+            assert len(str(error)) < 400, "as long as what is told, not as what was given"
+        else:
+            assert harmless(getattr(made, name)) or f"{where}.{name}" in BY_RECIPE, (value, made)
+
+
+def harmless(value: object) -> bool:
+    """Whether all numbers in a value are finite, and none is beyond what anything is measured by."""
+    if isinstance(value, (list, tuple)):
+        return all(map(harmless, value))
+    return not isinstance(value, (int, float)) or abs(value) <= 1e10
+
+
+@pytest.mark.parametrize(("where", "name"), SETTINGS)
+def test_every_number_has_two_ends(where: str, name: str) -> None:
+    if f"{where}.{name}" not in BY_RECIPE:
+        assert "any" not in told(MODELS[where].model_fields[name]).replace(",", "").split()
+
+
+def test_the_page_of_settings_tells_their_ranges() -> None:
+    text = (ROOT / "docs" / "settings.md").read_text()
+    for step in STEPS:
+        for name, field in step.params.model_fields.items():
+            line = next(line for line in text.splitlines() if line.startswith(f"| `{step.name}.{name}` "))
+            assert line.split("|")[3].strip() == told(field), line
+
+
+def test_every_number_that_a_command_takes_has_a_range() -> None:
+    def commands(group: Any) -> Iterator[Any]:
+        for one in group.commands.values():
+            yield from commands(one) if hasattr(one, "commands") else [one]
+
+    hints = [get_type_hints(one.callback) for one in commands(get_command(app))]
+    numbers = {name for of in hints for name, kind in of.items() if {int, float} & {kind, *get_args(kind)}}
+    assert len(numbers) > 15 and numbers <= Numbers.model_fields.keys()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "option"),
+    [
+        (("slam", "v.mp4", "--focal", "nan"), "--focal"),
+        (("slam", "v.mp4", "--focal", "-5"), "--focal"),
+        (("slam", "v.mp4", "--focal", "0"), "--focal"),
+        (("slam", "v.mp4", "--focal", "inf"), "--focal"),
+        (("slam", "v.mp4", "--centre", "nan", "3"), "--centre"),
+        (("slam", "v.mp4", "--fps", "0"), "--fps"),
+        (("slam", "v.mp4", "--set", "slam.sigma=nan"), "slam.sigma"),
+        (("run", "tile", "--hold-out", "1"), "views.hold_out"),
+        (("run", "data_samples/tile", "--set", "export.world_origin=[nan, 0, 0]"), "export.world_origin"),
+        (("run", "data_samples/tile", "--set", "export.world_origin=[1e300, 0, 0]"), "export.world_origin"),
+        (("run", "data_samples/tile", "--set", "poisson.threads=100000"), "poisson.threads"),
+        (("run", "data_samples/tile", "--set", "unwrap.texel=1e-9"), "unwrap.texel"),
+        (("run", "data_samples/tile", "--set", "unwrap.vegetation.texel=nan"), "unwrap.texel"),
+        (("run", "data_samples/tile", "--set", f"voxel.size={'9' * 6000}"), "voxel.size"),
+        (("tile", "data_samples/tile", "--length", "nan"), "--length"),
+        (("survey", "data_samples/tile", "--buffer", "inf"), "--buffer"),
+    ],
+)
+def test_commands_refuse_wild_numbers_at_once(arguments: tuple[str, ...], option: str, tmp_path: Path) -> None:
+    given = ["data_samples/tile" if a == "tile" and i else a for i, a in enumerate(arguments)]
+    result = CliRunner().invoke(app, [*given, "--out", str(tmp_path / "out")])
+    assert isinstance(result.exception, SettingError) and result.exception.where == option
+    assert "must be" in result.exception.cause and not (tmp_path / "out" / "steps").exists()
+
+
+def test_a_sample_of_wild_size_is_refused(tmp_path: Path) -> None:
+    for option, value in (("--length", "1e300"), ("--points", "nan"), ("--photos", "-3"), ("--seed", "-1")):
+        result = CliRunner().invoke(app, ["sample", str(tmp_path / "street"), option, value])
+        assert isinstance(result.exception, SettingError) and result.exception.where == option
+
+
+def test_texels_too_fine_for_a_surface_are_refused() -> None:
+    check_size(2e8, UnwrapParams(texel=0.01))
+    with pytest.raises(SettingError, match=r"0\.0005 m a texel makes .* Set unwrap\.texel=0\.0023 or larger"):
+        check_size(8e10, UnwrapParams(texel=0.0005))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
+import sys
 import time
 from pathlib import Path
 from typing import Literal
@@ -14,11 +16,11 @@ from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 
 class ToyParams(Params):
-    """What the toy does: nothing, fail, die, hang or fill the disk; `log` counts its runs."""
+    """What the toy does: nothing, fail, die, hang, or die noisily and leave litter; `log` counts its runs."""
 
     log: Path
     name: str
-    does: Literal["work", "fail", "bug", "die", "hang"] = "work"
+    does: Literal["work", "fail", "bug", "die", "hang", "litter"] = "work"
     value: int = 0
 
 
@@ -34,6 +36,11 @@ def toy(inputs: Inputs, params: ToyParams, out: Path, report: Report) -> Done:
     if params.does == "bug":
         raise ZeroDivisionError("a bug")
     if params.does == "die":
+        os.kill(os.getpid(), signal.SIGKILL)
+    if params.does == "litter":
+        locks = [multiprocessing.get_context("forkserver").Lock() for _ in range(3)]
+        print(f"{len(locks)} locks are never given back", file=sys.stderr, flush=True)
+        os.write(2, b"a library says this\n")
         os.kill(os.getpid(), signal.SIGKILL)
     if params.does == "hang":
         time.sleep(60)

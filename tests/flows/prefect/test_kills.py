@@ -158,6 +158,23 @@ def test_ctrl_c_ends_a_run_and_the_server_that_it_started(tmp_path: Path) -> Non
     assert "the same command goes on from there" in log.read_text()
 
 
+def test_a_killed_command_takes_the_server_that_it_started_along(tmp_path: Path) -> None:
+    out, log = tmp_path / "out", tmp_path / "log"
+    command = [sys.executable, "-m", "scan2sim.flows.cli", "survey", "data_samples/tile", "--out", str(out)]
+    with open(log, "w") as file:
+        process = subprocess.Popen(
+            [*command, "--runner", "threads"], env=environment(tmp_path), cwd=ROOT, stdout=file, stderr=file,
+            start_new_session=True,
+        )  # fmt: skip
+    try:
+        wait_for("its server", lambda: processes("PREFECT__SERVER_EPHEMERAL", "1"), 150)
+        wait_for("a finished step", lambda: list(out.glob("steps/*/*/*/manifest.json")), 150)
+        process.kill()  # it alone
+        wait_for("the end of all that it started", lambda: not processes("PREFECT_HOME", str(tmp_path)), 30)
+    finally:
+        kill(process)
+
+
 class GivenUp:
     """A future as runners give it that have lost too many workers to a step (Dask: `KilledWorker`)."""
 

@@ -86,6 +86,12 @@ def test_what_write_tile_writes_read_tile_reads(tmp_path: Path) -> None:
         ({"photo": {"postion": [0, 0, 0]}}, r"field `photos\.0\.postion`.*docs/formats\.md"),
         ({"camera": {"model": "pinhole", "distortion": [0.1]}}, r"camera `front`: 1 distortion coef.*takes 0"),
         ({"camera": {"focal": [0.0, 0.0]}}, r"camera `front`: focal .* is not positive.*fx and fy"),
+        ({"camera": {"focal": [float("nan"), 1.0]}}, r"camera `front`: focal .* is not positive"),
+        ({"camera": {"focal": [1e300, 1.0]}}, r"camera `front`: focal"),
+        ({"camera": {"centre": [float("nan"), 0.0]}}, r"camera `front`: centre .*cx and cy"),
+        ({"camera": {"centre": [1e300, 0.0]}}, r"camera `front`: centre .*cx and cy"),
+        ({"camera": {"model": "opencv", "distortion": [float("nan"), 0, 0, 0]}}, r"camera `front`: distortion"),
+        ({"camera": {"model": "opencv", "distortion": [0, -1e300, 0, 0]}}, r"camera `front`: distortion"),
         ({"camera": {"model": "fish"}}, r"field `cameras\.0\.model`"),
         ({"units": "yards"}, r"field `units`.*docs/formats\.md"),
         ({"crs": "EPSG:99999"}, r"EPSG:99999.* is not a CRS.*EPSG:32633"),
@@ -107,6 +113,13 @@ def test_bad_tiles_are_refused_by_name(tmp_path: Path, changes: dict, message: s
     (tmp_path / "bad.csv").write_text("time,x,y,z\n1,2\n")
     with pytest.raises(InputError, match=message):
         read_tile(save(tmp_path, body(tmp_path, **changes)))
+
+
+def test_two_cameras_of_one_id_are_refused(tmp_path: Path) -> None:
+    content = body(tmp_path)
+    content["cameras"] *= 2
+    with pytest.raises(InputError, match=r"has two cameras `front`.*an id of its own"):
+        read_tile(save(tmp_path, content))
 
 
 def test_no_tile_and_bad_toml(tmp_path: Path) -> None:

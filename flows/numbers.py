@@ -1,0 +1,63 @@
+"""Ranges of the numbers that commands take as options, in one table: a name means the same in all commands."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+from pydantic import Field
+
+from scan2sim.pipeline.ranges import Seed, Voxel
+from scan2sim.pipeline.step import Params
+
+Metres = Annotated[float, Field(ge=0, le=10_000)]
+Jobs = Annotated[int, Field(ge=0, le=1024)]
+Pixels = Annotated[float, Field(ge=-1_000_000, le=1_000_000)]
+Focal = Annotated[float, Field(ge=1, le=1_000_000)]
+"""Pixels."""
+Rate = Annotated[float, Field(ge=0.01, le=1000)]
+"""Frames a second."""
+Shift = Annotated[float, Field(ge=-1e10, le=1e10)]
+"""Seconds between two clocks, of which one may count from 1970."""
+
+
+class Numbers(Params):
+    """Options by their names, those that are given; the commands' help says what they mean."""
+
+    hold_out: Annotated[int, Field(ge=0, le=1_000_000)] | None = None
+    jobs: Jobs | None = None
+    cores: Annotated[int, Field(ge=1, le=1024)] | None = None
+    length: Annotated[float, Field(ge=1, le=100_000)] | None = None
+    buffer: Annotated[float, Field(ge=0, le=1000)] | None = None
+    reach: Annotated[float, Field(ge=1, le=10_000)] | None = None
+    photo_reach: Metres | None = None
+    points: Annotated[float, Field(ge=1000, le=1e9)] | None = None
+    photos: Annotated[int, Field(ge=0, le=10_000)] | None = None
+    seed: Seed | None = None
+    minutes: Annotated[float, Field(ge=0, le=100_000)] | None = None
+    steps: Annotated[int, Field(ge=1, le=10_000_000)] | None = None
+    gps_offset: Shift | None = None
+    time_offset: Shift | None = None
+    focal: Focal | None = None
+    centre: tuple[Pixels, Pixels] | None = None
+    fps: Rate | None = None
+    every: Annotated[int, Field(ge=1, le=1_000_000)] | None = None
+    until: Annotated[float, Field(ge=0, le=1e7)] | None = None
+    segment: Annotated[float, Field(ge=1, le=1e7)] | None = None
+    max_range: Annotated[float, Field(ge=0.1, le=10_000)] | None = None
+    min_range: Metres | None = None
+    period: Annotated[float, Field(ge=0.0001, le=1000)] | None = None
+    voxel: Voxel | None = None
+    scale: Annotated[float, Field(ge=1e-6, le=1e6)] | None = None
+
+
+def check(given: Mapping[str, Any]) -> None:
+    """See that numbers among a command's options are in their ranges; others are left to the command.
+
+    Raises:
+        SettingError: naming the option and its range.
+    """
+    for name, value in given.items():
+        if name in Numbers.model_fields and isinstance(value, (int, float, tuple)):
+            option = f"--{name.replace('_', '-')}"
+            Numbers.of("", {name: value}, remedy=f"Give another {option}; `--help` says what it means")
