@@ -13,6 +13,7 @@ from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 if TYPE_CHECKING:
     from scan2sim.pipeline.types import PointCloud
 
+FLAT = 0.5  # |nz| from which on a surface is a roof's
 COVER = 3  # cells of the points' spacing: gaps between points of one roof or crown
 
 
@@ -20,7 +21,8 @@ class MadeUpParams(Params):
     """Whether what an airborne scanner can't see is made up.
 
     Attributes:
-        when: "auto": where the tile has neither a scanner's path nor photos taken from the ground; "always", "never".
+        when: "auto": where the tile has neither a scanner's path nor photos taken from the ground, and more of its
+            buildings' points lie on roofs than on walls; "always", "never".
         seed: the tile's (x, y), world metres, where it meets others; set by the recipe.
         neighbours: names of tiles whose cells touch to their seeds, world metres; set by the recipe.
         name: of the tile; set by the recipe.
@@ -60,9 +62,10 @@ def ground(inputs: Inputs, params: GroundParams, out: Path, report: Report) -> D
 
     terrain = united(inputs, params, "terrain")
     above = [united(inputs, params, part) for part in ("building", "vegetation", "rest")]
+    asked = params.when == "always" or from_above(above[0])
     made = PointCloud(terrain.frame, np.zeros((0, 3), np.float32), normal=np.zeros((0, 3), np.float32))
     area = 0.0
-    if len(terrain) and any(map(len, above)):
+    if asked and len(terrain) and any(map(len, above)):
         from scipy import ndimage
 
         raster = Raster.over(spacing(terrain.xyz), [terrain.xyz, *(cloud.xyz for cloud in above)])
@@ -85,7 +88,15 @@ def ground(inputs: Inputs, params: GroundParams, out: Path, report: Report) -> D
         made = PointCloud(terrain.frame, xyz, rgb, normal.astype(np.float32), label)
         area = len(xyz) * raster.cell**2
     made.save(out / "made.npz")
-    return Done({"made": out / "made.npz"}, {"points": len(made), "made_up_m2": round(area, 1)})
+    return Done({"made": out / "made.npz"}, {"from_above": asked, "points": len(made), "made_up_m2": round(area, 1)})
+
+
+def from_above(building: PointCloud) -> bool:
+    """Whether a scanner saw more of the buildings' roofs than of their walls; so it is without buildings, too."""
+    import numpy as np
+
+    assert building.normal is not None
+    return len(building) == 0 or float(np.mean(np.abs(building.normal[:, 2]) > FLAT)) >= 0.5
 
 
 def near_cell(xy: object, params: MadeUpParams, cloud: PointCloud) -> object:

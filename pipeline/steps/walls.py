@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from pydantic import Field
 
 from scan2sim.pipeline.step import Done, Inputs, Report, Step
-from scan2sim.pipeline.steps.ground import MadeUpParams, near_cell, united
+from scan2sim.pipeline.steps.ground import FLAT, MadeUpParams, from_above, near_cell, united
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.heightfield import Raster
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from scan2sim.pipeline.types import F32, F64, PointCloud
 
 DENSE = 0.2  # metres between points of a wall
-FLAT = 0.5  # |nz| from which on a surface is a roof's
 SUNK = 0.3  # metres that walls reach into the ground
 OUTSIDE = (1.5, 2.5, 3.5)  # cells beyond a roof's side where another roof is looked for, the nearest first
 SEEN = 1.5  # times DENSE: a wall's own points are this close
@@ -60,8 +59,9 @@ def walls(inputs: Inputs, params: WallsParams, out: Path, report: Report) -> Don
     if "ground" in inputs:
         floor = np.concatenate([floor, PointCloud.load(inputs["ground"]).xyz])
     made = PointCloud(building.frame, np.zeros((0, 3), np.float32), normal=np.zeros((0, 3), np.float32))
-    facts = {"roofs": 0, "sides": 0, "footprints": 0, "points": 0, "made_up_m2": 0.0}
-    if len(building) and len(floor):
+    asked = params.when == "always" or from_above(building)
+    facts = {"from_above": asked, "roofs": 0, "sides": 0, "footprints": 0, "points": 0, "made_up_m2": 0.0}
+    if asked and len(building) and len(floor):
         assert building.normal is not None
         flat = building.xyz[np.abs(building.normal[:, 2]) > FLAT]
         raster = Raster.over(spacing(flat), [building.xyz])
@@ -87,7 +87,7 @@ def walls(inputs: Inputs, params: WallsParams, out: Path, report: Report) -> Don
         xyz = np.concatenate([np.zeros((0, 3)), *(part[0] for part in parts)])
         normal = np.concatenate([np.zeros((0, 3)), *(part[1] for part in parts)])
         made = _cloud(xyz, normal, building, params)
-        facts = {"roofs": int(label.max()), "sides": count, "footprints": len(given)}
+        facts |= {"roofs": int(label.max()), "sides": count, "footprints": len(given)}
         facts |= {"points": len(made), "made_up_m2": round(len(made) * DENSE**2, 1)}
     made.save(out / "made.npz")
     return Done({"made": out / "made.npz"}, facts)

@@ -130,7 +130,7 @@ def test_the_house_is_closed_and_the_roof_stays(house: dict[str, Path], tmp_path
 
 def test_walls_that_were_seen_are_left_alone(house: dict[str, Path], tmp_path: Path) -> None:
     building = PointCloud.load(house["building"])
-    y, z = (a.ravel() for a in np.meshgrid(np.arange(-4, 4, 0.15), np.arange(-0.2, 6, 0.15)))
+    y, z = (a.ravel() for a in np.meshgrid(np.arange(-4, 4, 0.25), np.arange(-0.2, 6, 0.25)))
     seen = np.column_stack([np.full(len(y), -6.0), y, z]).astype(np.float32)
     wall = PointCloud(
         FRAME, seen, np.full((len(seen), 3), 200, np.uint8), np.tile(np.float32([-1, 0, 0]), (len(seen), 1)),
@@ -256,3 +256,19 @@ def test_points_far_from_the_mesh_are_warned_of_and_made_up_area_is_told(
     assert len(done.warnings) == 1 and "building" in done.warnings[0]
     west = 8 * 3 / (8 * 3 + 10 * 8)
     assert done.facts["building"]["made_up"] == pytest.approx(west, abs=0.06)
+
+
+def test_a_street_scanned_from_the_ground_gets_nothing_made_up_without_a_path_either(
+    house: dict[str, Path], tmp_path: Path
+) -> None:
+    building = PointCloud.load(house["building"])
+    y, z = (a.ravel() for a in np.meshgrid(np.arange(-4, 4, 0.1), np.arange(0, 6, 0.1)))
+    wall = np.column_stack([np.full(len(y), -6.0), y, z]).astype(np.float32)
+    seen = PointCloud(FRAME, wall, normal=np.tile(np.float32([-1, 0, 0]), (len(wall), 1)),
+                      label=np.full(len(wall), CODE["building"], np.uint8))  # fmt: skip
+    ledge = building.take(np.flatnonzero(building.xyz[:, 0] < -5))
+    PointCloud.join([ledge, seen]).save(tmp_path / "building.npz")
+    inputs = {name: house[name] for name in ("terrain", "vegetation", "rest")} | {"building": tmp_path / "building.npz"}
+    for step in (GROUND, WALLS):
+        assert go(step, tmp_path / step.name, inputs).facts["points"] == 0
+        assert go(step, tmp_path / f"{step.name}_asked", inputs, when="always").facts["points"] > 0
