@@ -106,7 +106,7 @@ def _render(
         pictures=pictures,
         groups=GROUPS,
         gazebo=opened,
-        view=view and {**view, "folder": SCRIPTS, "about": {name: view[name] for name in ("walk", "turn")}},
+        view=view and {**view, "folder": SCRIPTS, "about": {name: view[name] for name in ("start", "walk", "turn")}},
         script=Markup((PAGES / "walk.js").read_text(encoding="utf-8")),
     )
 

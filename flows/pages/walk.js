@@ -84,7 +84,7 @@
   }
 
   class View {
-    // box: the element that holds the world; about: where eyes are at first, `walk` and `turn`: [eye, target], metres
+    // box: the element that holds the world; about: `walk` and `turn`: [eye, target], metres; `start`: one of them
     constructor(box, all, about) {
       this.box = box;
       this.about = about;
@@ -107,7 +107,7 @@
       this.listen();
       new ResizeObserver(() => this.fit()).observe(box);
       this.fit();
-      this.mode("walk");
+      this.mode(about.start);
       let before = performance.now();
       const frame = (now) => {
         this.move(Math.min(0.25, (now - before) / 1000));
@@ -122,6 +122,7 @@
       const { clientWidth: width, clientHeight: height } = this.box;
       this.renderer.setSize(width, height, false);
       this.camera.aspect = width / Math.max(1, height);
+      this.camera.fov = this.camera.aspect > 1 ? 50 : 65; // degrees from top to bottom: phones are narrow
       this.camera.updateProjectionMatrix();
       this.stale = true;
     }

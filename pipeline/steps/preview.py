@@ -36,11 +36,14 @@ def preview(inputs: Inputs, params: PreviewParams, out: Path, report: Report) ->
     """Pack the textured groups as a GLB inside a script, `preview/world.js`.
 
     A page that is opened by a double click may read no other file but scripts. Facts: `scale` of the pages' sides,
-    `bytes`, and where eyes are at first, `walk` and `turn`: [eye, target], local metres.
+    `bytes`, and where eyes are at first, `walk` and `turn`: [eye, target], local metres; `start` is one of both, as in
+    the report's first picture.
     """
+    import numpy as np
+
     from scan2sim.pipeline import render
     from scan2sim.pipeline.io import gltf, textured
-    from scan2sim.pipeline.steps.pictures import bird_pose, bounds, driver_pose
+    from scan2sim.pipeline.steps.pictures import bird_pose, bounds, driver_pose, whole_pose
     from scan2sim.pipeline.types import Trajectory
 
     read = {group: textured.read(inputs[group]) for group in GROUPS if group in inputs}
@@ -57,15 +60,19 @@ def preview(inputs: Inputs, params: PreviewParams, out: Path, report: Report) ->
     script = folder / "world.js"
     script.write_bytes(CALL + b'("' + base64.b64encode(glb.read_bytes()) + b'");\n')
     glb.unlink()
-    path = Trajectory.load(inputs["path"]) if "path" in inputs else None
-    low, high = bounds([surface.mesh.vertices for surface in surfaces.values()])
+    path = Trajectory.load(inputs["path"]).positions if "path" in inputs else []
+    driven = len(path) > 1
+    points = np.concatenate([surface.mesh.vertices for surface in surfaces.values()])
+    low, high = bounds([points])
+    air = bird_pose(low, high) if driven else whole_pose(points.clip(low, high), render.pinhole(1280, 720))
     shapes = render.Renderer([render.Body(surface.mesh) for surface in surfaces.values()])
     facts: dict[str, Any] = {
         "triangles": triangles,
         "scale": round(scale, 4),
         "bytes": script.stat().st_size,
-        "walk": _eye(driver_pose(path.positions if path is not None else None, low, high, shapes), low),
-        "turn": _eye(bird_pose(low, high), low),
+        "start": "walk" if driven else "turn",
+        "walk": _eye(driver_pose(path if driven else None, low, high, shapes), low),
+        "turn": _eye(air, low),
     }
     return Done({"preview": folder}, facts)
 
@@ -89,4 +96,4 @@ def _eye(pose: F64, low: F64) -> list[list[float]]:
     return [eye.round(3).tolist(), (eye + ahead * reach).round(3).tolist()]
 
 
-PREVIEW = Step("preview", 1, preview, PreviewParams)
+PREVIEW = Step("preview", 2, preview, PreviewParams)

@@ -54,6 +54,7 @@ def test_one_starts_on_the_ground_and_above_it(made: Any) -> None:
     (x, y, z), target = facts["walk"]
     assert z - made_up.height(np.array(x), np.array(y)) == pytest.approx(1.6, abs=0.3)
     assert np.linalg.norm(np.subtract(target, (x, y, z))) > 5 and facts["turn"][0][2] > 5
+    assert facts["start"] == "turn"  # nobody drove there
 
 
 def test_a_world_of_too_many_triangles_has_none(made: Any) -> None:
