@@ -89,9 +89,13 @@ def _scan(file: Any, node: Any) -> Iterator[Points]:
     for name, array in values.items():
         buffers.append(libe57.SourceDestBuffer(file, name, array, PART, True, True))
     pose = _pose(node)
+    done = 0
     with closing(header.points.reader(buffers)) as reader:
         while n := reader.read():
+            done += n
             yield _points({name: array[:n].copy() for name, array in values.items()}, places, pose, node)
+    if done != header.point_count:
+        raise ValueError(f"{done:,} of {header.point_count:,} points can be read")
 
 
 def _points(values: dict[str, F64], places: tuple[str, ...], pose: F64, node: Any) -> Points:

@@ -58,7 +58,7 @@ def by_earth(model: Path, T_earth: F64, centres: F64, crs: str | None) -> Fit:
     corners = middle + np.vstack([np.zeros(3), 100 / size * np.eye(3)])  # 100 m along each of the model's axes
     xyz = corners @ T_earth[:3, :3].T + T_earth[:3, 3]
     lon, lat, height = Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True).transform(*xyz.T)
-    crs, places = _projected(model, crs, np.column_stack([lat, lon, height]))
+    crs, places, _ = _projected(model, crs, np.column_stack([lat, lon, height]))
     u, stretch, vt = np.linalg.svd((places[1:] - places[0]).T * size / 100)
     scale = float(np.sort(stretch)[1])  # two of the three are the projection's, one is the height's
     rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
@@ -98,8 +98,8 @@ def by_photos(model: Path, centres: F64, ups: F64, photos: Sequence[Path], crs: 
             model, f"only {len(some)} of {len(photos)} photos have GPS", "Give --upright and --scale instead"
         )
     rows: Any = [positions[i] for i in some]
-    crs, target = _projected(model, crs, np.array([(lat, lon, height or 0.0) for lat, lon, height in rows]))
-    source = centres[some]
+    crs, target, unit = _projected(model, crs, np.array([(lat, lon, height or 0.0) for lat, lon, height in rows]))
+    source, target = centres[some], target * unit  # in metres, as the bounds are
     try:
         onto, near = robust(source, target, REACH)
     except DataError as error:
@@ -121,11 +121,11 @@ def by_photos(model: Path, centres: F64, ups: F64, photos: Sequence[Path], crs: 
         told.append("its photos lie on a line, about which GPS can't tell the roll: the photos' own up is taken for it")
     if len(used) < 0.6 * len(some):
         told.append(f"the GPS of {len(some) - len(used)} photos is more than {REACH:g} m off, and was left out")
-    return Fit(onto, crs, rms, used, tuple(told))
+    return Fit(Similarity(onto.scale / unit, onto.rotation, onto.translation / unit), crs, rms, used, tuple(told))
 
 
-def _projected(model: Path, crs: str | None, places: F64) -> tuple[str, F64]:
-    """CRS (default: UTM) and coordinates in its units of (N, 3) latitudes, longitudes (degrees), heights (m)."""
+def _projected(model: Path, crs: str | None, places: F64) -> tuple[str, F64, float]:
+    """CRS (default: UTM), coordinates in its units and metres of one, of (N, 3) latitudes, longitudes, heights (m)."""
     from pyproj import Transformer
 
     lat, lon, height = places.T
@@ -137,7 +137,7 @@ def _projected(model: Path, crs: str | None, places: F64) -> tuple[str, F64]:
     out = np.column_stack([east, north, height / unit])
     if not np.isfinite(out).all():
         raise InputError(model, f"lies outside of {crs_io.name(crs)}", "Name another CRS")
-    return crs, out
+    return crs, out, unit
 
 
 def _spread(places: F64) -> tuple[float, float]:

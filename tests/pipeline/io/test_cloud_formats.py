@@ -344,6 +344,32 @@ def test_a_pcd_header_that_lies_is_refused(tmp_path: Path, data: str, count: int
         clouds.read(tmp_path / "c.pcd", Frame())
 
 
+def crc32c(data: bytes) -> int:
+    """Castagnoli's, of E57's pages."""
+    table = []
+    for value in range(256):
+        for _ in range(8):
+            value = value >> 1 ^ (0x82F63B78 if value & 1 else 0)
+        table.append(value)
+    crc = 0xFFFFFFFF
+    for byte in data:
+        crc = table[(crc ^ byte) & 255] ^ crc >> 8
+    return crc ^ 0xFFFFFFFF
+
+
+@pytest.mark.parametrize("count", [b"401", b"999"])
+def test_an_e57_count_that_lies_is_refused(tmp_path: Path, count: bytes) -> None:
+    """With right checksums: E57 has one behind every 1,020 bytes."""
+    write_e57(tmp_path / "c.e57", made(N))
+    data = (tmp_path / "c.e57").read_bytes()
+    plain = b"".join(data[at : at + 1020] for at in range(0, len(data), 1024))
+    plain = plain.replace(b'recordCount="400"', b'recordCount="%s"' % count)
+    pages = [plain[at : at + 1020] for at in range(0, len(plain), 1020)]
+    (tmp_path / "c.e57").write_bytes(b"".join(page + struct.pack(">I", crc32c(page)) for page in pages))
+    with pytest.raises(InputError, match=f"400 of {count.decode()} points can be read"):
+        clouds.read(tmp_path / "c.e57", FRAME)
+
+
 def test_beams_without_return_are_left_out(tmp_path: Path) -> None:
     rows = np.ones(1000, [("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
     rows["y"][:900] = np.nan

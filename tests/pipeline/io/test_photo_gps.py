@@ -96,6 +96,14 @@ def test_exact_gps_places_exactly(tmp_path: Path) -> None:
     assert np.allclose(fit.onto.rotation @ TURN.as_matrix(), np.eye(3), atol=1e-3)
 
 
+def test_a_crs_in_feet_is_placed_in_feet(tmp_path: Path) -> None:
+    feet = "+proj=utm +zone=33 +datum=WGS84 +units=us-ft +type=crs"
+    told = circle() + np.random.default_rng(0).normal(0, 1.5, (16, 3))
+    fit = by_photos(tmp_path, in_model(circle()), ups(16), photos(tmp_path, told), feet)
+    assert np.abs(fit.onto.apply(in_model(circle())) * 1200 / 3937 - circle()).max() < 3
+    assert len(fit.used) == 16 and fit.rms is not None and fit.rms < 3.5
+
+
 def test_on_a_straight_track_the_photos_own_up_tells_the_roll(tmp_path: Path) -> None:
     told = line() + np.random.default_rng(0).normal(0, 1, (16, 3))
     fit = by_photos(tmp_path, in_model(line()), ups(16), photos(tmp_path, told), CRS)
