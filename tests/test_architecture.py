@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -46,6 +47,12 @@ def test_prefect_is_known_to_its_flows_alone() -> None:
         for file in (ROOT / room).rglob("*.py"):
             if "prefect" in imported(file):
                 assert file.relative_to(ROOT).as_posix() in ("flows/tile.py", "flows/survey.py", "flows/reprocess.py")
+
+
+def test_hints_to_install_work_without_a_checkout() -> None:
+    for room in ROOMS:
+        for file in (ROOT / room).rglob("*.py"):
+            assert not re.search(r"pip install[^\n]*(-e |constraints)", file.read_text()), file.relative_to(ROOT)
 
 
 def loaded_by(code: str, names: tuple[str, ...] = HEAVY) -> set[str]:
