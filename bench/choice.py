@@ -190,8 +190,9 @@ def paint(files: dict[str, Path], choice: Choice, folder: Path) -> Path:
 def compare(scene: Scene, names: Sequence[str], *, textures: bool) -> dict[str, dict[str, Any]]:
     """Figures of all solvers, printed as they come."""
     folder = scene.folder / "choices"
-    files = prepare(scene, folder)
-    choice, mesh = Choice.load(files["choice"]), Mesh.load(scene.mesh)
+    found = folder / "choose" / "choice.npz"
+    files = prepare(scene, folder) if textures or not found.is_file() else {}
+    choice, mesh = Choice.load(found), Mesh.load(scene.mesh)
     pairs, length, price = seams(mesh, ChooseParams.model_validate({}).smoothness)
     problem = (choice.view, labels.costs(choice.view, choice.quality), pairs, price)
     bound = labels.solve(*problem).bound
@@ -221,7 +222,7 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=[*SCENES, WARM])
     parser.add_argument("--out", type=Path, default=ROOT / "bench-out" / "texture")
     parser.add_argument("--solvers", nargs="+", default=list(solvers()), choices=list(solvers()))
-    parser.add_argument("--energies", action="store_true", help="energies and times alone, no textures")
+    parser.add_argument("--energies", action="store_true", help="no textures; candidates of an earlier run stand")
     arguments = parser.parse_args()
     told = {}
     for name in arguments.scenes:
