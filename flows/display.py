@@ -16,6 +16,7 @@ from rich.table import Column
 
 from scan2sim.flows.execute import Event
 from scan2sim.flows.recipe import Node
+from scan2sim.pipeline.errors import printable
 from scan2sim.pipeline.step import Report
 
 console = Console()
@@ -50,7 +51,7 @@ def progress(title: str) -> Iterator[Report]:
 
 def warn(text: str) -> None:
     """Show a warning."""
-    console.print(f"[yellow]warning:[/] {escape(text)}", highlight=False, soft_wrap=True)
+    console.print(f"[yellow]warning:[/] {escape(printable(text))}", highlight=False, soft_wrap=True)
 
 
 class RunDisplay:

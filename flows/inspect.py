@@ -5,14 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
-from xml.etree import ElementTree
 
 from rich.markup import escape
 from rich.table import Table
 
 from scan2sim.flows.display import console
 from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.io import files
+from scan2sim.pipeline.io import files, xml
 
 Facts = list[tuple[str, str]]
 
@@ -165,10 +164,7 @@ def _sdf(folder: Path) -> Path:
 
 
 def _world(path: Path) -> tuple[str, Facts]:
-    try:
-        root = ElementTree.parse(path).getroot()
-    except ElementTree.ParseError as error:
-        raise InputError(path, f"is no readable SDF ({error})", "Export it again") from None
+    root = xml.root(path)
     place = [root.findtext(f".//spherical_coordinates/{k}") for k in ("latitude_deg", "longitude_deg", "elevation")]
     facts = [
         ("SDF", root.get("version", "?")),

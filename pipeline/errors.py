@@ -23,12 +23,17 @@ class ScanError(Exception):
 
     def __init__(self, where: str | Path, cause: str, remedy: str) -> None:
         super().__init__(where, cause, remedy)  # args must survive pickling between processes
-        self.where = str(where)
-        self.cause = cause
-        self.remedy = remedy
+        self.where = printable(str(where))
+        self.cause = printable(cause)
+        self.remedy = printable(remedy)
 
     def __str__(self) -> str:
         return f"{self.where}: {self.cause}. {self.remedy}"
+
+
+def printable(text: str) -> str:
+    """Text, which may hold names of files, with codes for what would steer a terminal or begin a line."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 class SettingError(ScanError):

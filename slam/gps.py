@@ -13,14 +13,14 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
 
 import numpy as np
 import numpy.typing as npt
 
 from scan2sim.pipeline.errors import InputError, from_os_error
 from scan2sim.pipeline.extras import need
-from scan2sim.pipeline.io import files
+from scan2sim.pipeline.io import files, xml
 from scan2sim.pipeline.io.crs import utm
 from scan2sim.pipeline.types import F64, Frame
 
@@ -105,15 +105,8 @@ def read_gps(path: Path) -> GpsTrack:
 
 def read_gpx(path: Path) -> GpsTrack:
     """Track points of all tracks and segments of a GPX 1.0 or 1.1 file."""
-    text = path.read_bytes()
-    if b"<!DOCTYPE" in text or b"<!ENTITY" in text:
-        raise InputError(path, "declares XML entities, which GPX doesn't have", "Export it again")
-    try:
-        root = ElementTree.fromstring(text)
-    except ElementTree.ParseError as error:
-        raise InputError(path, f"is no readable XML ({error})", "Export it again") from None
     rows, untimed = [], 0
-    for point in root.iter():
+    for point in xml.root(path).iter():
         if _bare(point) != "trkpt":
             continue
         about = {_bare(child): (child.text or "").strip() for child in point}
@@ -246,7 +239,7 @@ FORMATS: dict[str, Callable[[Path], GpsTrack]] = {
 }
 
 
-def _bare(element: ElementTree.Element) -> str:
+def _bare(element: Element) -> str:
     """An element's tag without its name space."""
     return str(element.tag).rpartition("}")[2]
 

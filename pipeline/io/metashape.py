@@ -20,22 +20,19 @@ from __future__ import annotations
 
 from collections import Counter
 from pathlib import Path
-from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.io import crs as crs_io
-from scan2sim.pipeline.io import files, lens
+from scan2sim.pipeline.io import lens, xml
 from scan2sim.pipeline.io.models import Model, Photos, Shot
 from scan2sim.pipeline.similarity import Similarity
 from scan2sim.pipeline.types import F64, Camera
 
 REMEDY = "Export it again (File > Export > Export Cameras, Agisoft XML)"
 UNDISTORT = "Undistort the photos in Metashape and export them with their cameras, or fit without it"
-LARGEST = 500 << 20
-"""Bytes of a file; photos take about two thousand each."""
 
 
 def read(model: Path, photos: Photos) -> Model:
@@ -80,17 +77,7 @@ def read(model: Path, photos: Photos) -> Model:
 
 
 def _chunk(model: Path) -> Element:
-    files.check(model)
-    try:
-        if model.stat().st_size > LARGEST:
-            raise InputError(model, f"is of {model.stat().st_size:,} bytes", REMEDY)
-        head = model.open("rb").read(4096)
-        if b"<!DOCTYPE" in head or b"<!ENTITY" in head:  # Metashape writes none; entities can grow without bounds
-            raise InputError(model, "declares a document type, which Metashape doesn't", REMEDY)
-        root = ElementTree.parse(model).getroot()
-    except (OSError, ElementTree.ParseError, ValueError, RecursionError) as error:
-        raise InputError(model, f"is no readable XML ({error})", REMEDY) from None
-    chunks = [chunk for chunk in root.iter("chunk") if chunk.find("cameras") is not None]
+    chunks = [chunk for chunk in xml.root(model, REMEDY).iter("chunk") if chunk.find("cameras") is not None]
     if len(chunks) != 1:
         raise InputError(model, f"holds {len(chunks)} chunks with cameras", "Export one chunk's cameras as Agisoft XML")
     return chunks[0]

@@ -95,6 +95,12 @@ def test_the_page_shows_worst_median_and_best_and_the_tables(report: Any) -> Non
     assert "7 m²" in page and "None" not in page.split("<h2>Steps")[0]
 
 
+def test_names_of_photos_are_no_code_on_the_page(report: Any) -> None:
+    name = "<img src=x onerror=alert(1)>"
+    page = report({**SCORED, "photos": {name: {"psnr_gain_db": 20.0}}})[1]
+    assert name not in page and "&lt;img" in page
+
+
 def test_a_page_without_held_out_photos(report: Any) -> None:
     page = report(UNSCORED)[1]
     assert "--hold-out 8" in page and "Where it differs" not in page and "24.0 dB" in page
