@@ -69,7 +69,7 @@ def code_of(text: str) -> int | None:
     """The code of a class by its name, however that is written ("Road sign"), or by itself ("64"); None: no such."""
     plain = _plain(text)
     names = {_plain(name): code for name, code in (OTHER_NAMES | CODE).items()}
-    return names.get(plain, int(plain) if plain.isdigit() and int(plain) in CODE.values() else None)
+    return names.get(plain, int(plain) if plain in map(str, CODE.values()) else None)
 
 
 def name_of(code: int) -> str:
@@ -94,7 +94,7 @@ def mapping(given: Mapping[str, str | int]) -> dict[int, int]:
     """
     found = {}
     for code, name in given.items():
-        meant = code_of(str(name))
+        meant = code_of(name if isinstance(name, str) else str(min(max(name, -1), 256)))
         if not (code.strip().isdecimal() and len(code.strip()) < 4 and int(code) < 256):
             raise SettingError(
                 "classes", f"{code[:40]!r} is no code", "Write 65=noise: a code of the file from 0 to 255"

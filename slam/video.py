@@ -84,8 +84,8 @@ def open_video(path: Path, *, fps: float = 10.0, times: Path | None = None) -> V
     av = _av()
     try:
         with av.open(str(path)) as container:
-            if not container.streams.video:
-                raise InputError(path, "has no video stream", "Name a video file, or a folder of pictures")
+            if not container.streams.video or container.streams.video[0].codec_context is None:
+                raise InputError(path, "has no video stream to read", "Name a video file, or a folder of pictures")
             stream = container.streams.video[0]
             rate = float(stream.average_rate or stream.base_rate or 30)
             count = stream.frames or (round(stream.duration * stream.time_base * rate) if stream.duration else None)

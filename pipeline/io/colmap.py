@@ -8,6 +8,7 @@ Source: https://colmap.github.io/format.html, https://colmap.github.io/cameras.h
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -186,7 +187,7 @@ def _point_lines(lines: list[str]) -> Iterator[Point]:
 
 
 def _posed(camera: int, name: str, pose: tuple[float, ...]) -> Posed:
-    if not any(pose[:4]):
+    if not 1e-6 < math.hypot(*pose[:4]) < 1e6:
         raise ValueError(f"{name} has no rotation")
     return Posed(camera, name, pose)
 

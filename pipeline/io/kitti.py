@@ -340,11 +340,9 @@ def read_poses(path: Path, numbers: list[int]) -> F64:
         InputError: it is none, or has too few.
     """
     try:
-        rows = np.loadtxt(path, ndmin=2)
+        rows = np.loadtxt(files.check(path), ndmin=2)
         if rows.shape[1] != 12 or not (np.abs(rows) < FARTHEST).all():
             raise ValueError(f"shape {rows.shape}, values up to {np.abs(rows).max(initial=0):g}")
-    except FileNotFoundError:
-        raise InputError(path, "is missing", "Put it there, or mend the name") from None
     except ValueError as error:
         raise InputError(path, f"is no pose file ({error})", "Write 12 numbers a line, row-major 3x4") from None
     if len(rows) <= numbers[-1]:
@@ -353,6 +351,9 @@ def read_poses(path: Path, numbers: list[int]) -> F64:
         )
     T = np.tile(np.eye(4), (len(numbers), 1, 1))
     T[:, :3] = rows[numbers].reshape(-1, 3, 4)
+    R = T[:, :3, :3]
+    if np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max() > 1e-2:
+        raise InputError(path, "its left 3x3 parts are no rotations", "Write 12 numbers a line, row-major 3x4")
     return T
 
 

@@ -209,7 +209,10 @@ def _camera(row: Row, path: Path, where: str) -> Camera:
     model: Any = row.get("model") or "pinhole"
     if model not in get_args(CameraModel):
         raise InputError(path, f"{where}: unknown model `{model}`", f"Use {', '.join(get_args(CameraModel))}")
-    width, height = (round(_number(row, key, path, where)) for key in ("width", "height"))
+    sides = [_number(row, key, path, where) for key in ("width", "height")]
+    if not all(1 <= side < 1e6 for side in sides):
+        raise InputError(path, f"{where}: {sides[0]:g} x {sides[1]:g} is no size of a photo", "Give it in pixels")
+    width, height = map(round, sides)
     if model == "equirectangular":
         return Camera(model, width, height)
     fx = _number(row, "fx", path, where)

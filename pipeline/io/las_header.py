@@ -21,6 +21,8 @@ VLR, EVLR = 54, 60
 """Bytes of the head of a record."""
 COMPRESSED = 0xC0
 """Bits of the point format that LAZ sets."""
+LAYERED, LAYERS = b"\3", {10: 9, 11: 1, 12: 2, 13: 1}
+"""LAZ's compressor of point formats from 6 on, and how many layers its items have; extra bytes one each."""
 VARIABLE = 0xFFFFFFFF
 """Points a chunk, where the chunk table says it for each, as in COPC files."""
 
@@ -48,7 +50,7 @@ def check(path: Path) -> tuple[str, ...]:
         scales, offsets = struct.unpack_from("<3d", head, 131), struct.unpack_from("<3d", head, 155)
         if not all(map(math.isfinite, (*scales, *offsets))) or 0 in scales:
             raise _bad(path, f"coordinates are scaled by {scales} and moved by {offsets}")
-        chunk = _walk(path, file, header_size, vlrs, VLR, start)
+        laszip = _walk(path, file, header_size, vlrs, VLR, start)
         end = size
         if minor >= 4:
             extended, number, count = struct.unpack_from("<QIQ", head, 235)
@@ -58,7 +60,7 @@ def check(path: Path) -> tuple[str, ...]:
         if minor == 3:
             end = struct.unpack_from("<Q", head, 227)[0] or size
         if compressed:
-            return _compressed(path, file, start, size, record, count, chunk)
+            return _compressed(path, file, start, size, count, laszip)
         there = (size - start) // record
         if there < count:
             raise truncated(path, there, count, "end of file")
@@ -79,9 +81,9 @@ def _left_over(count: int, there: int) -> tuple[str, ...]:
     return (more,) if there > count else ()
 
 
-def _walk(path: Path, file: BinaryIO, at: int, number: int, head: int, end: int) -> int | None:
-    """Go through records that must end before byte `end`; the points a chunk, if one of them tells of LAZ's."""
-    chunk = None
+def _walk(path: Path, file: BinaryIO, at: int, number: int, head: int, end: int) -> bytes:
+    """Go through records that must end before byte `end`; returns what LAZ's own among them says, or nothing."""
+    laszip = b""
     for i in range(number):
         file.seek(min(at, end))
         about = file.read(head)
@@ -89,16 +91,16 @@ def _walk(path: Path, file: BinaryIO, at: int, number: int, head: int, end: int)
         if len(about) < head or at + head + length > end:
             raise _bad(path, f"{number:,} records are named, but the {i + 1}. reaches beyond their end")
         if about[2:18].startswith(b"laszip encoded") and head == VLR:
-            body = file.read(min(length, 16)).ljust(16, b"\0")
-            chunk = struct.unpack_from("<I", body, 12)[0]
+            laszip = file.read(length)
         at += head + length
-    return chunk
+    return laszip
 
 
-def _compressed(
-    path: Path, file: BinaryIO, start: int, size: int, record: int, count: int, chunk: int | None
-) -> tuple[str, ...]:
+def _compressed(path: Path, file: BinaryIO, start: int, size: int, count: int, laszip: bytes) -> tuple[str, ...]:
     """Hold the number of points against LAZ's table of chunks, each of which begins with a whole point."""
+    import lazrs
+
+    chunk = struct.unpack_from("<I", laszip.ljust(16, b"\0"), 12)[0]
     if not chunk:
         raise _bad(path, "nothing in it tells how its points are compressed")
     file.seek(start)
@@ -112,8 +114,37 @@ def _compressed(
     chunks = struct.unpack("<II", file.read(8))[1]
     if chunks * RECORDS[0] > table - start:
         raise truncated(path, 0, count, f"{chunks:,} chunks in {table - start:,} bytes")
+    file.seek(start)
+    try:
+        lengths = lazrs.read_chunk_table(file, lazrs.LazVlr(laszip))
+    except Exception as error:  # lazrs has its own kinds
+        raise truncated(path, 0, count, f"its table of chunks: {error}") from None
+    if sum(length for _, length in lengths) > table - start:
+        raise truncated(path, 0, count, "its chunks reach beyond their table")
+    _check_layers(path, file, start + 8, [length for _, length in lengths], laszip, count)
     if chunk == VARIABLE:
+        there = sum(points for points, _ in lengths)
+        if there < count:
+            raise truncated(path, there, count, "end of chunks")
         return ()
     if count > chunks * chunk:
         raise truncated(path, chunks * chunk, count, "end of chunks")
     return _left_over(count, (chunks - 1) * chunk + 1) if chunks else ()
+
+
+def _check_layers(path: Path, file: BinaryIO, at: int, lengths: list[int], laszip: bytes, count: int) -> None:
+    """Hold the lengths of the layers that a chunk of point formats from 6 on is made of against the chunk's own.
+
+    A chunk begins with a whole point and the number of its points; then come its layers' lengths, 32 bits each.
+    """
+    items = [struct.unpack_from("<HH", laszip, 34 + 6 * i) for i in range((len(laszip) - 34) // 6)]
+    if laszip[:1] != LAYERED or not items:
+        return
+    layers = sum(LAYERS.get(kind, size) for kind, size in items)
+    first = sum(size for _, size in items) + 4
+    for length in lengths:
+        file.seek(at + first)
+        said = file.read(4 * layers)
+        if len(said) < 4 * layers or sum(struct.unpack(f"<{layers}I", said)) > length:
+            raise truncated(path, 0, count, f"the chunk at byte {at:,} is longer than its {length:,} bytes")
+        at += length

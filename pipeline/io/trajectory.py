@@ -36,6 +36,8 @@ REMEDIES = {
     ".kitti": "Write 12 numbers a line, row-major 3x4",
 }
 KITTI_RATE = 10.0  # poses a second, as KITTI's cameras
+FARTHEST = 1e9
+"""Metres from a CRS's origin that no place has."""
 Lines = list[tuple[int, list[str]]]  # number in the file, from 1 on, and cells
 
 
@@ -63,6 +65,9 @@ def read(
         if kind == ".csv":
             heading, lines = _heading(path, lines)
         trajectory = _from_columns(path, kind, heading, lines, frame)
+    far = np.flatnonzero(~(np.abs(trajectory.positions) < FARTHEST).all(axis=1))
+    if len(far):
+        raise _bad(path, kind, lines[far[0]][0], "a position that is nowhere on Earth", "Leave out what has no pose")
     order = np.argsort(trajectory.times, kind="stable")
     if ordered and (np.diff(trajectory.times) <= 0).any():
         late = int(np.flatnonzero(np.diff(trajectory.times) <= 0)[0]) + 1
