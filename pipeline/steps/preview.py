@@ -60,7 +60,7 @@ def preview(inputs: Inputs, params: PreviewParams, out: Path, report: Report) ->
     script = folder / "world.js"
     script.write_bytes(CALL + b'("' + base64.b64encode(glb.read_bytes()) + b'");\n')
     glb.unlink()
-    path = Trajectory.load(inputs["path"]).positions if "path" in inputs else []
+    path = Trajectory.load(inputs["path"]).positions if "path" in inputs else np.zeros((0, 3))
     driven = len(path) > 1
     points = np.concatenate([surface.mesh.vertices for surface in surfaces.values()])
     low, high = bounds([points])
