@@ -143,7 +143,8 @@ def check(planned: Sequence[Planned]) -> None:
     if missing:
         libraries.check()
     for node in missing:
-        node.step.check(node.params)
+        if node.step.check:
+            node.step.check(node.params)
 
 
 def drop_damaged(planned: Sequence[Planned], store: Store, labels: Collection[str]) -> bool:

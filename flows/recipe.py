@@ -210,6 +210,19 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
     return nodes
 
 
+def check_here(settings: Settings) -> None:
+    """Refuse settings that don't exist or can't be had on this machine, before there is a tile.
+
+    Raises:
+        SettingError: as `recipe`.
+        ScanError: of a step that can't run here.
+    """
+    settings.check(STEPS, PER_CLASS)
+    for step in STEPS:
+        if step.check:
+            step.check(settings.params(step))
+
+
 def survey_recipe(tiles: Sequence[Tile], settings: Settings) -> list[Node]:
     """The graph of several tiles of a survey, which meet.
 

@@ -15,9 +15,10 @@ from scan2sim.flows.memory import parse
 from scan2sim.flows.planning import Planned, drop_damaged, plan
 from scan2sim.flows.prepare import survey_of
 from scan2sim.flows.publish import to_read
-from scan2sim.flows.recipe import survey_recipe
+from scan2sim.flows.recipe import check_here, survey_recipe
 from scan2sim.flows.run import STORE, Log, default_jobs, execute_shown, show_results
 from scan2sim.flows.settings import Settings
+from scan2sim.pipeline import libraries
 from scan2sim.pipeline.errors import ScanError, SettingError, SpaceError, StepError
 from scan2sim.pipeline.extras import need
 from scan2sim.pipeline.io.remote import Remote, is_remote, likeness
@@ -56,6 +57,8 @@ def run_source(
         survey(source, target, length, buffer, settings.values, runner, jobs, memory, cores, address)
         return
     limit_cores(cores)
+    libraries.check()
+    check_here(settings)
     with progress("survey") as report:
         path = survey_of(source, target, length=length, buffer=buffer, say=warn, report=report)
     log = Log(likeness(target) / "run.log")

@@ -79,10 +79,6 @@ class Run(Protocol):
     def __call__(self, inputs: Inputs, params: Any, out: Path, report: Report) -> Done: ...
 
 
-def _can_always(params: Any) -> None:
-    """The check of a step that needs nothing but the core."""
-
-
 @dataclass(frozen=True)
 class Step:
     """A step of the mission.
@@ -94,8 +90,8 @@ class Step:
             import what is heavy inside.
         params: its parameters; defaults are the mission's numbers.
         per_class: defaults that differ between terrain, building and vegetation.
-        check: given parameters, raises a ScanError if the step can't run with them on this machine (a package is
-            missing, say); called before any step runs, and quick.
+        check: given parameters, which then need defaults, raises a ScanError if the step can't run with them on this
+            machine (a package is missing, say); called before any step runs, and quick. None: it always can.
     """
 
     name: str
@@ -103,4 +99,4 @@ class Step:
     run: Run
     params: type[Params] = Params
     per_class: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    check: Callable[[Any], None] = _can_always
+    check: Callable[[Any], None] | None = None

@@ -9,6 +9,7 @@ from pydantic import AfterValidator, Field
 
 from scan2sim.pipeline.classes import GROUPS
 from scan2sim.pipeline.errors import DataError, SettingError
+from scan2sim.pipeline.extras import need
 from scan2sim.pipeline.ranges import Coordinate, Name
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
@@ -207,4 +208,14 @@ def _metadata(
     }
 
 
-EXPORT = Step("export", 1, export, ExportParams)
+def can_export(params: ExportParams) -> None:
+    """Refuse to begin if rasters are wanted without what writes them.
+
+    Raises:
+        UnavailableError: rasterio isn't installed.
+    """
+    if params.rasters:
+        need("export.rasters", "rasterio")
+
+
+EXPORT = Step("export", 1, export, ExportParams, check=can_export)

@@ -10,7 +10,6 @@ from pydantic import Field
 
 from scan2sim.pipeline.classes import GROUPS
 from scan2sim.pipeline.errors import DataError, SettingError
-from scan2sim.pipeline.extras import need
 from scan2sim.pipeline.ranges import Name, Texel
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
@@ -111,13 +110,4 @@ def rasters(inputs: Inputs, params: RastersParams, out: Path, report: Report) ->
     return Done({"rasters": folder}, facts, [local] if frame.crs == LOCAL else [])
 
 
-def can_write(params: RastersParams) -> None:
-    """Refuse to begin without what writes them.
-
-    Raises:
-        UnavailableError: rasterio isn't installed.
-    """
-    need("export.rasters", "rasterio")
-
-
-RASTERS = Step("rasters", 1, rasters, RastersParams, check=can_write)
+RASTERS = Step("rasters", 1, rasters, RastersParams)

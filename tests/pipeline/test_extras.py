@@ -6,12 +6,14 @@ import importlib.util
 import re
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from scan2sim.flows.run import run_tile, show_plan
 from scan2sim.flows.settings import Settings
-from scan2sim.pipeline.errors import InputError, UnavailableError
+from scan2sim.flows.surveying import run_source
+from scan2sim.pipeline.errors import InputError, SettingError, UnavailableError
 from scan2sim.pipeline.extras import EXTRA_OF
 from tests.conftest import ROOT
 
@@ -46,6 +48,15 @@ def test_a_setting_that_cannot_be_is_refused_before_anything_runs(
     assert not any((tmp_path / "out" / "steps").glob("*/*"))
     with pytest.raises(UnavailableError):
         show_plan(TILE, tmp_path / "out", settings)
+
+
+def test_a_survey_is_refused_before_it_is_cut(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    without(monkeypatch, "transformers")
+    how: dict[str, Any] = dict.fromkeys(("length", "buffer", "memory", "address", "cores"))
+    for setting, error in (("label.network=segformer", UnavailableError), ("lable.network=segformer", SettingError)):
+        with pytest.raises(error):
+            run_source(str(TILE), str(tmp_path), Settings.read(None, [setting]), jobs=1, runner="processes", **how)
+    assert not list(tmp_path.iterdir())
 
 
 def test_weights_that_are_not_there_are_told_before_anything_runs(tmp_path: Path) -> None:
