@@ -45,7 +45,7 @@ def rasters(inputs: Inputs, params: RastersParams, out: Path, report: Report) ->
     """Look at the textured groups from straight above, in the tile's CRS.
 
     Files below `rasters/`: `<name>_orthophoto.tif` (colours), `<name>_dsm.tif` (heights of the highest surface) and
-    `<name>_dtm.tif` (heights of the terrain's mesh alone: nothing where there is none, as below buildings).
+    `<name>_dtm.tif` (heights of the terrain's mesh alone: nothing where there is none).
 
     Raises:
         DataError: no group has a face.
