@@ -105,6 +105,7 @@ def test_it_holds_the_rooms_whole_and_nothing_else(wheel: Path) -> None:
 def test_a_users_folders_and_files_are_not_taken_for_ours(installed: Installed) -> None:
     assert installed.scan2sim("--version").startswith("scan2sim ")
     installed.scan2sim("sample", "--small", "tile")
+    assert "not empty" in installed.scan2sim("sample", "--small", "tile", code=2)
     assert "EPSG:32633" in installed.scan2sim("inspect", "tile")
     assert "poisson.terrain" in installed.scan2sim("plan", "tile")
     call = "from scan2sim.pipeline import isolate; print(isolate.call('operator:add', 1, 2, timeout=60))"
