@@ -55,7 +55,7 @@ def load(name: str, weights: Path | None, device: str = "auto") -> Network:
     """The network of a backend, with the user's weights or, for "street", the project's own.
 
     Raises:
-        SettingError: it wants weights, or the device isn't there.
+        SettingError: the device isn't there.
         InputError: the weights are damaged, of another architecture, or unsafe to read.
         ScanError: as `check`.
     """
@@ -67,7 +67,7 @@ def check(name: str, weights: Path | None) -> Any:
     """The module of a backend that can run here; nothing heavy is loaded.
 
     Raises:
-        SettingError: there is no such backend.
+        SettingError: there is no such backend, or it wants weights.
         UnavailableError: a package is missing.
         InputError: the weights aren't there.
     """
@@ -77,6 +77,8 @@ def check(name: str, weights: Path | None) -> Any:
     lacking = backend.missing(weights)
     if lacking:
         raise unavailable(f"label.network {name}", lacking)
+    if weights is None and name != "street":
+        raise SettingError("label.weights", f"{name!r} comes without weights", "Name yours: --set label.weights=PATH")
     if weights is not None and not weights.exists():
         raise InputError(weights, "is no file or folder", "Give one on this disk; nothing is downloaded")
     return backend

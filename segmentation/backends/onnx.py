@@ -32,15 +32,13 @@ def missing(weights: Path | None) -> str | None:
     return extras.missing("onnxruntime")
 
 
-def load(weights: Path | None, device: str) -> Network:
+def load(weights: Path, device: str) -> Network:
     """The network of an ONNX file.
 
     Raises:
-        SettingError: no file is given, or onnxruntime can't use the device.
+        SettingError: onnxruntime can't use the device.
         InputError: it is missing, damaged, has other inputs or outputs, or doesn't name its labels.
     """
-    if weights is None:
-        raise SettingError("label.weights", "'onnx' comes without weights", "Give an ONNX file")
     return Network(weights, device)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from scan2sim.pipeline import extras
-from scan2sim.pipeline.errors import InputError, SettingError
+from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.types import F32, U8
 from scan2sim.segmentation.backends import Facts, torch_device
 
@@ -30,15 +30,13 @@ def missing(weights: Path | None) -> str | None:
     return extras.missing("torch", "safetensors", "transformers")
 
 
-def load(weights: Path | None, device: str) -> Network:
+def load(weights: Path, device: str) -> Network:
     """The network of a folder (config.json, model.safetensors or pytorch_model.bin), or of a file beside config.json.
 
     Raises:
-        SettingError: no weights are given.
+        SettingError: torch can't use the device.
         InputError: they are missing, damaged, of another architecture, or a pickle with more than tensors.
     """
-    if weights is None:
-        raise SettingError("label.weights", "'segformer' comes without weights", REMEDY)
     return Network(weights, torch_device(device))
 
 

@@ -60,6 +60,8 @@ def test_a_survey_is_refused_before_it_is_cut(monkeypatch: pytest.MonkeyPatch, t
 
 
 def test_weights_that_are_not_there_are_told_before_anything_runs(tmp_path: Path) -> None:
+    with pytest.raises(SettingError, match="comes without weights"):
+        run_tile(TILE, tmp_path / "out", Settings.read(None, ["label.network=onnx"]))
     with pytest.raises(InputError, match=r"mine\.onnx"):
         run_tile(TILE, tmp_path / "out", Settings.read(None, [f"label.weights={tmp_path}/mine.onnx"]))
     assert not any((tmp_path / "out" / "steps").glob("*/*"))
