@@ -12,7 +12,7 @@ from scan2sim.pipeline.io import clouds
 from scan2sim.pipeline.io.las_csv import import_las
 from scan2sim.pipeline.types import Frame
 from tests.fuzz.damage import REAL, WHOLE
-from tests.pipeline.io.test_cloud_formats import Format
+from tests.pipeline.io.test_cloud_formats import Format, e57_changed
 from tests.pipeline.io.test_clouds import FRAME, made
 
 HEADER = (
@@ -44,6 +44,18 @@ def read(form: Format) -> Callable[[Path], None]:
         import_las([path], out, crs=FRAME.crs, overwrite=out.exists())
 
     return read
+
+
+def e57_content(data: bytes, rng: Random) -> bytes:
+    """Bytes of what is behind the checksums, which are right again."""
+
+    def change(plain: bytes) -> bytes:
+        body, xml = bytearray(plain), plain.find(b"<?xml")
+        for _ in range(rng.choice((1, 3, 10))):
+            body[rng.randrange(xml if rng.random() < 0.5 else 0, len(body))] = rng.randrange(256)
+        return bytes(body)
+
+    return e57_changed(data, change) if b"<?xml" in data and len(data) % 1024 == 0 else data
 
 
 def las_field(data: bytes, rng: Random) -> bytes:

@@ -33,10 +33,10 @@ class Kind:
     special: Damage | None = None
 
 
-LAS = ("las", "laz", "copc")
+SPECIAL: dict[str, Damage] = {**dict.fromkeys(("las", "laz", "copc"), clouds.las_field), "e57": clouds.e57_content}
 SET = "decimate.target=50000\nsplit.vegetation=both\ndecimate.building.target=2e4\nvoxel.size=0.1\n"
 KINDS: dict[str, Kind] = {
-    **{n: Kind(clouds.whole(f), clouds.read(f), clouds.las_field if n in LAS else None) for n, f in FORMATS.items()},
+    **{n: Kind(clouds.whole(f), clouds.read(f), SPECIAL.get(n)) for n, f in FORMATS.items()},
     "photo jpg": Kind(*models.photo(".jpg")),
     "photo png": Kind(*models.photo(".png")),
     "tile.toml": Kind(tables.tile, read_tile),

@@ -357,15 +357,19 @@ def crc32c(data: bytes) -> int:
     return crc ^ 0xFFFFFFFF
 
 
+def e57_changed(data: bytes, change: Callable[[bytes], bytes]) -> bytes:
+    """An E57 file with other content (of the same length) and right checksums: one stands behind every 1,020 bytes."""
+    plain = change(b"".join(data[at : at + 1020] for at in range(0, len(data), 1024)))
+    pages = [plain[at : at + 1020] for at in range(0, len(plain), 1020)]
+    return b"".join(page + struct.pack(">I", crc32c(page)) for page in pages)
+
+
 @pytest.mark.parametrize("count", [b"401", b"999"])
 def test_an_e57_count_that_lies_is_refused(tmp_path: Path, count: bytes) -> None:
-    """With right checksums: E57 has one behind every 1,020 bytes."""
-    write_e57(tmp_path / "c.e57", made(N))
-    data = (tmp_path / "c.e57").read_bytes()
-    plain = b"".join(data[at : at + 1020] for at in range(0, len(data), 1024))
-    plain = plain.replace(b'recordCount="400"', b'recordCount="%s"' % count)
-    pages = [plain[at : at + 1020] for at in range(0, len(plain), 1020)]
-    (tmp_path / "c.e57").write_bytes(b"".join(page + struct.pack(">I", crc32c(page)) for page in pages))
+    path = tmp_path / "c.e57"
+    write_e57(path, made(N))
+    lie = b'recordCount="%s"' % count
+    path.write_bytes(e57_changed(path.read_bytes(), lambda plain: plain.replace(b'recordCount="400"', lie)))
     with pytest.raises(InputError, match=f"400 of {count.decode()} points can be read"):
         clouds.read(tmp_path / "c.e57", FRAME)
 
