@@ -17,7 +17,9 @@ from scan2sim.pipeline.io import clouds, image, las
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.step import silent
 from scan2sim.pipeline.steps.ingest import IngestParams, ingest
-from scan2sim.pipeline.types import Frame, PointCloud
+from scan2sim.pipeline.steps.views import _problem
+from scan2sim.pipeline.store import digest
+from scan2sim.pipeline.types import Camera, Frame, PointCloud, View
 
 FRAME = Frame("local", (700_000.0, 5_400_000.0, 100.0))
 SIZES = {"bounds": "<6d", "count": "<Q", "vlrs": "<I", "extended": "<QI", "scale": "<d"}
@@ -121,6 +123,13 @@ def test_pipes_and_folders_are_no_files(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="folder"):
         image.size_of(tmp_path)
     assert image.read_rgb(pipe(tmp_path, "p.jpg")) is None
+
+
+def test_photos_that_are_pipes_or_folders_are_left_out_and_no_digest_waits_for_them(tmp_path: Path) -> None:
+    (tmp_path / "folder.jpg").mkdir()
+    for path, told in ((pipe(tmp_path, "pipe.jpg"), "pipe or device"), (tmp_path / "folder.jpg", "is a folder")):
+        assert digest(path) == "missing"
+        assert told in (_problem(View("1", Camera("pinhole", 64, 48, 50, 50, 31, 23), np.eye(4), path)) or "")
 
 
 @pytest.mark.parametrize(
