@@ -107,7 +107,7 @@ def _together(survey: Survey, done: Sequence[Made], out: Path, digests: Digests)
                 _there(place / "report.html"), _there(place / PICTURE), geotiff.find(place / "rasters", one.name),
             )
         )  # fmt: skip
-    worlds.assemble(out, survey.name, tiles)
+    worlds.assemble(out, survey.name, tiles, warn=warn)
     stac.write(out, survey.name, f"{len(tiles)} tiles of {survey.name}, made by scan2sim", items)
     stac.write_vpc(out / f"{survey.name}.vpc", items)
     for kind in geotiff.KINDS:

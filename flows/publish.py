@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -13,7 +12,7 @@ from scan2sim.flows.planning import Planned
 from scan2sim.flows.report import PAGES, SCRIPTS
 from scan2sim.flows.settings import Settings
 from scan2sim.pipeline.errors import DamagedError
-from scan2sim.pipeline.io.worlds import EDITED, STAMP, link, swap
+from scan2sim.pipeline.io.worlds import EDITED, STAMP, link, same_file, swap
 from scan2sim.pipeline.store import Manifest, Store
 from scan2sim.pipeline.types import Tile
 
@@ -91,16 +90,7 @@ def _current(source: Path, place: Path, key: str) -> bool:
     files = [path.relative_to(source) for path in source.rglob("*") if path.is_file()]
     if not (files and stamp.is_file() and stamp.read_text(errors="replace") == key):
         return False
-    return all(_same(source / file, place / file) for file in files)
-
-
-def _same(kept: Path, shown: Path) -> bool:
-    """Whether a file is a link to the kept one, or a copy that hasn't been changed since."""
-    try:
-        a, b = kept.stat(), shown.stat()
-    except OSError:
-        return False
-    return os.path.samestat(a, b) or (a.st_size, a.st_mtime_ns) == (b.st_size, b.st_mtime_ns)
+    return all(same_file(source / file, place / file) for file in files)
 
 
 def _publish(source: Path, place: Path, key: str) -> list[Path]:

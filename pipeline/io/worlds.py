@@ -10,7 +10,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -47,7 +47,13 @@ class TileWorld:
 
 
 def assemble(
-    out: Path, name: str, tiles: Sequence[TileWorld], *, buffer: float = 20.0, performer: str = "robot"
+    out: Path,
+    name: str,
+    tiles: Sequence[TileWorld],
+    *,
+    buffer: float = 20.0,
+    performer: str = "robot",
+    warn: Callable[[str], None] = lambda _: None,
 ) -> Path:
     """Put the worlds of all tiles into one, `out/world/`, unless it is there and nothing has changed.
 
@@ -58,6 +64,7 @@ def assemble(
         name: of the world.
         buffer: metres around a tile within which a performer has it loaded.
         performer: name of the robot's model, which levels are loaded for.
+        warn: told of files that were changed since the world was made, by hand or by damage.
 
     Returns:
         Path of the world's .sdf.
@@ -73,7 +80,7 @@ def assemble(
     files = {tile.name: _files(tile.model) for tile in tiles}
     world = out / "world"
     stamp = _stamp(name, tiles, files, buffer, performer)
-    if not _is_current(world, stamp, files):
+    if not _is_current(world, stamp, tiles, files):
         fresh = out / ".world"
         try:
             shutil.rmtree(fresh, ignore_errors=True)
@@ -84,6 +91,9 @@ def assemble(
             raise from_os_error(error, out) from None
         finally:
             shutil.rmtree(fresh, ignore_errors=True)
+    else:
+        for path in _edited(world):
+            warn(f"{path} was changed since it was made, and stays so: remove {world} to have it made anew")
     return world / f"{name}.sdf"
 
 
@@ -95,6 +105,15 @@ def link(source: str, target: str) -> None:
         os.link(source, target)
     except OSError:
         shutil.copy2(source, target)
+
+
+def same_file(source: Path, copy: Path) -> bool:
+    """Whether a file is `link`'s of the source, and neither has been changed since."""
+    try:
+        a, b = source.stat(), copy.stat()
+    except OSError:
+        return False
+    return os.path.samestat(a, b) or (a.st_size, a.st_mtime_ns) == (b.st_size, b.st_mtime_ns)
 
 
 def swap(fresh: Path, place: Path) -> None:
@@ -149,12 +168,20 @@ def _stamp(name: str, tiles: Sequence[TileWorld], files: dict[str, list[Path]], 
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
 
 
-def _is_current(world: Path, stamp: str, files: dict[str, list[Path]]) -> bool:
+def _is_current(world: Path, stamp: str, tiles: Sequence[TileWorld], files: dict[str, list[Path]]) -> bool:
+    """Whether the world was made of these tiles, and its meshes and textures are theirs."""
     try:
-        same = (world / STAMP).read_text() == stamp
+        same = (world / STAMP).read_text(errors="replace") == stamp
     except OSError:
         return False
-    return same and all((world / "models" / tile / file).is_file() for tile, own in files.items() for file in own)
+    pairs = [(tile.model / file, world / "models" / tile.name / file) for tile in tiles for file in files[tile.name]]
+    return same and all(copy.is_file() if copy.suffix in EDITED else same_file(file, copy) for file, copy in pairs)
+
+
+def _edited(world: Path) -> list[Path]:
+    """Files that were written to after the world was finished: users' edits, or damage; nobody can tell which."""
+    finished = (world / STAMP).stat().st_mtime_ns
+    return [p for p in sorted(world.rglob("*")) if p.suffix in EDITED and p.stat().st_mtime_ns > finished]
 
 
 def _write(folder: Path, name: str, tiles: Sequence[TileWorld], buffer: float, performer: str) -> None:

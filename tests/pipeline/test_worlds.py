@@ -114,13 +114,21 @@ def test_nothing_is_done_where_nothing_has_changed(tmp_path: Path) -> None:
     edited = folder / "models/tile0/model.sdf"
     edited.write_text(edited.read_text() + "\n")
     before = _snapshot(folder)
-    assemble(tmp_path, "town", row)
+    told: list[str] = []
+    assemble(tmp_path, "town", row, warn=told.append)
     assert _snapshot(folder) == before  # a user's edit stays
+    assert len(told) == 1 and "tile0/model.sdf was changed since it was made" in told[0]
     assemble(tmp_path, "town", row, buffer=5)
     assert _snapshot(folder) != before and _root(folder / "town.sdf").find(".//level/buffer").text == "5"
     (folder / "models/tile1/meshes/collision.obj").unlink()
     assemble(tmp_path, "town", row, buffer=5)
     assert (folder / "models/tile1/meshes/collision.obj").is_file()
+    damaged = folder / "models/tile1/meshes/collision.obj"
+    whole = damaged.read_bytes()
+    damaged.unlink()
+    damaged.write_bytes(b"x" * len(whole))  # as many bytes
+    assemble(tmp_path, "town", row, buffer=5)
+    assert damaged.read_bytes() == whole
     source = row[0].model / "meshes/terrain.obj"
     text = source.read_text()
     source.unlink()  # as a rebuilt result is: a new file, not new bytes in the old one
