@@ -141,7 +141,10 @@ def membrane(values: F64, wanted: Bools) -> F64:
         np.add.at(right, number[rim], value[rim])
     i, j = np.concatenate([*rows, np.arange(n)]), np.concatenate([*columns, np.arange(n)])
     entries = np.concatenate([np.full(sum(map(len, rows)), -1.0), diagonal])
-    out[wanted] = splu(coo_matrix((entries, (i, j)), shape=(n, n)).tocsc(), permc_spec="MMD_AT_PLUS_A").solve(right)
+    matrix = coo_matrix((entries, (i, j)), shape=(n, n)).tocsc()
+    # the matrix is symmetric and dominated by its diagonal: without pivoting the factors stay as sparse as they can
+    factors = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    out[wanted] = factors.solve(right)
     return out
 
 
