@@ -17,6 +17,7 @@ import numpy as np
 
 from scan2sim.flows.numbers import check
 from scan2sim.pipeline.cells import Cell, Seed, cells
+from scan2sim.pipeline.classes import strangers
 from scan2sim.pipeline.cutting import dense, members, seeds, sees
 from scan2sim.pipeline.errors import DataError, InputError, SettingError
 from scan2sim.pipeline.io import clouds, las, orthophoto
@@ -181,7 +182,7 @@ def _spread(
     places = seeds(name, tile.frame, options.length, low, high, tile.trajectory, warn)
     while True:
         spool = Spool(folder, np.floor(corridor.low), unit, len(places))
-        far = _assign(corridor, np.array(list(places.values())), options, spool, report)
+        far, strange = _assign(corridor, np.array(list(places.values())), options, spool, report)
         few = [i for i, held in enumerate(spool.held) if held.own < MIN_POINTS]
         if not few:
             break
@@ -202,6 +203,8 @@ def _spread(
             f"({', '.join(dropped[:5])}{' ...' if len(few) > 5 else ''}): their points go to the nearest ones"
         )
         places = {key: seed for key, seed in places.items() if key not in dropped}
+    for told in strange:
+        warn(told)
     if spool.lost:
         warn(f"{spool.lost:,} points with NaN coordinates left out")
     if far > sum(corridor.counts) / 2:
@@ -209,21 +212,23 @@ def _spread(
     return places, spool
 
 
-def _assign(corridor: Corridor, places: F64, options: Options, spool: Spool, report: Report) -> int:
-    """Give all points to their tiles; returns how many are out of the trajectory's reach."""
+def _assign(corridor: Corridor, places: F64, options: Options, spool: Spool, report: Report) -> tuple[int, list[str]]:
+    """Give all points to their tiles; returns how many are out of the trajectory's reach, and what to say of codes."""
     from scipy.spatial import cKDTree
 
     tile = corridor.tile
     path = None
     if tile.trajectory is not None:
         path = cKDTree(dense((tile.trajectory.positions + np.asarray(tile.frame.origin))[:, :2]))
-    total, done, far = sum(corridor.counts), 0, 0
+    total, done, far, strange = sum(corridor.counts), 0, 0, list[str]()
     for cloud in tile.clouds:
-        table = clouds.meanings(cloud, tile.classes)
+        table, count = clouds.meanings(cloud, tile.classes), np.zeros(256, np.int64)
         for part in clouds.chunks(cloud, tile.frame, CHUNK):
             report(READING * done / total, f"reading {cloud.name}")
             done += len(part)
-            part = part if part.label is None else replace(part, label=table[part.label])
+            if part.label is not None:
+                count += np.bincount(part.label, minlength=256)
+                part = replace(part, label=table[part.label])
             rows = spool.rows(part)
             xy = spool.world(rows)[:, :2]
             if path is not None:
@@ -239,7 +244,9 @@ def _assign(corridor: Corridor, places: F64, options: Options, spool: Spool, rep
                     chosen = rows[points[some]]
                     chosen["own"] = some < len(xy)
                     spool.add(int(tiles[some[0]]), chosen, part)
-    return far
+        told = strangers(count, table)
+        strange += [f"{cloud.name}: {told}"] if told else []
+    return far, strange
 
 
 class _Writer:

@@ -143,16 +143,15 @@ def known() -> npt.NDArray[np.bool_]:
     return table
 
 
-def strangers(label: U8, table: U8) -> str:
-    """What to say of a file's codes (N,) that `meanings` made nothing of; empty if there are none.
+def strangers(count: npt.NDArray[np.integer], table: U8) -> str:
+    """What to say of a file's codes, of which there are so many (256,), that `meanings` made nothing of; mostly empty.
 
     Codes of the survey's own are meant: what has none is told of where surfaces are made (`split`).
     """
-    count = np.bincount(label, minlength=256)
     lost = [c for c in np.flatnonzero(count).tolist() if c >= OF_THE_SURVEY and table[c] == UNCLASSIFIED]
     if not lost:
         return ""
-    codes = ", ".join(f"{c} ({count[c] / len(label):.1%})" for c in lost[:8])
+    codes = ", ".join(f"{c} ({count[c] / count.sum():.1%})" for c in lost[:8])
     one = lost[0]
     return (
         f"codes {codes} are the survey's own (LAS leaves {OF_THE_SURVEY} and up to it), and taken as unclassified. "

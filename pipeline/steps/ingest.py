@@ -50,7 +50,7 @@ def ingest(inputs: Inputs, params: IngestParams, out: Path, report: Report) -> D
         cloud = clouds.read(inputs[name], frame)
         if cloud.label is not None and len(cloud):
             table = clouds.meanings(inputs[name], params.classes)
-            strange = classes.strangers(cloud.label, table)
+            strange = classes.strangers(np.bincount(cloud.label, minlength=256), table)
             warnings += [f"{inputs[name].name}: {strange}"] if strange else []
             cloud = replace(cloud, label=table[cloud.label])
         finite = np.atleast_1d(np.isfinite(cloud.xyz).all(axis=1))

@@ -99,7 +99,9 @@ def test_clouds_that_become_laz_keep_their_survey_s_codes_until_a_tile_says_what
 
 def test_tiles_of_a_survey_hold_codes_as_the_corridor_says(tmp_path: Path) -> None:
     path = import_las([foreign(tmp_path / "a.las")], tmp_path / "tile", crs="local", classes={65: 69})
-    survey = read_survey(cut_survey(path, tmp_path / "survey", Options(length=100.0)))
+    told: list[str] = []
+    survey = read_survey(cut_survey(path, tmp_path / "survey", Options(length=100.0), warn=told.append))
+    assert len(told) == 1 and told[0].startswith("a.las: codes 200 (20.0%) are the survey's own")
     tile = read_tile(next(iter(survey.tiles.values())))
     codes = clouds.meanings(tile.clouds[0], tile.classes)[clouds.read(tile.clouds[0], tile.frame).label]
     assert np.unique(codes).tolist() == [1, 2, 31, 69]
