@@ -438,7 +438,7 @@ def test_only_a_survey_is_overwritten_and_only_when_told(tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("options", "field"),
     [(Options(length=0), "length"), (Options(buffer=-1), "buffer"), (Options(length=10, buffer=6), "buffer"),
-     (Options(reach=float("nan")), "reach"), (Options(photo_reach=-1), "photo_reach")],
+     (Options(reach=float("nan")), "reach"), (Options(photo_reach=-1), "photo-reach")],
 )  # fmt: skip
 def test_options_out_of_range_are_refused(tmp_path: Path, options: Options, field: str) -> None:
     with pytest.raises(SettingError, match=field):
