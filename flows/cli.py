@@ -579,7 +579,7 @@ def main() -> None:
         if isinstance(error, ScanError):
             typer.secho(f"error: {error.where}: {error.cause}", fg="red", err=True)
             remedy = re.sub(r"(?<![\w/])docs(?=/\w+\.md)", str(PAGES), error.remedy)
-            typer.echo(f"  {remedy}.", err=True)
+            typer.echo(f"  {remedy}{'' if remedy.endswith('?') else '.'}", err=True)
         else:
             from scan2sim.flows.display import log_unexpected
 

@@ -43,7 +43,9 @@ def _reader(path: Path) -> Callable[[Path], tuple[str, Facts]]:
             return lambda p: _world(_sdf(p / "world"))
         if any(path.glob("*.sdf")):
             return lambda p: _world(_sdf(p))
-        raise InputError(path, "holds neither tile.toml nor a world", "Name a cloud, a tile, a mesh or a world")
+        raise InputError(
+            path, "holds neither tile.toml nor a world", "Name a cloud, a tile (of a survey, too), a mesh or a world"
+        )
     files.check(path, "Mend the name")
     readers = {
         **dict.fromkeys(clouds.FORMATS, _cloud), ".toml": _tile, ".sdf": _world, ".npz": _result,

@@ -83,7 +83,14 @@ def parse(text: str) -> dict[int, int]:
     Raises:
         SettingError: a code or class that there isn't.
     """
-    return mapping(dict((entry.strip().partition("=")[::2]) for entry in text.split(",") if entry.strip()))
+    given: dict[str, str] = {}
+    for entry in filter(None, map(str.strip, text.split(","))):
+        code, _, name = entry.partition("=")
+        if not name or code.strip() in given:
+            cause = f"{entry[:40]!r} " + ("names no class" if not name else "names a class for this code again")
+            raise SettingError("classes", cause, "Write 65=noise,200=5: each code once")
+        given[code.strip()] = name
+    return mapping(given)
 
 
 def mapping(given: Mapping[str, str | int]) -> dict[int, int]:

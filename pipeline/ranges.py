@@ -33,8 +33,14 @@ Seed = Annotated[int, Field(ge=0, le=2**32 - 1)]
 """Of random numbers."""
 Stops = Annotated[float, Field(ge=0.001, le=20)]
 """Of exposure, EV."""
-Device = Annotated[str, Field(pattern=r"^[a-z]{1,20}(:[0-9]{1,3})?$", max_length=24)]
-"""As torch or onnxruntime call it, "cuda:1" say."""
+Device = Annotated[
+    str,
+    Field(
+        pattern=r"^(auto|numba|(cpu|cuda|mps|xpu)(:[0-9]{1,3})?)$",
+        json_schema_extra={"range": "auto, numba, cpu, cuda, mps or xpu; cuda:1 for the second"},
+    ),
+]
+"""What computes: "numba" in the step `texture` alone, the others as torch or onnxruntime call them."""
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_]+$", max_length=100)]
 """Of tiles and surveys: it becomes folders, files, and names in SDF."""
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from scan2sim.pipeline.cameras import ALIKE, EQUIRECTANGULAR, FISHEYE, OPENCV, ORTHOGRAPHIC
-from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.errors import SettingError
 from scan2sim.pipeline.range_image import MAX_SLOPE, SLOPE_SHARE
 from scan2sim.texturing.blend import EDGE, WHITE
 from scan2sim.texturing.photos import OFFSET
@@ -37,7 +37,7 @@ class TorchRows:
         device: of torch, as "cuda" or "cpu".
 
     Raises:
-        InputError: this torch has no such device.
+        SettingError: this torch has no such device.
     """
 
     def __init__(self, owner: I32, flat: F32, corners: F32, normals: F32, device: str) -> None:
@@ -45,7 +45,7 @@ class TorchRows:
             self._device = torch.zeros(1, device=device).device
         except (RuntimeError, AssertionError) as error:
             reason = str(error).splitlines()[0]
-            raise InputError(
+            raise SettingError(
                 "texture.device", f"torch can't use {device!r} ({reason})", 'Say "numba", or "auto"'
             ) from None
         self._shape = owner.shape

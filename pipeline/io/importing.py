@@ -30,7 +30,7 @@ def tile_folder(out: Path, overwrite: bool = False, kind: Literal["tile", "surve
     if out.exists() and not out.is_dir():
         raise SettingError(out, "is a file, not a folder", "Name another folder")
     if out.is_dir() and any(out.iterdir()) and not overwrite:
-        raise SettingError(out, "exists and is not empty", "Name a new folder, or say that it may be overwritten")
+        raise SettingError(out, "exists and is not empty", "Name a new folder, or have it overwritten: --overwrite")
     if out.is_dir() and any(out.iterdir()) and not (out / f"{kind}.toml").is_file():
         raise SettingError(out, f"is no {kind}, and is not overwritten", f"Name a new folder, or a {kind}'s")
     try:

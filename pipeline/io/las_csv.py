@@ -94,7 +94,7 @@ def import_las(
     headers = [cloud_io.read_header(Path(cloud)) for cloud in clouds]
     if crs is None and any(h.crs is None for h in headers):
         bare = next(cloud for cloud, h in zip(clouds, headers, strict=True) if h.crs is None)
-        raise InputError(bare, "has no CRS", "Name it: a code as EPSG:32633, or `local` for no georeference")
+        raise InputError(bare, "has no CRS", "Name it: --crs EPSG:32633, say, or --crs local for no georeference")
     known, unit = crs_io.common(Path("tile.toml"), crs, units, clouds, headers)
     for cloud, header in zip(clouds, headers, strict=True):
         for note in header.notes:

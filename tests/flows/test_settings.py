@@ -63,7 +63,8 @@ def test_unknown_names_are_refused_with_the_nearest(text: str, message: str) -> 
 
 
 @pytest.mark.parametrize(
-    "text", ["decimate.target=5", "decimate.target=many", "split.vegetation=maybe", "voxel.size=-1"]
+    "text",
+    ["decimate.target=5", "decimate.target=many", "split.vegetation=maybe", "voxel.size=-1", "texture.device=gpu"],
 )
 def test_values_out_of_range_are_refused(text: str) -> None:
     settings = Settings.read(None, [text])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.errors import SettingError
 from scan2sim.pipeline.io import image
 from tests.texturing.corner import CAMERAS, POSES, photograph, points
 
@@ -31,5 +31,5 @@ def test_torch_paints_the_same(street, name, band):
 
 def test_a_device_that_is_not_there_is_named(street):
     street.add(CAMERAS["pinhole"], POSES[0])
-    with pytest.raises(InputError, match="xpu:7"):
+    with pytest.raises(SettingError, match="xpu:7"):
         street.run(device="xpu:7")
