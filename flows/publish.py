@@ -12,7 +12,7 @@ from scan2sim.flows.planning import Planned
 from scan2sim.flows.report import PAGES, SCRIPTS
 from scan2sim.flows.settings import Settings
 from scan2sim.pipeline.errors import DamagedError
-from scan2sim.pipeline.io.worlds import EDITED, STAMP, link, same_file, swap
+from scan2sim.pipeline.io.worlds import EDITED, STAMP, link, same_file, same_unless_edited, swap
 from scan2sim.pipeline.store import Manifest, Store
 from scan2sim.pipeline.types import Tile
 
@@ -30,7 +30,7 @@ def publish(
     """Put the world, rasters, exposures and the resolved settings beside the report; a world that is there stays.
 
     Returns:
-        What the user should read.
+        What the user should read: of files that were edited.
 
     Raises:
         DamagedError: a result has gone in the meantime.
@@ -43,7 +43,8 @@ def publish(
             raise DamagedError(label)
     for label, (source, place) in places.items():
         if not _current(source, place, keys[label]):
-            changed += _publish(source, place, keys[label])
+            _publish(source, place, keys[label])
+        changed += edited(source, place)
     if "rasters" not in done and (out / "rasters" / STAMP).is_file():  # of an earlier world
         shutil.rmtree(out / "rasters")
     if done["preview"].files:
@@ -57,7 +58,7 @@ def publish(
         "steps": {label: {k: v for k, v in m.params.items() if k not in BULKY} for label, m in done.items()},
     }
     (out / "config.json").write_text(json.dumps(config, indent=1), encoding="utf-8")
-    return [f"{path} was changed since it was made; what it held is kept as {path.name}~ beside it" for path in changed]
+    return [f"{path} was changed since it was made, and stays so: remove it to have it made anew" for path in changed]
 
 
 def to_read(store: Store, planned: Iterable[Planned], out: Path) -> set[str]:
@@ -85,30 +86,29 @@ def _published(store: Store, keys: Mapping[str, str], out: Path) -> dict[str, tu
 
 
 def _current(source: Path, place: Path, key: str) -> bool:
-    """Whether a published folder is of this result, and its files as they were when they were published."""
-    stamp = place / STAMP
+    """Whether a published folder is of this result, and its files, but for edits, as when they were published."""
     files = [path.relative_to(source) for path in source.rglob("*") if path.is_file()]
-    if not (files and stamp.is_file() and stamp.read_text(errors="replace") == key):
-        return False
-    return all(same_file(source / file, place / file) for file in files)
+    return bool(files) and _is_of(place, key) and all(same_unless_edited(source / f, place / f) for f in files)
 
 
-def _publish(source: Path, place: Path, key: str) -> list[Path]:
-    """Copy a folder from the store (large files as hard links, where that can be).
+def _is_of(place: Path, key: str) -> bool:
+    """Whether a folder was published of this result."""
+    stamp = place / STAMP
+    return stamp.is_file() and stamp.read_text(errors="replace") == key
 
-    Returns:
-        Files that were changed by hand, or damaged, since the same was published; what they held is kept.
-    """
+
+def edited(source: Path, place: Path) -> list[Path]:
+    """Published files that were changed by a user (or by damage: nobody can tell which), of kinds that users edit."""
+    pairs = [(source / path.relative_to(place), path) for path in sorted(place.rglob("*")) if path.suffix in EDITED]
+    return [b for a, b in pairs if a.is_file() and not same_file(a, b) and a.read_bytes() != b.read_bytes()]
+
+
+def _publish(source: Path, place: Path, key: str) -> None:
+    """Copy a folder from the store (large files as hard links, where that can be); edits of the same one stay."""
     fresh = place.with_name(f".{place.name}")
     shutil.rmtree(fresh, ignore_errors=True)
     shutil.copytree(source, fresh, copy_function=link)
-    changed = []
-    if (place / STAMP).is_file() and (place / STAMP).read_text(errors="replace") == key:
-        for file in (path.relative_to(place) for path in place.rglob("*") if path.suffix in EDITED):
-            kept = fresh / file
-            if kept.is_file() and kept.read_bytes() != (place / file).read_bytes():
-                shutil.copy2(place / file, kept.with_name(f"{kept.name}~"))
-                changed.append(place / file)
+    for file in edited(source, place) if _is_of(place, key) else ():
+        shutil.copy2(file, fresh / file.relative_to(place))
     (fresh / STAMP).write_text(key)
     swap(fresh, place)
-    return changed

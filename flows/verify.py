@@ -7,18 +7,20 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
-from scan2sim.flows.display import console, progress
+from scan2sim.flows.display import console, progress, warn
 from scan2sim.flows.execute import locked
 from scan2sim.flows.finish import TILES
 from scan2sim.flows.publish import PLACES
 from scan2sim.flows.run import STORE
 from scan2sim.pipeline.errors import DamagedError, InputError
-from scan2sim.pipeline.io.worlds import STAMP
+from scan2sim.pipeline.io.worlds import EDITED, STAMP
 from scan2sim.pipeline.store import TEMPORARY, Manifest, damaged, digest, read_manifest
 
 
 def verify(out: Path) -> None:
     """Digest all kept results and published worlds below a run's or survey's folder, and print what is damaged.
+
+    What users edit (`pipeline.io.worlds.EDITED`) may be as they left it: it is printed where it was changed.
 
     The next `run` or `survey` makes that anew, and nothing else: a damaged file is marked as changed now, a damaged
     manifest is one that can't be read.
@@ -32,6 +34,7 @@ def verify(out: Path) -> None:
     if not folders:
         raise InputError(out, "holds no results of a run", "Name the folder that was given to run or survey by --out")
     bad: list[tuple[Path, str]] = []
+    changed: list[Path] = []
     files = 0
     with locked(out), progress("verify") as report:
         for i, folder in enumerate(folders):
@@ -42,10 +45,16 @@ def verify(out: Path) -> None:
                 continue
             files += len(manifest.digests)
             bad += [(folder / name, "isn't as it was made") for name in damaged(folder, manifest)]
-            bad += _published(out, folder, manifest)
+            for file in _published(out, folder, manifest):
+                if file.suffix in EDITED and file.is_file():
+                    changed.append(file)
+                else:
+                    bad.append((file, "isn't as it was published"))
         for path, _ in bad:
             with suppress(OSError):
                 os.utime(path, follow_symlinks=False)
+    for path in changed:
+        warn(f"{path} was changed since it was made, and stays so: remove it to have it made anew")
     for path, cause in bad:
         console.print(f"[red]{path.relative_to(out)}[/] {cause}", highlight=False, soft_wrap=True)
     if bad:
@@ -54,7 +63,7 @@ def verify(out: Path) -> None:
     console.print(f"{files} files of {len(folders)} results, and the worlds made of them, are as they were made")
 
 
-def _published(out: Path, folder: Path, manifest: Manifest) -> Iterator[tuple[Path, str]]:
+def _published(out: Path, folder: Path, manifest: Manifest) -> Iterator[Path]:
     """Files that were published of a result, if any were, and are missing or others."""
     tile, _, label = manifest.label.rpartition("/")
     output, place = PLACES.get(label, ("", ""))
@@ -66,4 +75,4 @@ def _published(out: Path, folder: Path, manifest: Manifest) -> Iterator[tuple[Pa
     for name, known in manifest.digests.items():
         below = Path(name).is_relative_to(manifest.files[output])
         if below and digest(file := shown / Path(name).relative_to(manifest.files[output])) != known:
-            yield file, "isn't as it was published"
+            yield file

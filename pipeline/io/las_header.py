@@ -12,7 +12,7 @@ from typing import BinaryIO
 
 from scan2sim.pipeline.errors import InputError
 
-AGAIN = "Copy or export it again"
+AGAIN = "Copy it again, or export it anew"
 HEADERS = {0: 227, 1: 227, 2: 227, 3: 235, 4: 375, 5: 393}
 """Bytes of a header, by minor version."""
 RECORDS = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)

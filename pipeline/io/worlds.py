@@ -116,6 +116,11 @@ def same_file(source: Path, copy: Path) -> bool:
     return os.path.samestat(a, b) or (a.st_size, a.st_mtime_ns) == (b.st_size, b.st_mtime_ns)
 
 
+def same_unless_edited(source: Path, copy: Path) -> bool:
+    """`same_file`, but of what users edit only whether it is there."""
+    return copy.is_file() if copy.suffix in EDITED else same_file(source, copy)
+
+
 def swap(fresh: Path, place: Path) -> None:
     """Move a finished folder to its place; the one that is there goes only then."""
     earlier = place.with_name(f".{place.name}-earlier")
@@ -175,7 +180,7 @@ def _is_current(world: Path, stamp: str, tiles: Sequence[TileWorld], files: dict
     except OSError:
         return False
     pairs = [(tile.model / file, world / "models" / tile.name / file) for tile in tiles for file in files[tile.name]]
-    return same and all(copy.is_file() if copy.suffix in EDITED else same_file(file, copy) for file, copy in pairs)
+    return same and all(same_unless_edited(file, copy) for file, copy in pairs)
 
 
 def _edited(world: Path) -> list[Path]:

@@ -352,10 +352,17 @@ def test_damage_is_noticed_told_and_mended(street: Path, world: Path, tmp_path: 
     (sdf,) = (out / "world").glob("*.sdf")
     whole = page.read_bytes(), sdf.read_bytes()
     flip(page)
-    flip(sdf)
-    told = good(scan2sim(*options))
-    assert (page.read_bytes(), sdf.read_bytes()) == whole and f"{sdf.name}~" in " ".join(told.split())
-    assert sdf.with_name(f"{sdf.name}~").read_bytes() != sdf.read_bytes()
+    flip(sdf)  # an edit, for all that can be known
+    changed = f"{sdf} was changed since it was made, and stays so"
+    checked = scan2sim("verify", out)
+    assert checked.returncode == 5 and changed in checked.stdout and "1 of" in checked.stderr
+    assert changed in good(scan2sim(*options))
+    assert page.read_bytes() == whole[0] and sdf.read_bytes() != whole[1]
+    assert changed in good(scan2sim(*options))
+    sdf.unlink()
+    good(scan2sim(*options))
+    made = next((out / "steps" / "export").rglob(sdf.name))
+    assert (page.read_bytes(), sdf.read_bytes()) == (whole[0], made.read_bytes())
 
     kept = next((out / "steps" / "decimate.terrain").glob("*/mesh.npz"))
     whole = kept.read_bytes(), page.read_bytes()
