@@ -86,7 +86,7 @@ def _joined(inputs: Inputs, groups: tuple[str, ...]) -> Mesh:
         raise DataError(
             "collision",
             f"there is no surface to collide with ({' and '.join(groups)} are empty)",
-            "Check the classes of the cloud, or set collision.vegetation=true",
+            "Check the cloud's classes, and voxel, poisson, trim, islands where set, or set collision.vegetation=true",
         )
     first = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])
     return Mesh(

@@ -57,6 +57,11 @@ def geometry(inputs: Inputs, params: GeometryParams, out: Path, report: Report) 
                 Cell(params.seed, params.neighbours).outside(cloud.xyz[:, :2] + np.asarray(cloud.frame.origin[:2])) <= 0
             )
             cloud = cloud.take(own)
+        if len(mesh) == 0 and len(cloud) > 0:
+            warnings.append(
+                f"{group}: none of its {len(cloud):,} points became a surface (too few, or taken by trim and islands): "
+                f"the world has no {group}"
+            )
         if len(mesh) == 0 or len(cloud) == 0:
             continue
         points = cloud.xyz[:: max(1, len(cloud) // params.samples)]
@@ -140,4 +145,4 @@ def spread(mesh: Mesh, count: int, seed: int = 0) -> F32:
     return ((1 - u) * a + u * (1 - v) * b + u * v * c).astype(np.float32)
 
 
-GEOMETRY = Step("geometry", 3, geometry, GeometryParams)
+GEOMETRY = Step("geometry", 4, geometry, GeometryParams)

@@ -272,3 +272,13 @@ def test_a_street_scanned_from_the_ground_gets_nothing_made_up_without_a_path_ei
     for step in (GROUND, WALLS):
         assert go(step, tmp_path / step.name, inputs).facts["points"] == 0
         assert go(step, tmp_path / f"{step.name}_asked", inputs, when="always").facts["points"] > 0
+
+
+def test_points_that_became_no_surface_are_told(house: dict[str, Path], tmp_path: Path) -> None:
+    from scan2sim.pipeline.steps.geometry import GEOMETRY
+    from scan2sim.pipeline.types import Mesh
+
+    nothing = Mesh(FRAME, np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
+    nothing.save(tmp_path / "none.npz")
+    done = go(GEOMETRY, tmp_path, {"mesh.building": tmp_path / "none.npz", "cloud.building": house["building"]})
+    assert done.facts == {} and "the world has no building" in done.warnings[0]
