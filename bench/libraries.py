@@ -11,7 +11,6 @@ Ends with `RESULT {json}`: shared objects looked at, libraries they need of the 
 from __future__ import annotations
 
 import argparse
-import ctypes
 import json
 import sys
 import sysconfig
@@ -19,7 +18,7 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
-from scan2sim.pipeline.libraries import PACKAGE_OF
+from scan2sim.pipeline.libraries import PACKAGE_OF, loads
 
 ALWAYS = {
     "ld-linux-x86-64.so.2", "libc.so.6", "libdl.so.2", "libm.so.6", "libmvec.so.1", "libpthread.so.0", "librt.so.1",
@@ -70,16 +69,8 @@ def nowhere(wanted: dict[str, list[str]], *, here: bool = False) -> dict[str, li
     return {
         name: users
         for name, users in of_the_system.items()
-        if (name not in ALWAYS and OTHER_NAMES.get(name, name) not in PACKAGE_OF) or (here and not _loads(name))
+        if (name not in ALWAYS and OTHER_NAMES.get(name, name) not in PACKAGE_OF) or (here and not loads(name))
     }
-
-
-def _loads(name: str) -> bool:
-    try:
-        ctypes.CDLL(name)
-    except OSError:
-        return False
-    return True
 
 
 def main() -> None:

@@ -23,7 +23,7 @@ def guard() -> None:
     if sys.platform != "linux":
         return
     mark = os.environ[FLOW] = f"{os.getpid()}-{secrets.token_hex(8)}"
-    end, alive = os.pipe()  # what only this process holds open is closed by its death
+    end, _ = os.pipe()  # the other end, which only this process holds open, is closed by its death
     subprocess.Popen(
         [sys.executable, "-P", "-m", "scan2sim.flows.ephemeral", mark],
         stdin=end,
@@ -33,7 +33,6 @@ def guard() -> None:
         start_new_session=True,
     )
     os.close(end)
-    os.set_inheritable(alive, False)
 
 
 def _main(mark: str) -> None:

@@ -11,7 +11,9 @@ from scan2sim.pipeline.ranges import Seed, Voxel
 from scan2sim.pipeline.step import Params
 
 Metres = Annotated[float, Field(ge=0, le=10_000)]
-Jobs = Annotated[int, Field(ge=0, le=1024)]
+Length = Annotated[float, Field(ge=1, le=100_000)]
+Buffer = Annotated[float, Field(ge=0, le=1000)]
+Range = Annotated[float, Field(ge=0.1, le=10_000)]
 Pixels = Annotated[float, Field(ge=-1_000_000, le=1_000_000)]
 Focal = Annotated[float, Field(ge=1, le=1_000_000)]
 """Pixels."""
@@ -25,10 +27,10 @@ class Numbers(Params):
     """Options by their names, those that are given; the commands' help says what they mean."""
 
     hold_out: Annotated[int, Field(ge=0, le=1_000_000)] | None = None
-    jobs: Jobs | None = None
+    jobs: Annotated[int, Field(ge=0, le=1024)] | None = None
     cores: Annotated[int, Field(ge=1, le=1024)] | None = None
-    length: Annotated[float, Field(ge=1, le=100_000)] | None = None
-    buffer: Annotated[float, Field(ge=0, le=1000)] | None = None
+    length: Length | None = None
+    buffer: Buffer | None = None
     reach: Annotated[float, Field(ge=1, le=10_000)] | None = None
     photo_reach: Metres | None = None
     points: Annotated[float, Field(ge=1000, le=1e9)] | None = None
@@ -44,7 +46,7 @@ class Numbers(Params):
     every: Annotated[int, Field(ge=1, le=1_000_000)] | None = None
     until: Annotated[float, Field(ge=0, le=1e7)] | None = None
     segment: Annotated[float, Field(ge=1, le=1e7)] | None = None
-    max_range: Annotated[float, Field(ge=0.1, le=10_000)] | None = None
+    max_range: Range | None = None
     min_range: Metres | None = None
     period: Annotated[float, Field(ge=0.0001, le=1000)] | None = None
     voxel: Voxel | None = None

@@ -26,10 +26,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict
 
 from scan2sim.flows.execute import locked
-from scan2sim.flows.numbers import Focal, Pixels, Rate, Shift
+from scan2sim.flows.numbers import Buffer, Focal, Length, Pixels, Range, Rate, Shift
 from scan2sim.pipeline.errors import InputError, from_os_error
 from scan2sim.pipeline.io import toml
 from scan2sim.pipeline.io.remote import is_remote, likeness
@@ -70,7 +70,7 @@ class SweepsEntry(_Strict):
     camera: str = "auto"
     focal: Focal | None = None
     centre: tuple[Pixels, Pixels] | None = None
-    max_range: float = Field(50.0, ge=0.1, le=10_000)
+    max_range: Range = 50.0
     voxel: Voxel | None = None
     crs: str = "local"
 
@@ -78,8 +78,8 @@ class SweepsEntry(_Strict):
 class TilesEntry(_Strict):
     """How the corridor is cut; as the options of `scan2sim tile`."""
 
-    length: float = Field(100.0, ge=1, le=100_000)
-    buffer: float = Field(5.0, ge=0, le=1000)
+    length: Length = 100.0
+    buffer: Buffer = 5.0
 
 
 class Drive(_Strict):

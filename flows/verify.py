@@ -30,7 +30,8 @@ def verify(out: Path) -> None:
         DamagedError: some are damaged.
         BusyError: a run is at work there.
     """
-    folders = [path.parent for path in sorted((out / STORE).rglob("manifest.json")) if TEMPORARY not in str(path)]
+    found = sorted((out / STORE).rglob("manifest.json"))
+    folders = [path.parent for path in found if TEMPORARY not in str(path.relative_to(out))]
     if not folders:
         raise InputError(out, "holds no results of a run", "Name the folder that was given to run or survey by --out")
     bad: list[tuple[Path, str]] = []

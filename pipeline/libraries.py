@@ -27,7 +27,7 @@ PACKAGE_OF = {
 
 def missing() -> dict[str, str]:
     """Libraries that can't be loaded here, and their packages; wheels for other systems than Linux need none."""
-    return {name: package for name, package in PACKAGE_OF.items() if sys.platform == "linux" and not _loads(name)}
+    return {name: package for name, package in PACKAGE_OF.items() if sys.platform == "linux" and not loads(name)}
 
 
 def check() -> None:
@@ -53,7 +53,8 @@ def command(lacking: dict[str, str]) -> str:
     return f"your system's package manager, for {', '.join(lacking)}"
 
 
-def _loads(library: str) -> bool:
+def loads(library: str) -> bool:
+    """Whether a library is here, by the name that others ask for it."""
     try:
         ctypes.CDLL(library)
     except OSError:

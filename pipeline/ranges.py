@@ -41,8 +41,9 @@ Device = Annotated[
     ),
 ]
 """What computes: "numba" in the step `texture` alone, the others as torch or onnxruntime call them."""
-Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_]+$", max_length=100)]
-"""Of tiles and surveys: it becomes folders, files, and names in SDF."""
+NAME = r"^[A-Za-z0-9_]{1,100}$"
+"""What tiles and surveys may be called: names become folders, files and names in SDF."""
+Name = Annotated[str, Field(pattern=NAME)]
 
 
 def _no_nul(text: Any) -> Any:

@@ -40,14 +40,13 @@ def read(model: Path, photos: Photos) -> Model:
                 path, f"has {cameras} cameras, its list {len(names)} photos", "Put its own list.txt beside it"
             )
         shots: list[Shot] = []
-        lenses: dict[str, Camera] = {}
+        lenses: dict[Camera, str] = {}
         for name in names:
             f, k1, k2 = row(next(lines), 3)
             R = np.array([row(next(lines), 3) for _ in range(3)])
             t = row(next(lines), 3)
             if f > 0:
-                key, camera = camera_named(lenses, _camera(photos.size(name), f, k1, k2))
-                lenses[key] = camera
+                key = named(lenses, _camera(photos.size(name), f, k1, k2))
                 shots.append(Shot(name, key, _pose(R, t)))
         xyz, rgb = [], []
         for _ in range(points):
@@ -60,7 +59,9 @@ def read(model: Path, photos: Photos) -> Model:
         raise InputError(path, f"is no readable Bundler file ({str(error)[:100]})", REMEDY) from None
     left = len(names) - len(shots)
     note = (f"{left} photos without a pose are left out",) if left else ()
-    return Model(lenses, tuple(shots), np.reshape(xyz, (-1, 3)), np.reshape(rgb, (-1, 3)).astype(np.uint8), notes=note)
+    cameras_by_name = {key: camera for camera, key in lenses.items()}
+    colours = np.reshape(rgb, (-1, 3)).astype(np.uint8)
+    return Model(cameras_by_name, tuple(shots), np.reshape(xyz, (-1, 3)), colours, notes=note)
 
 
 def numbered(path: Path) -> Iterator[str]:
@@ -83,9 +84,9 @@ def row(line: str, count: int) -> F64:
     return values
 
 
-def camera_named(known: dict[str, Camera], camera: Camera) -> tuple[str, Camera]:
-    """The name of a camera: of its equal among those known, or a new one."""
-    return next((key for key, other in known.items() if other == camera), f"camera_{len(known) + 1}"), camera
+def named(known: dict[Camera, str], camera: Camera) -> str:
+    """The name of a camera: of its equal among those known, or a new one, which is known then."""
+    return known.setdefault(camera, f"camera_{len(known) + 1}")
 
 
 def _names(path: Path) -> list[str]:

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.io import files
 from scan2sim.pipeline.io.models import Model, Photos, Shot
 from scan2sim.pipeline.types import F64, Camera, CameraModel
 
@@ -123,7 +124,7 @@ def camera_of(model: Path, camera: Described) -> Camera:
 def _parsed(file: Path, parse: Callable[[Any], Iterator[Any]]) -> list[Any]:
     """All records of a file; text as its lines."""
     try:
-        data = file.read_bytes()
+        data = files.check(file, "Export the model again").read_bytes()
         return list(parse(data if file.suffix == ".bin" else data.decode().split("\n")))
     except OSError as error:
         raise InputError(file, f"can't be read ({error.strerror})", "Export the model again") from None

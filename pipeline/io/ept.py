@@ -24,6 +24,8 @@ from scan2sim.pipeline.io import files, las, points
 from scan2sim.pipeline.io.points import PART, Points
 from scan2sim.pipeline.types import F64, Frame, PointCloud
 
+Schema = tuple[np.dtype[Any], dict[str, tuple[float, float]]]
+"""A packed point, and scale and offset of each of its dimensions."""
 REMEDY = "Copy the whole folder again, or build it anew"
 SUFFIXES = {"laszip": ".laz", "binary": ".bin", "zstandard": ".zst"}
 KINDS = {"signed": "i", "unsigned": "u", "float": "f"}
@@ -100,9 +102,8 @@ def _laszip(tile: Path) -> Iterator[Points]:
         )
 
 
-def _packed(tile: Path, schema: list[dict[str, Any]], count: int) -> Iterator[Points]:
-    row = np.dtype([(entry["name"], f"<{KINDS[entry['type']]}{entry['size']}") for entry in schema])
-    scales = {entry["name"]: (float(entry.get("scale", 1)), float(entry.get("offset", 0))) for entry in schema}
+def _packed(tile: Path, schema: Schema, count: int) -> Iterator[Points]:
+    row, scales = schema
     if tile.suffix == ".bin" and tile.stat().st_size != count * row.itemsize:
         raise InputError(tile, f"is of {tile.stat().st_size:,} bytes, not {count * row.itemsize:,}", REMEDY)
 
@@ -143,18 +144,17 @@ def _records(tile: Path, row: np.dtype[Any]) -> Iterator[npt.NDArray[Any]]:
         raise InputError(tile, f"is no readable zstd file ({error})", REMEDY) from None
 
 
-def _schema(path: Path, info: dict[str, Any]) -> list[dict[str, Any]]:
-    schema = info.get("schema")
+def _schema(path: Path, info: dict[str, Any]) -> Schema:
     try:
-        assert isinstance(schema, list)
-        for entry in schema:
-            np.dtype(f"<{KINDS[entry['type']]}{int(entry['size'])}")
-            assert np.isfinite([float(entry.get("scale", 1)), float(entry.get("offset", 0))]).all()
-        names = [str(entry["name"]) for entry in schema]
-        assert {"X", "Y", "Z"} <= set(names) and len(set(names)) == len(names)
-    except (AssertionError, KeyError, TypeError, ValueError, AttributeError):
-        raise InputError(path, "its schema describes no points with X, Y and Z", REMEDY) from None
-    return schema
+        entries = [(str(entry["name"]), entry) for entry in info["schema"]]
+        row = np.dtype([(name, f"<{KINDS[entry['type']]}{int(entry['size'])}") for name, entry in entries])
+        scales = {name: (float(entry.get("scale", 1)), float(entry.get("offset", 0))) for name, entry in entries}
+        good = {"X", "Y", "Z"} <= scales.keys() and np.isfinite(list(scales.values())).all()
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError):
+        good = False
+    if not good:
+        raise InputError(path, "its schema describes no points with X, Y and Z", REMEDY)
+    return row, scales
 
 
 def _json(path: Path) -> dict[str, Any]:

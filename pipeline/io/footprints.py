@@ -6,6 +6,7 @@ import json
 import sqlite3
 import struct
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.heightfield import signed_area
+from scan2sim.pipeline.io import files
 from scan2sim.pipeline.io.crs import LOCAL
 from scan2sim.pipeline.types import F64, Frame
 
@@ -21,6 +23,10 @@ SUFFIXES = (".geojson", ".json", ".gpkg")
 MOST = 1_000_000  # rings
 ENVELOPES = (0, 32, 48, 48, 64)  # bytes, by a GeoPackage geometry's flag
 POLYGON, MULTIPOLYGON = 3, 6
+UNREADABLE = (
+    OSError, ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError, struct.error,
+    sqlite3.Error,
+)  # fmt: skip
 
 Ring = F64
 
@@ -36,13 +42,10 @@ def read(path: Path, frame: Frame) -> list[F64]:
     """
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(path, "is no GeoJSON or GeoPackage", f"Footprints are {', '.join(SUFFIXES)} files")
-    if not path.is_file():
-        raise InputError(path, "is missing", "Put it there, or leave the footprints out")
+    files.check(path, "Put it there, or leave the footprints out")
     try:
         found = list(_geopackage(path) if path.suffix.lower() == ".gpkg" else _geojson(path))
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError, struct.error) as error:
-        raise InputError(path, f"can't be read as footprints ({error})", "Export it again") from None
-    except sqlite3.Error as error:
+    except UNREADABLE as error:
         raise InputError(path, f"can't be read as footprints ({error})", "Export it again") from None
     rings = []
     for crs, polygon in found:
@@ -83,7 +86,7 @@ def _geometries(body: Any) -> Iterator[Any]:
 
 def _geopackage(path: Path) -> Iterator[tuple[str | None, list[Ring]]]:
     """CRS and rings of each polygon of all tables of features."""
-    with sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True) as base:
+    with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as base:
         tables = base.execute(
             "SELECT g.table_name, g.column_name, s.organization, s.organization_coordsys_id, s.definition "
             "FROM gpkg_geometry_columns g JOIN gpkg_spatial_ref_sys s ON g.srs_id = s.srs_id"

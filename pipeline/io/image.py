@@ -27,7 +27,7 @@ def size_of(path: Path) -> tuple[int, int]:
         InputError: it is missing, no file, no image, or larger than `MAX_PIXELS`.
     """
     files.check(path)
-    with _opened(path) as image:
+    with opened(path) as image:
         width, height = image.size
     if width * height > MAX_PIXELS:
         told = f"is of {width:,} x {height:,} pixels, more than {MAX_PIXELS:,}"
@@ -41,13 +41,18 @@ def check_decodes(path: Path) -> None:
     Raises:
         InputError: it can't be.
     """
-    with _opened(path) as image:
+    with opened(path) as image:
         image.draft(None, (image.size[0] // 8, image.size[1] // 8))
         image.load()
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Any]:
+def opened(path: Path) -> Iterator[Any]:
+    """A photo by Pillow, its header read.
+
+    Raises:
+        InputError: it can't be read, here or while it is open.
+    """
     from PIL import Image
 
     Image.MAX_IMAGE_PIXELS = None  # `MAX_PIXELS` is the limit: Pillow's own is below what 360 cameras make

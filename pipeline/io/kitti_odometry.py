@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.io.image import read_rgb
+from scan2sim.pipeline.io import files
+from scan2sim.pipeline.io.image import size_of
 from scan2sim.pipeline.io.kitti import PHOTOS, Drive, Rig, assemble, entry, numbered, read_poses, rig, within
 from scan2sim.pipeline.step import Report, silent
 from scan2sim.pipeline.types import F64
@@ -74,11 +75,7 @@ def import_kitti_odometry(
 
 def _rig(sequence: Path, folder: str, photos: dict[int, Path], T_cam0_velo: F64) -> Rig:
     P = entry(sequence, "calib.txt", f"P{folder.removeprefix('image_')}", 12).reshape(3, 4)
-    first = next(iter(photos.values()))
-    image = read_rgb(first)
-    if image is None:
-        raise InputError(first, "is no readable image", "Copy it again")
-    return rig(P, T_cam0_velo, image.shape[1], image.shape[0])
+    return rig(P, T_cam0_velo, *size_of(next(iter(photos.values()))))
 
 
 def _poses_of(sequence: Path) -> Path:
@@ -92,12 +89,11 @@ def _poses_of(sequence: Path) -> Path:
 
 def _times(path: Path, numbers: list[int]) -> F64:
     """(F,) seconds."""
+    remedy = "Unpack the sequence's times again"
     try:
-        times = np.loadtxt(path, ndmin=1).astype(np.float64)
-    except FileNotFoundError:
-        raise InputError(path, "is missing", "Unpack the sequence's times again") from None
+        times = np.loadtxt(files.check(path, remedy), ndmin=1).astype(np.float64)
     except (OSError, ValueError) as error:
-        raise InputError(path, f"is no list of times ({error})", "Unpack the sequence's times again") from None
+        raise InputError(path, f"is no list of times ({error})", remedy) from None
     if times.ndim != 1 or len(times) <= numbers[-1]:
         raise InputError(path, f"has {len(times)} times, but sweep {numbers[-1]} is asked for", "Unpack it again")
     some = times[numbers]

@@ -102,10 +102,10 @@ def import_las(
     shots, rigs = read_photos(photos, cameras) if photos else ([], {})
     base = images or (photos.parent if photos else Path())
     with tile_folder(out, overwrite) as folder:
-        files = []
+        taken = []
         for i, cloud in enumerate(clouds):
             report(0.5 * i / len(clouds), f"cloud {Path(cloud).name}")
-            files.append(_take(Path(cloud), folder, Frame(known, unit=unit), link))
+            taken.append(_take(Path(cloud), folder, Frame(known, unit=unit), link))
         for i, shot in enumerate(shots):
             report(0.5 + 0.5 * i / len(shots), f"photo {shot['file']}")
             for key, where in (("file", "photos"), ("mask", "masks")):
@@ -115,7 +115,7 @@ def import_las(
             folder,
             name=tile_name(name or Path(out).name),
             crs=crs_io.short(known),
-            clouds=files,
+            clouds=taken,
             cameras=rigs,
             photos=shots,
             trajectory=place(trajectory, folder, "trajectory.csv", link) if trajectory else None,

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.io import lens
-from scan2sim.pipeline.io.bundler import camera_named, numbered, row
+from scan2sim.pipeline.io.bundler import named, numbered, row
 from scan2sim.pipeline.io.models import Model, Photos, Shot
 from scan2sim.pipeline.types import F64, Camera
 
@@ -38,12 +38,11 @@ def read(model: Path, photos: Photos) -> Model:
         if count < 1:
             raise ValueError(f"{count} cameras")
         shots: list[Shot] = []
-        lenses: dict[str, Camera] = {}
+        lenses: dict[Camera, str] = {}
         for _ in range(count):
             name, *rest = next(lines).rsplit(maxsplit=10)
             f, *q_and_c, r, _ = row(" ".join(rest), 10)
-            key, camera = camera_named(lenses, _camera(model, photos.size(name), f, r, fixed))
-            lenses[key] = camera
+            key = named(lenses, _camera(model, photos.size(name), f, r, fixed))
             shots.append(Shot(name, key, _pose(np.array(q_and_c[:4]), np.array(q_and_c[4:]))))
         points = int(next(lines, "0"))
         values = [np.array(next(lines).split()[:6], np.float64) for _ in range(points)]
@@ -52,7 +51,8 @@ def read(model: Path, photos: Photos) -> Model:
         raise InputError(model, "is truncated: it ends before its last camera or point", "Copy it again") from None
     except ValueError as error:
         raise InputError(model, f"is no readable NVM file ({str(error)[:100]})", REMEDY) from None
-    return Model(lenses, tuple(shots), rows[:, :3], np.clip(rows[:, 3:], 0, 255).astype(np.uint8))
+    cameras = {key: camera for camera, key in lenses.items()}
+    return Model(cameras, tuple(shots), rows[:, :3], np.clip(rows[:, 3:], 0, 255).astype(np.uint8))
 
 
 def _fixed(head: str) -> tuple[float, ...] | None:

@@ -48,7 +48,7 @@ def read(model: Path, photos: Photos) -> Model:
         xyz = np.array([point["coordinates"] for point in points], np.float64).reshape(-1, 3)
         rgb = np.array([point["color"] for point in points], np.float64).reshape(-1, 3)
         earth = _earth(part.get("reference_lla"))
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise InputError(path, f"lacks or misstates {str(error)[:100]}", REMEDY) from None
     for shot in shots:
         if shot.camera not in cameras:

@@ -14,6 +14,7 @@ import numpy as np
 
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.io import crs as crs_io
+from scan2sim.pipeline.io import files, image
 from scan2sim.pipeline.io.importing import place
 from scan2sim.pipeline.types import F64, Camera, Frame, View
 
@@ -74,19 +75,15 @@ def take(path: Path, folder: Path, link: bool = False) -> str:
 
 def _header(path: Path) -> tuple[tuple[int, int], dict[int, Any]]:
     """Width and height, and the tags that a TIFF has."""
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        with Image.open(path) as image:
-            return image.size, dict(getattr(image, "tag_v2", {}))
-    except (OSError, UnidentifiedImageError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise InputError(path, f"can't be read as a picture ({error})", "Export it as GeoTIFF, JPEG or PNG") from None
+    size = image.size_of(path)
+    with image.opened(path) as picture:
+        return size, dict(getattr(picture, "tag_v2", {}))
 
 
 def _from_world_file(path: Path) -> F64:
     """(2, 3) pixel (column, row, 1) to CRS coordinates."""
     try:
-        text = path.read_text(encoding="utf-8-sig")[:10_000]
+        text = files.check(path).read_text(encoding="utf-8-sig")[:10_000]
         a, d, b, e, c, f = (float(word) for word in re.split(r"\s+", text.strip().replace(",", ".")))
     except (OSError, ValueError) as error:
         raise InputError(path, f"is no world file of six numbers ({error})", "Export it again") from None

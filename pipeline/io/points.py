@@ -1,4 +1,4 @@
-"""Points as files have them, part by part: what readers that aren't LAS or PLY share.
+"""Points as files have them, part by part: what all readers but LAS's share.
 
 A reader yields `Points`: CRS coordinates in float64, colours and intensities in whatever range the file has. Here they
 become `PointCloud`s: colours of 8 bits, intensities of 16, both by one rule for the whole file, points without

@@ -24,7 +24,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.io import toml
-from scan2sim.pipeline.io.tile import NAME, tile_name
+from scan2sim.pipeline.io.tile import tile_name
+from scan2sim.pipeline.ranges import NAME, Name
 
 
 class SurveyFile(BaseModel):
@@ -32,7 +33,7 @@ class SurveyFile(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    name: str = Field(pattern=NAME)
+    name: Name
     crs: str
     units: Literal["m", "ft", "us-ft"] | None = None
     length: float = Field(gt=0)

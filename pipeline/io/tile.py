@@ -51,10 +51,9 @@ from scan2sim.pipeline.io import clouds as cloud_io
 from scan2sim.pipeline.io import crs as crs_io
 from scan2sim.pipeline.io import files, orthophoto, toml
 from scan2sim.pipeline.io import trajectory as trajectory_io
+from scan2sim.pipeline.ranges import Name
 from scan2sim.pipeline.types import Camera, CameraModel, Frame, Tile, Trajectory, View
 
-NAME = r"^[A-Za-z0-9_]{1,100}$"
-"""What tiles and surveys may be called: names become folders, files and names in SDF."""
 Vector = tuple[float, float, float]
 FARTHEST, STRONGEST = 1e6, 1e6
 """Pixels that a camera's centre may be from its first, and coefficients of its distortion."""
@@ -108,7 +107,7 @@ class CellEntry(_Strict):
 class TileFile(_Strict):
     """All of `tile.toml`."""
 
-    name: str = Field(pattern=NAME)
+    name: Name
     crs: str | None = None
     units: Literal["m", "ft", "us-ft"] | None = None
     clouds: tuple[str, ...] = Field(min_length=1)
@@ -262,7 +261,11 @@ def _camera(tile: Path, entry: CameraEntry) -> Camera:
     if entry.model != "equirectangular" and not (
         np.isfinite(entry.focal).all() and min(entry.focal) > 0 and max(entry.focal) <= FARTHEST
     ):
-        raise InputError(tile, f"{where}: focal {entry.focal} is not positive", "Give fx and fy in pixels")
+        raise InputError(
+            tile,
+            f"{where}: focal {entry.focal} is not positive, or more than {FARTHEST:,.0f}",
+            "Give fx and fy in pixels",
+        )
     if not (np.isfinite(entry.centre).all() and np.abs(entry.centre).max() <= FARTHEST):
         raise InputError(tile, f"{where}: centre {entry.centre} is no place in a photo", "Give cx and cy in pixels")
     if not (np.isfinite(entry.distortion).all() and np.abs(entry.distortion).max(initial=0) <= STRONGEST):

@@ -37,7 +37,7 @@ def commands(folder: Path, monkeypatch: pytest.MonkeyPatch, **scripts: str) -> N
 
 
 def lacking_usb(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(libraries, "_loads", lambda name: name not in USB)
+    monkeypatch.setattr(libraries, "loads", lambda name: name not in USB)
 
 
 def test_the_missing_library_and_its_package_are_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -84,7 +84,7 @@ def test_what_may_be_installed_is_said_and_installed(
 ) -> None:
     asked = tmp_path / "asked"
     monkeypatch.setattr(os, "geteuid", lambda: 0 if root else 1000)
-    monkeypatch.setattr(libraries, "_loads", lambda name: name not in USB or asked.exists())
+    monkeypatch.setattr(libraries, "loads", lambda name: name not in USB or asked.exists())
     scripts = {"apt-get": f'echo "$@" >> {asked}', "env": 'shift; exec "$@"', "sudo": 'shift; "$@"'}
     commands(tmp_path, monkeypatch, **scripts)
     install.install_system_packages(USB)

@@ -440,6 +440,10 @@ def test_a_line_that_never_ends_is_refused(tmp_path: Path, monkeypatch: pytest.M
         clouds.read(tmp_path / "c.xyz", Frame())
 
 
+BINARY = """{"dataType": "binary", "schema": [{"name": "X", "type": "signed", "size": %s, "scale": %s},
+    {"name": "Y", "type": "signed", "size": 4}, {"name": "Z", "type": "signed", "size": 4}]}"""
+
+
 @pytest.mark.parametrize(
     ("file", "body", "cause"),
     [
@@ -450,6 +454,9 @@ def test_a_line_that_never_ends_is_refused(tmp_path: Path, monkeypatch: pytest.M
         ("ept-hierarchy/0-0-0-0.json", "[" * 100_000, "is no readable JSON"),
         ("ept.json", "{}", "has the dataType"),
         ("ept.json", '{"dataType": "binary", "schema": [{"name": "X"}]}', "its schema describes no points"),
+        ("ept.json", BINARY % ("4", "NaN"), "its schema describes no points"),
+        ("ept.json", BINARY % ("4", "1" + 400 * "0"), "its schema describes no points"),
+        ("ept.json", BINARY % ("1e400", "1"), "its schema describes no points"),
     ],
 )
 def test_a_broken_ept_is_refused(tmp_path: Path, file: str, body: str, cause: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import cv2
@@ -109,6 +110,13 @@ def test_a_damaged_sequence_is_refused(sequence: Path, tmp_path: Path, file: str
     with pytest.raises(InputError, match=cause):
         import_kitti_odometry(sequence, tmp_path / "tile")
     assert not (tmp_path / "tile").exists()
+
+
+def test_times_in_a_pipe_are_not_waited_for(sequence: Path, tmp_path: Path) -> None:
+    (sequence / "times.txt").unlink()
+    os.mkfifo(sequence / "times.txt")
+    with pytest.raises(InputError, match="is a pipe"):
+        import_kitti_odometry(sequence, tmp_path / "tile")
 
 
 def test_a_real_sequences_sweeps_agree(real_data: Path, tmp_path: Path) -> None:

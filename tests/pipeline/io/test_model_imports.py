@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -401,6 +402,14 @@ def test_the_command_makes_a_tile(tmp_path: Path, kind: str) -> None:
     assert len(tile.views) == len(poses)
     for view in tile.views:
         assert np.allclose(tile.frame.to_crs(view.centre), 2 * poses[view.photo.stem][:3, 3], atol=1e-6)
+
+
+def test_opensfm_numbers_beyond_all_bounds_are_refused(tmp_path: Path) -> None:
+    path = WRITERS["opensfm"](tmp_path)
+    for number in ("Infinity", "1" + 400 * "0"):
+        path.write_text(re.sub(r'"width": [^,]+', f'"width": {number}', path.read_text()))
+        with pytest.raises(InputError, match="lacks or misstates"):
+            read("opensfm", path, images())
 
 
 @pytest.mark.parametrize("kind", WRITERS)

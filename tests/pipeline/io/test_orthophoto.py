@@ -10,6 +10,7 @@ from PIL import Image, TiffImagePlugin
 
 from scan2sim.pipeline.cameras import project, ray_origins, unproject
 from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.io import image
 from scan2sim.pipeline.io.orthophoto import read_view
 from scan2sim.pipeline.types import Frame
 
@@ -70,3 +71,15 @@ def test_a_picture_that_says_not_where_it_is(tmp_path: Path) -> None:
     (tmp_path / "torn.tif").write_bytes(b"II*\0")
     with pytest.raises(InputError, match="torn"):
         read_view(tmp_path / "torn.tif", FEET, highest=1.0)
+
+
+def test_large_ones_are_measured_by_the_projects_limit_not_pillows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = picture(tmp_path / "map.png")
+    (tmp_path / "map.pgw").write_text("1\n0\n0\n-1\n0\n0\n")
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 100)
+    assert read_view(file, FEET, highest=0.0).camera.width == 60
+    monkeypatch.setattr(image, "MAX_PIXELS", 100)
+    with pytest.raises(InputError, match="60 x 40 pixels, more than 100"):
+        read_view(file, FEET, highest=0.0)

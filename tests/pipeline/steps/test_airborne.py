@@ -199,7 +199,8 @@ def test_footprints_come_to_the_tiles_coordinates(kind: str, tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("name", "content"),
     [("a.geojson", b"{"), ("a.geojson", b'{"type": "Point", "coordinates": [1, 2]}'), ("a.gpkg", b"no database"),
-     ("a.shp", b""), ("a.geojson", b'{"type": "Polygon", "coordinates": [[[1, "x"]]]}')],
+     ("a.shp", b""), ("a.geojson", b'{"type": "Polygon", "coordinates": [[[1, "x"]]]}'),
+     ("a.geojson", b'{"type": "Polygon", "coordinates": [[[1' + 400 * b"0" + b", 2]]]}")],
 )  # fmt: skip
 def test_bad_footprints_are_named(name: str, content: bytes, tmp_path: Path) -> None:
     (tmp_path / name).write_bytes(content)
