@@ -13,14 +13,15 @@ if TYPE_CHECKING:
 
     from scan2sim.pipeline.types import F32
 
+MISSIONS = 0.10  # metres, the voxels that the limits are made for (D3.2)
 FULL_VOXELS = 1.4  # mean distance to six neighbours on a surface whose every voxel holds a point, in voxels
 
 
 class TrimParams(Params):
     """What is removed, all in metres.
 
-    The limits suit a cloud that fills its voxels, as a mobile scanner's does. Where the points lie
-    sparser than that, limits grow in proportion (the fact `widened` tells how much).
+    The limits suit a cloud that fills voxels of 10 cm, as a mobile scanner's does. Where the points lie
+    sparser than that, or are thinned to larger voxels, limits grow in proportion (the fact `widened` tells how much).
 
     Attributes:
         max_edge: of a triangle; the mission's 50 cm for terrain (holes get closed), 25 cm else.
@@ -48,7 +49,7 @@ def trim(inputs: Inputs, params: TrimParams, out: Path, report: Report) -> Done:
         return Done({"mesh": out / "mesh.npz"}, {"faces_in": 0, "faces": 0})
     assert mesh.density is not None
     tree = cKDTree(cloud.xyz)
-    widened = max(1.0, _spacing(tree, cloud.xyz) / (FULL_VOXELS * params.voxel))
+    widened = max(1.0, _spacing(tree, cloud.xyz) / (FULL_VOXELS * MISSIONS))
     if "made" in inputs:
         tree = cKDTree(np.concatenate([cloud.xyz, PointCloud.load(inputs["made"]).xyz]))
     corners = mesh.corners
@@ -83,4 +84,4 @@ def _spacing(tree: cKDTree, xyz: F32) -> float:
     return float(np.median(distance[:, 1:].mean(axis=1)))
 
 
-TRIM = Step("trim", 1, trim, TrimParams, {"terrain": {"max_edge": 0.5, "max_distance": 0.5, "max_spacing": 1.6}})
+TRIM = Step("trim", 2, trim, TrimParams, {"terrain": {"max_edge": 0.5, "max_distance": 0.5, "max_spacing": 1.6}})
