@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from scan2sim.pipeline.errors import DataError
 from scan2sim.pipeline.types import F32, F64
 
 Bools = npt.NDArray[np.bool_]
@@ -26,6 +27,8 @@ PER_CELL = 1.2
 """Mean distance to six neighbours on a square lattice, in its cells."""
 MARGIN = 4
 """Cells around everything."""
+MOST = 2 * 10**8
+"""Cells of a raster: several of them in float64 have to fit into memory."""
 
 
 @dataclass(frozen=True)
@@ -44,11 +47,23 @@ class Raster:
 
     @classmethod
     def over(cls, cell: float, parts: Sequence[npt.NDArray[Any]]) -> Raster:
-        """The raster over all points of `parts` (N, 2 or 3), with room around."""
+        """The raster over all points of `parts` (N, 2 or 3), with room around.
+
+        Raises:
+            DataError: it would have more than `MOST` cells.
+        """
         filled = [part[:, :2] for part in parts if len(part)]
         low = np.floor(np.min([part.min(axis=0) for part in filled], axis=0) / cell).astype(int) - MARGIN
         high = np.floor(np.max([part.max(axis=0) for part in filled], axis=0) / cell).astype(int) + MARGIN + 1
-        return cls(cell, (int(low[0]), int(low[1])), (int(high[1] - low[1]), int(high[0] - low[0])))
+        columns, rows = int(high[0] - low[0]), int(high[1] - low[1])
+        if rows * columns > MOST:
+            raise DataError(
+                "the cloud",
+                f"is {columns * cell:,.0f} x {rows * cell:,.0f} m wide: {rows * columns:,} cells of {cell:g} m are too "
+                "many to make up walls and ground with",
+                "Cut it into tiles (scan2sim tile), or set ground.when and walls.when to never",
+            )
+        return cls(cell, (int(low[0]), int(low[1])), (rows, columns))
 
     def at(self, xy: npt.NDArray[Any]) -> tuple[Ints, Ints]:
         """Rows and columns (N,) of places (N, 2 or 3); the outermost cell's for those beyond."""

@@ -20,7 +20,7 @@ from scan2sim.pipeline.types import F64, Frame
 
 WGS84 = "OGC:CRS84"
 SUFFIXES = (".geojson", ".json", ".gpkg")
-MOST = 1_000_000  # rings
+MOST = 1_000_000  # rows of a table: a view's needn't end
 ENVELOPES = (0, 32, 48, 48, 64)  # bytes, by a GeoPackage geometry's flag
 POLYGON, MULTIPOLYGON = 3, 6
 UNREADABLE = (
@@ -95,7 +95,9 @@ def _geopackage(path: Path) -> Iterator[tuple[str | None, list[Ring]]]:
             known = str(organization).upper() in ("EPSG", "ESRI", "OGC") and int(code) > 0
             crs = f"{organization}:{code}" if known else None if definition in (None, "undefined") else definition
             name, what = (str(text).replace('"', '""') for text in (table, column))
-            for (blob,) in base.execute(f'SELECT "{what}" FROM "{name}" LIMIT {MOST}'):
+            for i, (blob,) in enumerate(base.execute(f'SELECT "{what}" FROM "{name}" LIMIT {MOST + 1}')):
+                if i == MOST:
+                    raise ValueError(f"{table} has more than {MOST:,} rows")
                 for polygon in _from_blob(blob):
                     yield crs, polygon
 

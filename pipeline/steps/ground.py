@@ -21,8 +21,8 @@ class MadeUpParams(Params):
     """Whether what an airborne scanner can't see is made up.
 
     Attributes:
-        when: "auto": where the tile has neither a scanner's path nor photos taken from the ground, and more of its
-            buildings' points lie on roofs than on walls; "always", "never".
+        when: "auto": where the tile has neither a scanner's path nor photos with poses, and more of its buildings'
+            points lie on roofs than on walls; "always", "never".
         seed: the tile's (x, y), world metres, where it meets others; set by the recipe.
         neighbours: names of tiles whose cells touch to their seeds, world metres; set by the recipe.
         name: of the tile; set by the recipe.

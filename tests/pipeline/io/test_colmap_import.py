@@ -237,6 +237,7 @@ def test_real_photos_are_placed_by_their_gps(real_data: Path, tmp_path: Path) ->
     extraction.max_image_size, extraction.sift.max_num_features = 800, 2000
     mapping.mapper.init_min_num_inliers, mapping.mapper.abs_pose_min_num_inliers = 60, 15
     pycolmap.set_random_seed(0)
+    mapping.num_threads, mapping.random_seed = 1, 0  # on several threads no two maps are the same
     pycolmap.extract_features(database, images, camera_mode=pycolmap.CameraMode.SINGLE, extraction_options=extraction)
     pycolmap.match_exhaustive(database)
     maps = pycolmap.incremental_mapping(database, images, tmp_path, options=mapping)

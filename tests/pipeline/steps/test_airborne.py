@@ -14,7 +14,7 @@ import pytest
 from scan2sim.flows.recipe import recipe
 from scan2sim.flows.settings import Settings
 from scan2sim.pipeline.classes import CODE
-from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.errors import DataError, InputError
 from scan2sim.pipeline.io import footprints
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.step import Done, Step, silent
@@ -283,3 +283,12 @@ def test_points_that_became_no_surface_are_told(house: dict[str, Path], tmp_path
     nothing.save(tmp_path / "none.npz")
     done = go(GEOMETRY, tmp_path, {"mesh.building": tmp_path / "none.npz", "cloud.building": house["building"]})
     assert done.facts == {} and "the world has no building" in done.warnings[0]
+
+
+def test_a_raster_that_no_memory_holds_is_refused() -> None:
+    from scan2sim.pipeline.heightfield import Raster
+
+    corners = np.array([[0, 0, 0], [5000, 5000, 0]], np.float32)
+    assert Raster.over(0.5, [corners]).shape[0] > 10_000
+    with pytest.raises(DataError, match="too many"):
+        Raster.over(0.1, [corners])
