@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from scan2sim.pipeline.classes import GROUPS, NOISE, group_of, known, name_of
+from scan2sim.pipeline.classes import GROUPS, NOISE, UNKNOWN, group_of, known, name_of
 from scan2sim.pipeline.errors import DataError
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
@@ -58,13 +58,15 @@ def split(inputs: Inputs, params: SplitParams, out: Path, report: Report) -> Don
         )
     codes, numbers = np.unique(cloud.label, return_counts=True)
     classes = {name_of(int(c)): int(n) for c, n in zip(codes, numbers, strict=True)}
-    vanished = {name_of(int(c)): int(n) for c, n in zip(codes, numbers, strict=True) if not known()[c]}
+    vanished = {int(c): int(n) for c, n in zip(codes, numbers, strict=True) if not known()[c]}
     if sum(vanished.values()) > TELL * len(cloud):
-        which = ", ".join(f"{name} {n / len(cloud):.1%}" for name, n in vanished.items())
+        which = ", ".join(f"{name_of(code)} {n / len(cloud):.1%}" for code, n in vanished.items())
+        foreign = max((code for code in vanished if code not in UNKNOWN), key=vanished.__getitem__, default=None)
+        mapping = f'Say what codes are by [classes] in tile.toml ({foreign} = "building"), or have'
         warnings.append(
             f"{sum(vanished.values()) / len(cloud):.1%} of the points have no class that says what they are ({which}): "
-            'the world has no surface there. Say what codes are by [classes] in tile.toml (31 = "building"), '
-            "or have all classes told anew by --set segment.overwrite=true"
+            f"the world has no surface there. {mapping if foreign else 'Have'} all classes told "
+            "anew by --set segment.overwrite=true"
         )
     return Done(files, {"points_in": len(cloud), "points": counts, "classes": classes}, warnings)
 

@@ -88,7 +88,11 @@ def test_points_that_vanish_are_named_with_their_share_and_what_to_do(tmp_path: 
     assert told.facts["points"] == {"terrain": 400, "building": 0, "vegetation": 400, "rest": 1200}
     warning = next(w for w in told.warnings if "no class" in w and "%" in w)
     assert warning.startswith("60.0% of the points") and "unclassified 40.0%, code_31 20.0%" in warning
-    assert "segment.overwrite=true" in warning
+    assert '31 = "building"' in warning and "segment.overwrite=true" in warning
+    cloud = PointCloud.load(done.files["cloud"])
+    cloud.take(np.flatnonzero(cloud.label != 31)).save(tmp_path / "rest.npz")  # type: ignore[arg-type]
+    told = split({"cloud": tmp_path / "rest.npz"}, SplitParams(), tmp_path / "split", silent)
+    assert "Have all classes told anew" in told.warnings[-1] and "[classes]" not in told.warnings[-1]
 
 
 def test_clouds_that_become_laz_keep_their_survey_s_codes_until_a_tile_says_what_they_are(tmp_path: Path) -> None:

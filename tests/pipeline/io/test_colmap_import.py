@@ -234,12 +234,17 @@ def test_real_photos_are_placed_by_their_gps(real_data: Path, tmp_path: Path) ->
     """COLMAP's own reconstruction of a walk along a street, whose photos hold a phone's GPS."""
     images, database = real_data / "opensfm_lund" / "images", tmp_path / "database.db"
     extraction, mapping = pycolmap.FeatureExtractionOptions(), pycolmap.IncrementalPipelineOptions()
+    extraction.num_threads = 1
     extraction.max_image_size, extraction.sift.max_num_features = 800, 2000
     mapping.mapper.init_min_num_inliers, mapping.mapper.abs_pose_min_num_inliers = 60, 15
     pycolmap.set_random_seed(0)
     mapping.num_threads, mapping.random_seed = 1, 0  # on several threads no two maps are the same
+    mapping.mapper.num_threads, mapping.mapper.random_seed = 1, 0
+    mapping.ba_refine_extra_params = False  # a straight walk doesn't tell a lens's distortion: the map would bend
     pycolmap.extract_features(database, images, camera_mode=pycolmap.CameraMode.SINGLE, extraction_options=extraction)
-    pycolmap.match_exhaustive(database)
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.num_threads = 1
+    pycolmap.match_exhaustive(database, matching_options=matching)
     maps = pycolmap.incremental_mapping(database, images, tmp_path, options=mapping)
     best = max(maps.values(), key=lambda found: found.num_reg_images())
     assert best.num_reg_images() >= 15
