@@ -382,7 +382,7 @@ def import_kitti(
             drive, out, poses=poses, cameras=camera or ["image_02"], max_range=max_range, deskew=not rigid,
             name=name, link=link, overwrite=overwrite, report=report,
         )  # fmt: skip
-    typer.echo(f"Tile: {path}")
+    _imported(path)
 
 
 @imports.command("kitti-odometry")

@@ -21,9 +21,10 @@ def verify(out: Path) -> None:
     """Digest all kept results and published worlds below a run's or survey's folder, and print what is damaged.
 
     What users edit (`pipeline.io.worlds.EDITED`) may be as they left it: it is printed where it was changed.
+    A survey's common world isn't read: the next `survey` compares it with the tiles'.
 
-    The next `run` or `survey` makes that anew, and nothing else: a damaged file is marked as changed now, a damaged
-    manifest is one that can't be read.
+    What is damaged the next `run` or `survey` makes anew, and nothing else: a damaged file is marked as changed now, a
+    damaged manifest is one that can't be read.
 
     Raises:
         InputError: there are no results.
@@ -61,7 +62,7 @@ def verify(out: Path) -> None:
     if bad:
         remedy = "Run again: what is damaged is made anew, and nothing else"
         raise DamagedError(out, f"{len(bad)} of {files} files of {len(folders)} results are damaged", remedy)
-    console.print(f"{files} files of {len(folders)} results, and the worlds made of them, are as they were made")
+    console.print(f"{files} files of {len(folders)} results, and the tiles' worlds made of them, are as they were made")
 
 
 def _published(out: Path, folder: Path, manifest: Manifest) -> Iterator[Path]:

@@ -72,6 +72,6 @@ def place(source: Path, folder: Path, name: str, link: bool = False) -> str:
     return name
 
 
-def inside(name: str) -> str:
+def without_parents(name: str) -> str:
     """A file name that stays in the tile's folder: `../a/b.jpg` and `/a/b.jpg` become `a/b.jpg`."""
     return "/".join(part for part in Path(name).parts if part not in ("..", ".", Path(name).anchor))

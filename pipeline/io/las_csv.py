@@ -34,7 +34,7 @@ from scan2sim.pipeline.io import clouds as cloud_io
 from scan2sim.pipeline.io import crs as crs_io
 from scan2sim.pipeline.io import files, las
 from scan2sim.pipeline.io import orthophoto as orthophoto_io
-from scan2sim.pipeline.io.importing import inside, place, tile_folder
+from scan2sim.pipeline.io.importing import place, tile_folder, without_parents
 from scan2sim.pipeline.io.tile import read_tile, tile_name, write_tile
 from scan2sim.pipeline.step import Report, silent
 from scan2sim.pipeline.types import F64, Camera, CameraModel, Frame
@@ -110,7 +110,7 @@ def import_las(
             report(0.5 + 0.5 * i / len(shots), f"photo {shot['file']}")
             for key, where in (("file", "photos"), ("mask", "masks")):
                 if shot.get(key):
-                    shot[key] = place(base / shot[key], folder, f"{where}/{inside(shot[key])}", link)
+                    shot[key] = place(base / shot[key], folder, f"{where}/{without_parents(shot[key])}", link)
         write_tile(
             folder,
             name=tile_name(name or Path(out).name),

@@ -22,7 +22,7 @@ from scan2sim.pipeline.io import clouds as cloud_io
 from scan2sim.pipeline.io import crs as crs_io
 from scan2sim.pipeline.io import las, photo_gps
 from scan2sim.pipeline.io.image import size_of
-from scan2sim.pipeline.io.importing import inside, place, tile_folder
+from scan2sim.pipeline.io.importing import place, tile_folder, without_parents
 from scan2sim.pipeline.io.tile import read_tile, tile_name, write_tile
 from scan2sim.pipeline.similarity import Similarity
 from scan2sim.pipeline.step import Report, silent
@@ -98,7 +98,7 @@ class Photos:
             InputError: there is none, or more than one.
         """
         name = name.replace("\\", "/")
-        path = self.folder / inside(name)
+        path = self.folder / without_parents(name)
         if name and path.is_file():
             return path
         known = self._known()

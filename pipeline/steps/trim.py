@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     from scan2sim.pipeline.types import F32
 
-MISSIONS = 0.10  # metres, the voxels that the limits are made for (D3.2)
+MISSION_VOXEL = 0.10  # metres, the voxels that the limits are made for (D3.2)
 FULL_VOXELS = 1.4  # mean distance to six neighbours on a surface whose every voxel holds a point, in voxels
 
 
@@ -49,7 +49,7 @@ def trim(inputs: Inputs, params: TrimParams, out: Path, report: Report) -> Done:
         return Done({"mesh": out / "mesh.npz"}, {"faces_in": 0, "faces": 0})
     assert mesh.density is not None
     tree = cKDTree(cloud.xyz)
-    widened = max(1.0, _spacing(tree, cloud.xyz) / (FULL_VOXELS * MISSIONS))
+    widened = max(1.0, _spacing(tree, cloud.xyz) / (FULL_VOXELS * MISSION_VOXEL))
     if "made" in inputs:
         tree = cKDTree(np.concatenate([cloud.xyz, PointCloud.load(inputs["made"]).xyz]))
     corners = mesh.corners
