@@ -27,6 +27,7 @@ from scan2sim.pipeline.steps.plants import PLANTS
 from scan2sim.pipeline.steps.poisson import POISSON
 from scan2sim.pipeline.steps.preview import PREVIEW
 from scan2sim.pipeline.steps.rasters import RASTERS
+from scan2sim.pipeline.steps.reach import REACH
 from scan2sim.pipeline.steps.split import SPLIT
 from scan2sim.pipeline.steps.trim import TRIM
 from scan2sim.pipeline.steps.views import VIEWS
@@ -46,8 +47,8 @@ from scan2sim.texturing.texture import TEXTURE
 from scan2sim.texturing.unwrap import UNWRAP
 
 STEPS: tuple[Step, ...] = (
-    INGEST, PATH, VIEWS, LABEL, SEGMENT, OVERLAP, SPLIT, VOXEL, GROUND, WALLS, POISSON, TRIM, ISLANDS, CLIP, JOIN,
-    DECIMATE, PLANTS, UNWRAP, VISIBILITY, EXPOSURE, AGREEMENT, CHOOSE, TEXTURE, LEVEL, COLLISION, EXPORT, RASTERS,
+    INGEST, PATH, VIEWS, LABEL, SEGMENT, REACH, OVERLAP, SPLIT, VOXEL, GROUND, WALLS, POISSON, TRIM, ISLANDS, CLIP,
+    JOIN, DECIMATE, PLANTS, UNWRAP, VISIBILITY, EXPOSURE, AGREEMENT, CHOOSE, TEXTURE, LEVEL, COLLISION, EXPORT, RASTERS,
     GEOMETRY, SCORE, PICTURES, PREVIEW, BORDERS,
 )  # fmt: skip
 PER_CLASS: tuple[Step, ...] = (VOXEL, POISSON, TRIM, ISLANDS, CLIP, JOIN, DECIMATE, CHOOSE, UNWRAP, TEXTURE, LEVEL)
@@ -116,12 +117,18 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
     if photographed:
         add(LABEL, whole | seen | _weights(settings), **_kept(settings))
     add(SEGMENT, whole | scanner | ({**seen, "labels": at("label", "labels")} if photographed else {}))
-    cloud = at("segment", "cloud")
+    last = "segment"  # step whose cloud is split, in every tile of a survey the same
     cell: dict[str, Any] = {"seed": tile.cell.seed, "neighbours": dict(tile.cell.neighbours)} if tile.cell else {}
     met = [name for name in cell.get("neighbours", {}) if name in (beside or ())]
     first = [name for name in met if name < tile.name]  # they own the borders with this one
+    limit = settings.params(REACH).limit
+    if limit != "off" and (met or (path and (photographed or limit != "auto"))):
+        shown = seen if photographed else {}
+        add(REACH, {"cloud": at(last, "cloud")} | scanner | shown, voxel=settings.params(VOXEL, "terrain").size)
+        last = "reach"
+    cloud = at(last, "cloud")
     if met and tile.cell:
-        others = {f"cloud.{name}": at("segment", "cloud", name) for name in met}
+        others = {f"cloud.{name}": at(last, "cloud", name) for name in met}
         add(OVERLAP, {"cloud": cloud} | others, name=tile.name, buffer=tile.cell.buffer, **cell)
         cloud = at("overlap", "cloud")
     add(SPLIT, {"cloud": cloud})
