@@ -23,6 +23,7 @@ LARGEST = 20_000  # GB, of what steps may need together
 PAUSE = 0.2  # seconds between looks for free memory
 NEEDS: dict[str, tuple[float, float]] = {
     "ingest": (0.4, 12),
+    "carve": (0.5, 6),
     "label": (1.5, 3),
     "segment": (0.5, 6),
     "poisson": (0.4, 70),

@@ -11,6 +11,7 @@ from scan2sim.flows.settings import Settings
 from scan2sim.pipeline.classes import GROUPS
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.step import Params, Step
+from scan2sim.pipeline.steps.carve import CARVE
 from scan2sim.pipeline.steps.clip import CLIP
 from scan2sim.pipeline.steps.collision import COLLISION
 from scan2sim.pipeline.steps.decimate import DECIMATE
@@ -47,9 +48,9 @@ from scan2sim.texturing.texture import TEXTURE
 from scan2sim.texturing.unwrap import UNWRAP
 
 STEPS: tuple[Step, ...] = (
-    INGEST, PATH, VIEWS, LABEL, SEGMENT, REACH, OVERLAP, SPLIT, VOXEL, GROUND, WALLS, POISSON, TRIM, ISLANDS, CLIP,
-    JOIN, DECIMATE, PLANTS, UNWRAP, VISIBILITY, EXPOSURE, AGREEMENT, CHOOSE, TEXTURE, LEVEL, COLLISION, EXPORT, RASTERS,
-    GEOMETRY, SCORE, PICTURES, PREVIEW, BORDERS,
+    INGEST, PATH, CARVE, VIEWS, LABEL, SEGMENT, REACH, OVERLAP, SPLIT, VOXEL, GROUND, WALLS, POISSON, TRIM, ISLANDS,
+    CLIP, JOIN, DECIMATE, PLANTS, UNWRAP, VISIBILITY, EXPOSURE, AGREEMENT, CHOOSE, TEXTURE, LEVEL, COLLISION, EXPORT,
+    RASTERS, GEOMETRY, SCORE, PICTURES, PREVIEW, BORDERS,
 )  # fmt: skip
 PER_CLASS: tuple[Step, ...] = (VOXEL, POISSON, TRIM, ISLANDS, CLIP, JOIN, DECIMATE, CHOOSE, UNWRAP, TEXTURE, LEVEL)
 
@@ -104,11 +105,15 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
     frame: dict[str, Any] = {"crs": tile.frame.crs, "origin": tile.frame.origin, "unit": tile.frame.unit}
     files = {f"cloud.{i:04d}": path for i, path in enumerate(tile.clouds)}
     add(INGEST, files, **frame, classes=dict(tile.classes))
-    whole = {"cloud": at("ingest", "cloud")}
     path = scanner_path(tile)
     if path:
         add(PATH, {}, **path)
     scanner = {"path": at("path", "path")} if path else {}
+    cameras = _rows([view.centre for view in tile.views if view.camera.model != "orthographic"])
+    rays = scanner if tile.trajectory is not None else {}  # cameras aren't where the scanner was
+    add(CARVE, {"cloud": at("ingest", "cloud")} | rays, cameras=cameras)
+    whole = {"cloud": at("carve", "cloud")}
+    moving = {"moving": at("carve", "moving")}
     photos: dict[str, Path | Output] = {f"photo.{i}": view.photo for i, view in enumerate(tile.views)}
     masks: dict[str, Path | Output] = {f"mask.{i}": view.mask for i, view in enumerate(tile.views) if view.mask}
     add(VIEWS, photos | masks | whole, poses=tuple(views_io.to_json(view, with_paths=False) for view in tile.views))
@@ -116,7 +121,8 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
     photographed = any(view.camera.model != "orthographic" for view in tile.views)
     if photographed:
         add(LABEL, whole | seen | _weights(settings), **_kept(settings))
-    add(SEGMENT, whole | scanner | ({**seen, "labels": at("label", "labels")} if photographed else {}))
+    told = {**seen, **moving, "labels": at("label", "labels")} if photographed else {}
+    add(SEGMENT, whole | scanner | told)
     last = "segment"  # step whose cloud is split, in every tile of a survey the same
     cell: dict[str, Any] = {"seed": tile.cell.seed, "neighbours": dict(tile.cell.neighbours)} if tile.cell else {}
     met = [name for name in cell.get("neighbours", {}) if name in (beside or ())]
@@ -177,7 +183,7 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
         add(PLANTS, {name: at(f"voxel.{name}", "cloud") for name in ("vegetation", "terrain")}, **cell)
         plants = {"plants": at("plants", "geojson"), "plants_csv": at("plants", "csv")}
 
-    add(VISIBILITY, meshes | clouds | seen)
+    add(VISIBILITY, meshes | clouds | moving | seen)
     seen = seen | {"depth": at("visibility", "depth")}
     prior = settings.params(EXPOSURE).prior
     add(EXPOSURE, seen | ({"prior": Path(prior)} if prior else {}))

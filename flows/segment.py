@@ -20,8 +20,9 @@ from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.las_classes import write_classified
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.store import Store
-from scan2sim.pipeline.types import PointCloud, Tile
+from scan2sim.pipeline.types import U8, PointCloud, Tile
 from scan2sim.segmentation.score import confusion
+from scan2sim.segmentation.segment import OWN, SHAPE
 
 CLOUDS = (".las", ".laz", ".copc")
 
@@ -39,7 +40,7 @@ def segment_tile(path: Path, out: Path, settings: Settings) -> None:
         store = Store(out / STORE)
         nodes = up_to("segment", recipe(tile, settings))
         planned = plan(nodes, store)
-        if drop_damaged(planned, store, {"ingest", "views", "label", "segment"}):
+        if drop_damaged(planned, store, {"ingest", "carve", "views", "label", "segment"}):
             planned = plan(nodes, store)
         log = Log(out / "run.log")
         log.write(f"segment {tile.path}, settings {json.dumps(settings.values)}")
@@ -51,10 +52,16 @@ def segment_tile(path: Path, out: Path, settings: Settings) -> None:
             for label, manifest in done.items()
             for name, file in manifest.files.items()
         }
-        told, own = PointCloud.load(files["segment", "cloud"]).label, PointCloud.load(files["ingest", "cloud"]).label
+        told, own = PointCloud.load(files["segment", "cloud"]).label, PointCloud.load(files["carve", "cloud"]).label
         assert told is not None
         with np.load(files["segment", "confidence"]) as beside:
-            _write_clouds(tile, out / "classified", told, beside["confidence"], beside["source"])
+            columns = told, beside["confidence"], beside["source"]
+            dropped = np.load(files["carve", "dropped"])
+            if len(dropped):
+                kept = done["segment"].facts["source"] == "cloud"
+                whole = PointCloud.load(files["ingest", "cloud"]).label if kept else None
+                columns = _of_all(dropped, whole, *columns)
+            _write_clouds(tile, out / "classified", *columns)
         if ("label", "labels") in files:
             _write_pictures(files["views", "views"], files["label", "labels"], out)
     show_warnings(done)
@@ -71,6 +78,24 @@ def up_to(last: str, nodes: list[Node]) -> list[Node]:
         if node.label in wanted:
             wanted |= {source.node for source in node.inputs.values() if isinstance(source, Output)}
     return [node for node in nodes if node.label in wanted]
+
+
+def _of_all(dropped: U8, own: U8 | None, told: U8, sure: U8, source: U8) -> tuple[U8, U8, U8]:
+    """Classes of all points, how sure they are and where from, with those that `carve` has dropped.
+
+    Args:
+        dropped: (N,) uint8, 0 where a point is kept, else what it is for `carve`.
+        own: (N,) the cloud's own classes, where they are kept, or None.
+        told, sure, source: (K,) of those kept.
+    """
+    kept = dropped == 0
+    codes = dropped.copy() if own is None else own
+    codes[kept] = told
+    all_sure = np.full(len(kept), 255, np.uint8)
+    all_sure[kept] = sure
+    sources = np.full(len(kept), SHAPE if own is None else OWN, np.uint8)
+    sources[kept] = source
+    return codes, all_sure, sources
 
 
 def _write_clouds(tile: Tile, out: Path, code: np.ndarray, confidence: np.ndarray, source: np.ndarray) -> None:

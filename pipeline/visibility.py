@@ -6,9 +6,10 @@ pixel of their footprint asks exactly where its own ray meets the plane.
 
 What hides: the meshes where points bear them out (Poisson rounds off what is thin, and such a bulge hides nothing),
 and of the cloud only what the meshes lack (cars, people, what was trimmed away), as discs along the points'
-normals. What drove past while it was scanned left a trail of points: each hides only from photos taken at about the
-time when it was scanned. A point is visible if its range is no more than the range image's plus a bias that grows
-with the slope at which the surface is seen. Measured on a street whose truth is known by `bench/visibility.py`.
+normals. What drove past while it was scanned left a trail of points, most of which `carve` has told apart: each hides
+only from photos taken at about the time when it was scanned. A point is visible if its range is no more than the range
+image's plus a bias that grows with the slope at which the surface is seen. Measured on a street whose truth is known
+by `bench/visibility.py`.
 """
 
 from __future__ import annotations
@@ -46,6 +47,10 @@ PASS = 5.0
 PRESENT = (-0.1, 0.4)
 """Seconds after its scan within which a point of a moving thing hides: points tell when their place was first scanned,
 and a car takes about so long to leave it."""
+MOMENT = 0.1
+"""The same, before and after, of points that `carve` found moving: the scanner's next turn has new ones."""
+FASTEST = 20.0
+"""Metres a second: points of moving things belong together less, the longer the time between them."""
 CLOSING = 0.7
 """Discs of movable things reach so far of the way to the eighth neighbour: seen from one side, they are sparse."""
 SPARSE = 3.0
@@ -61,7 +66,7 @@ class Scene:
         triangles: number of them.
         centres, normals: (N, 3) of the discs; unit normals.
         radii: (N,) of the discs, metres.
-        times: (N,) of the discs, seconds: when a moving thing was there; NaN for those that hide at all times.
+        spans: (N, 2) of the discs, seconds from and to which they hide; NaN for those that hide at all times.
     """
 
     casting: Any
@@ -69,7 +74,7 @@ class Scene:
     centres: F32
     normals: F32
     radii: F32
-    times: F64
+    spans: F64
 
 
 @dataclass(frozen=True)
@@ -88,7 +93,12 @@ class DepthMap:
 
 
 def scene(
-    meshes: Iterable[Mesh], cloud: PointCloud | None = None, *, radius: float = 0.08, lacking: float = 0.2
+    meshes: Iterable[Mesh],
+    cloud: PointCloud | None = None,
+    *,
+    radius: float = 0.08,
+    lacking: float = 0.2,
+    moving: PointCloud | None = None,
 ) -> Scene:
     """What hides, from the meshes of all classes and the whole cloud.
 
@@ -97,6 +107,7 @@ def scene(
         cloud: with normals; None if only meshes hide, all of them.
         radius: of the discs, metres; about the cloud's voxel size.
         lacking: points nearer than this to a mesh (metres) are left to the mesh.
+        moving: what the step `carve` found moving, with normals and time.
     """
     import open3d as o3d
 
@@ -110,12 +121,34 @@ def scene(
             triangles += len(mesh)
     if cloud is None or whole:
         empty = np.zeros((0, 3), np.float32)
-        return Scene(casting, triangles, empty, empty, np.zeros(0, np.float32), np.zeros(0))
+        still = Scene(casting, triangles, empty, empty, np.zeros(0, np.float32), np.zeros((0, 2)))
+        return _with(still, moving, radius)
     if triangles:
         near = casting.compute_distance(np.ascontiguousarray(cloud.xyz)).numpy()
         cloud = cloud.take(near > np.where(_of_class(cloud, FOLIAGE), LOOSE * lacking, lacking))
     assert cloud.normal is not None
-    return Scene(casting, triangles, cloud.xyz, cloud.normal, _radii(cloud, radius), times_of_moving(cloud))
+    spans = times_of_moving(cloud)[:, None] + PRESENT
+    return _with(Scene(casting, triangles, cloud.xyz, cloud.normal, _radii(cloud, radius), spans), moving, radius)
+
+
+def _with(still: Scene, moving: PointCloud | None, radius: float) -> Scene:
+    """The scene with the points of what moved, each at its time."""
+    from scipy.spatial import cKDTree
+
+    if moving is None or not len(moving):
+        return still
+    assert moving.normal is not None and moving.time is not None
+    since = FASTEST * (moving.time - moving.time.min())
+    there = np.column_stack([moving.xyz, since])
+    distance, _ = cKDTree(there).query(there, k=[min(9, len(there))], workers=-1)
+    radii = np.clip(CLOSING * distance[:, 0], radius, SPARSE * radius).astype(np.float32)
+    return replace(
+        still,
+        centres=np.concatenate([still.centres, moving.xyz]),
+        normals=np.concatenate([still.normals, moving.normal]),
+        radii=np.concatenate([still.radii, radii]),
+        spans=np.concatenate([still.spans, moving.time[:, None] + (-MOMENT, MOMENT)]),
+    )
 
 
 def _of_class(cloud: PointCloud, codes: tuple[int, ...]) -> npt.NDArray[np.bool_]:
@@ -204,8 +237,9 @@ def depth_map(
             cast[..., :3] += begin @ T_world_cam[:3, :3].T
         met = hides.casting.cast_rays(cast)["t_hit"].numpy()
         depth = np.where(np.isfinite(rays[..., 0]), met, np.inf).astype(np.float32)
-    since = np.full(len(hides.centres), np.nan) if time is None else time - hides.times
-    there = np.isnan(since) | ((since > PRESENT[0]) & (since < PRESENT[1]))
+    there = np.ones(len(hides.centres), bool)
+    if time is not None:
+        there = np.isnan(hides.spans[:, 0]) | ((time > hides.spans[:, 0]) & (time < hides.spans[:, 1]))
     if there.any():
         T_cam_world: F64 = np.linalg.inv(T_world_cam).astype(np.float64)
         centres, normals, radii = hides.centres[there], hides.normals[there], hides.radii[there]

@@ -39,7 +39,8 @@ class SegmentParams(Params):
 def segment(inputs: Inputs, params: SegmentParams, out: Path, report: Report) -> Done:
     """Keep the classes of `cloud`, or tell them from `labels` (of the step `label`, for `views`) and shape.
 
-    Inputs: `cloud`; `views` and `labels`; `path`, the scanner's, where it is known.
+    Inputs: `cloud`; `views` and `labels`; `path`, the scanner's, where it is known; `moving`, of `carve`: it hides what
+    is behind it in photos.
     Files: `cloud`; `confidence`, .npz with `confidence` (N,) uint8, 255 sure, and `source` (N,) uint8
     (`PHOTO`, `SHAPE` or `OWN`).
     """
@@ -101,7 +102,7 @@ def tell(cloud: PointCloud, inputs: Inputs, params: SegmentParams, report: Repor
     from scan2sim.pipeline.io import views as views_io
     from scan2sim.pipeline.normals import oriented_normals
     from scan2sim.pipeline.steps.voxel import sample, voxel_groups
-    from scan2sim.pipeline.types import Trajectory
+    from scan2sim.pipeline.types import PointCloud, Trajectory
     from scan2sim.segmentation.geometric import classify
 
     n = len(cloud)
@@ -119,12 +120,19 @@ def tell(cloud: PointCloud, inputs: Inputs, params: SegmentParams, report: Repor
     thin = oriented_normals(thin, 12, Trajectory.load(inputs["path"]) if "path" in inputs else None)
     report(0.25, "shape")
     shape = classify(thin, lambda f, m="": report(0.25 + 0.25 * f, m), voxel=params.voxel)
-    code, sure, seen, told = _from_photos(thin, shape, views, inputs["labels"], params, report)
+    moving = PointCloud.load(inputs["moving"]) if "moving" in inputs else None
+    code, sure, seen, told = _from_photos(thin, shape, views, inputs["labels"], moving, params, report)
     return code[voxel], sure[voxel], np.where(seen, PHOTO, SHAPE).astype(np.uint8)[voxel], told
 
 
 def _from_photos(
-    thin: PointCloud, shape: U8, views: Any, labels: Path, params: SegmentParams, report: Report
+    thin: PointCloud,
+    shape: U8,
+    views: Any,
+    labels: Path,
+    driven: PointCloud | None,
+    params: SegmentParams,
+    report: Report,
 ) -> tuple[U8, U8, U8, dict[str, Any]]:
     """LAS codes, confidence and whether a photo sees it, by voxel; and facts."""
     import json
@@ -137,7 +145,10 @@ def _from_photos(
     from scan2sim.segmentation.smooth import decide
     from scan2sim.segmentation.votes import vote
 
-    votes = vote(thin, views, labels, radius=0.8 * params.size, report=lambda f, m="": report(0.5 + 0.3 * f, m))
+    votes = vote(
+        thin, views, labels, radius=0.8 * params.size, moving=driven,
+        report=lambda f, m="": report(0.5 + 0.3 * f, m),
+    )  # fmt: skip
     report(0.8, "smoothing")
     tells = json.loads((labels / "network.json").read_text(encoding="utf-8"))["tells"]
     height, ground = split_ground(thin.xyz)
@@ -149,4 +160,4 @@ def _from_photos(
     return code_of_index()[best], np.round(255 * sure).astype(np.uint8), seen.astype(np.uint8), told
 
 
-SEGMENT = Step("segment", 5, segment, SegmentParams)
+SEGMENT = Step("segment", 6, segment, SegmentParams)

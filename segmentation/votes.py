@@ -44,7 +44,15 @@ class Votes:
     sky: float
 
 
-def vote(cloud: PointCloud, views: Sequence[View], labels: Path, *, radius: float, report: Report = silent) -> Votes:
+def vote(
+    cloud: PointCloud,
+    views: Sequence[View],
+    labels: Path,
+    *,
+    radius: float,
+    moving: PointCloud | None = None,
+    report: Report = silent,
+) -> Votes:
     """Ask all photos that have been labelled.
 
     Args:
@@ -52,9 +60,10 @@ def vote(cloud: PointCloud, views: Sequence[View], labels: Path, *, radius: floa
         views: all, by index; those without a file are not asked.
         labels: folder of `<view index>.npy`, (h, w, C) uint8.
         radius: metres, of the discs that points hide by: about the voxel's size.
+        moving: what the step `carve` found moving: it hides, too, while it is there.
         report: progress.
     """
-    hides = scene([], cloud, radius=radius)
+    hides = scene([], cloud, radius=radius, moving=moving)
     score = np.zeros((len(cloud), len(CLASSES)), np.float32)
     weight = np.zeros(len(cloud), np.float32)
     assert cloud.normal is not None

@@ -25,7 +25,7 @@ class VisibilityParams(Params):
 
 
 def visibility(inputs: Inputs, params: VisibilityParams, out: Path, report: Report) -> Done:
-    """Draw a depth map of the meshes `mesh.*` and clouds `cloud.*` for every view of `views`.
+    """Draw a depth map of the meshes `mesh.*`, the clouds `cloud.*` and what is `moving` for every view of `views`.
 
     The maps are `depth/<view index>.npy`: (H, W) float32, metres along the pixel's ray.
     """
@@ -42,7 +42,8 @@ def visibility(inputs: Inputs, params: VisibilityParams, out: Path, report: Repo
         return Done({"depth": folder}, {"views": 0})
     meshes = [Mesh.load(path) for name, path in inputs.items() if name.startswith("mesh.")]
     cloud = PointCloud.join([PointCloud.load(path) for name, path in inputs.items() if name.startswith("cloud.")])
-    hides = kernel.scene(meshes, cloud, radius=params.radius, lacking=params.lacking)
+    moving = PointCloud.load(inputs["moving"]) if "moving" in inputs else None
+    hides = kernel.scene(meshes, cloud, radius=params.radius, lacking=params.lacking, moving=moving)
     for i, view in enumerate(views):
         report(i / len(views), view.name)
         depth = kernel.depth_map(view.camera, view.T_world_cam, hides, time=view.time, pixels=params.pixels)
@@ -50,4 +51,4 @@ def visibility(inputs: Inputs, params: VisibilityParams, out: Path, report: Repo
     return Done({"depth": folder}, {"views": len(views), "triangles": hides.triangles, "discs": len(hides.centres)})
 
 
-VISIBILITY = Step("visibility", 2, visibility, VisibilityParams)
+VISIBILITY = Step("visibility", 3, visibility, VisibilityParams)

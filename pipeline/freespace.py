@@ -1,0 +1,209 @@
+"""Free space: where a scanner's rays have passed, and where therefore nothing stands.
+
+Every return proves that its ray was empty up to it. Space is cut into voxels, time into windows about as long as a
+turn of a spinning scanner. In a window a voxel is *hit* where a return lies in it or beside it, else it is *passed*
+where so many rays went through it that they would have met a thing of its size. A place is free if it and all its
+neighbours were passed in several windows, and it was seldom hit. What no ray has been behind is never free: roads and
+walls stay however flatly they are seen, and whatever a pose is off by less than a voxel. Thin and see-through things
+stay as they are hit again and again. Rays are followed exactly, each from where the scanner was at its moment, so any
+scanner will do that sees a place more than once: one that spins in every turn, a profile scanner in every pass.
+
+After DUFOMap (Duberg et al., "DUFOMap: Efficient Dynamic Awareness Mapping", RA-L 2024), with votes over windows in
+place of its single sight. Import this module late: it loads numba.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit, prange
+
+from scan2sim.pipeline.types import F32, F64
+
+BLOCK = 32.0
+"""Metres: space is worked on in square blocks of this side, one a thread, which bounds memory."""
+RAYS = 2
+"""Rays through a voxel in one window that make a pass: farther apart, they miss what is narrower than it."""
+HALO = 2
+"""Voxels around a block: its own voxels' neighbours, and theirs."""
+
+
+def in_free_space(
+    xyz: F32,
+    origins: F32,
+    windows: npt.NDArray[np.int64],
+    *,
+    voxel: float,
+    reach: float,
+    votes: int,
+    low: float = -np.inf,
+    high: float = np.inf,
+) -> npt.NDArray[np.bool_]:
+    """(N,) which points lie where other rays have found nothing.
+
+    Args:
+        xyz: (N, 3) local metres, in order of time.
+        origins: (N, 3) where the scanner was when it measured each; NaN where that isn't known.
+        windows: (N,) number of each point's window of time, ascending.
+        voxel: metres; poses must be better than this.
+        reach: metres from the scanner up to which rays count.
+        votes: windows that must have passed a place.
+        low, high: heights (local z, metres) between which points are asked about.
+    """
+    starts = np.append(np.flatnonzero(np.diff(windows, prepend=windows[:1] - 1)), len(xyz))
+    asked = (xyz[:, 2] > low) & (xyz[:, 2] < high)
+    path = origins[np.isfinite(origins[:, 0])]
+    if not len(path):
+        return np.zeros(len(xyz), bool)
+    corner, far = path.min(axis=0) - reach, path.max(axis=0) + reach
+    asked &= ((xyz > corner) & (xyz < far)).all(axis=1)
+    if not asked.any():
+        return asked
+    boxes = _boxes(xyz[asked])
+    return _in_free_space(xyz, origins, asked, starts, boxes, voxel, reach, votes)
+
+
+def _boxes(xyz: F32) -> F64:
+    """(B, 6) least and greatest corner of the blocks that hold points (N, 3)."""
+    low, high = xyz.min(axis=0).astype(np.float64), xyz.max(axis=0).astype(np.float64) + 1e-3
+    column = np.floor((xyz[:, :2] - low[:2]) / BLOCK).astype(np.int64)
+    found = np.unique(column[:, 0] << 32 | column[:, 1])
+    corner = low[:2] + BLOCK * np.column_stack([found >> 32, found & 0xFFFFFFFF])
+    return np.column_stack(
+        [corner, np.full(len(found), low[2]), np.minimum(corner + BLOCK, high[:2]), np.full(len(found), high[2])]
+    )
+
+
+@njit(cache=True, parallel=True)
+def _in_free_space(xyz, origins, asked, starts, boxes, voxel, reach, votes):  # type: ignore[no-untyped-def]
+    spans = np.empty((len(starts) - 1, 6), np.float64)
+    for w in prange(len(spans)):
+        spans[w] = _span(xyz, origins, starts[w], starts[w + 1])
+    out = np.zeros(len(xyz), np.bool_)
+    for b in prange(len(boxes)):
+        _carve(xyz, origins, asked, starts, spans, boxes[b], voxel, reach, votes, out)
+    return out
+
+
+@njit(cache=True)
+def _span(xyz, origins, first, end):  # type: ignore[no-untyped-def]
+    """Least and greatest corner of the box of a window's rays."""
+    span = np.array([np.inf, np.inf, np.inf, -np.inf, -np.inf, -np.inf])
+    for i in range(first, end):
+        if not math.isnan(origins[i, 0]):
+            for k in range(3):
+                span[k] = min(span[k], xyz[i, k], origins[i, k])
+                span[k + 3] = max(span[k + 3], xyz[i, k], origins[i, k])
+    return span
+
+
+@njit(cache=True)
+def _carve(xyz, origins, asked, starts, spans, box, voxel, reach, votes, out):  # type: ignore[no-untyped-def]
+    """Say in `out` which of the points that are asked about, and lie in the box, are in free space."""
+    corner = box[:3] - HALO * voxel
+    shape = np.empty(3, np.int64)
+    for k in range(3):
+        shape[k] = int(math.ceil((box[k + 3] - corner[k]) / voxel)) + HALO
+    far = corner + shape * voxel
+    size = shape[0] * shape[1] * shape[2]
+    passes, hits = np.zeros(size, np.uint16), np.zeros(size, np.uint16)
+    hit_in, passed_in = np.full(size, -1, np.int32), np.full(size, -1, np.int32)  # the last window that did
+    rays = np.zeros(size, np.uint8)  # through the voxel, in that window
+    for w in range(len(spans)):
+        s = spans[w]
+        if s[0] > far[0] or s[1] > far[1] or s[2] > far[2] or s[3] < corner[0] or s[4] < corner[1] or s[5] < corner[2]:
+            continue
+        for i in range(starts[w], starts[w + 1]):
+            _hit(xyz[i], corner, far, shape, voxel, w, hit_in, hits)
+        for i in range(starts[w], starts[w + 1]):
+            _pass(xyz[i], origins[i], corner, far, shape, voxel, reach, w, hit_in, passed_in, rays, passes)
+    for i in range(len(xyz)):
+        p = xyz[i]
+        if not asked[i] or p[0] < box[0] or p[1] < box[1] or p[2] < box[2]:
+            continue
+        if p[0] >= box[3] or p[1] >= box[4] or p[2] >= box[5]:
+            continue
+        x, y, z = int((p[0] - corner[0]) / voxel), int((p[1] - corner[1]) / voxel), int((p[2] - corner[2]) / voxel)
+        at = (x * shape[1] + y) * shape[2] + z
+        if hits[at] <= passes[at]:
+            out[i] = _least(passes, x, y, z, shape) >= votes
+
+
+@njit(cache=True)
+def _least(values, x, y, z, shape):  # type: ignore[no-untyped-def]
+    """The least value of a voxel and its 26 neighbours."""
+    least = values[(x * shape[1] + y) * shape[2] + z]
+    for jx in range(x - 1, x + 2):
+        for jy in range(y - 1, y + 2):
+            for jz in range(z - 1, z + 2):
+                least = min(least, values[(jx * shape[1] + jy) * shape[2] + jz])
+    return least
+
+
+@njit(cache=True)
+def _hit(p, corner, far, shape, voxel, window, hit_in, hits):  # type: ignore[no-untyped-def]
+    """Mark the voxel of a return and its neighbours."""
+    for k in range(3):
+        if p[k] < corner[k] or p[k] >= far[k]:
+            return
+    x, y, z = int((p[0] - corner[0]) / voxel), int((p[1] - corner[1]) / voxel), int((p[2] - corner[2]) / voxel)
+    for jx in range(max(x - 1, 0), min(x + 2, shape[0])):
+        for jy in range(max(y - 1, 0), min(y + 2, shape[1])):
+            for jz in range(max(z - 1, 0), min(z + 2, shape[2])):
+                at = (jx * shape[1] + jy) * shape[2] + jz
+                if hit_in[at] != window:
+                    hit_in[at] = window
+                    hits[at] += 1
+
+
+@njit(cache=True)
+def _pass(p, o, corner, far, shape, voxel, reach, window, hit_in, passed_in, rays, passes):  # type: ignore[no-untyped-def]
+    """Walk along a ray from voxel to voxel (Amanatides and Woo, 1987), up to the last before its return."""
+    dx, dy, dz = float(p[0] - o[0]), float(p[1] - o[1]), float(p[2] - o[2])
+    r = math.sqrt(dx * dx + dy * dy + dz * dz)
+    begin, end = 0.0, min(r - voxel, reach)
+    if not end > voxel:  # nor where the origin isn't known
+        return
+    direction = (dx / r, dy / r, dz / r)
+    for k in range(3):  # what of it lies in the block
+        d = direction[k]
+        if abs(d) < 1e-9:
+            if o[k] < corner[k] or o[k] >= far[k]:
+                return
+        else:
+            a, b = (corner[k] - o[k]) / d, (far[k] - o[k]) / d
+            begin, end = max(begin, min(a, b)), min(end, max(a, b))
+    begin += 1e-4
+    if begin >= end:
+        return
+    x, y, z = (
+        (o[0] + begin * direction[0] - corner[0]) / voxel,
+        (o[1] + begin * direction[1] - corner[1]) / voxel,
+        (o[2] + begin * direction[2] - corner[2]) / voxel,
+    )
+    ix, iy, iz = int(x), int(y), int(z)
+    step_x, step_y, step_z = (1 if dx > 0 else -1), (1 if dy > 0 else -1), (1 if dz > 0 else -1)
+    each_x = voxel / max(abs(direction[0]), 1e-9)
+    each_y = voxel / max(abs(direction[1]), 1e-9)
+    each_z = voxel / max(abs(direction[2]), 1e-9)
+    next_x = begin + ((ix + 1 - x) if dx > 0 else (x - ix)) * each_x
+    next_y = begin + ((iy + 1 - y) if dy > 0 else (y - iy)) * each_y
+    next_z = begin + ((iz + 1 - z) if dz > 0 else (z - iz)) * each_z
+    along = begin
+    while along < end and 0 <= ix < shape[0] and 0 <= iy < shape[1] and 0 <= iz < shape[2]:
+        at = (ix * shape[1] + iy) * shape[2] + iz
+        if hit_in[at] != window:
+            if passed_in[at] != window:
+                passed_in[at], rays[at] = window, 0
+            if rays[at] < RAYS:
+                rays[at] += 1
+                if rays[at] == RAYS:
+                    passes[at] += 1
+        if next_x < next_y and next_x < next_z:
+            along, next_x, ix = next_x, next_x + each_x, ix + step_x
+        elif next_y < next_z:
+            along, next_y, iy = next_y, next_y + each_y, iy + step_y
+        else:
+            along, next_z, iz = next_z, next_z + each_z, iz + step_z
