@@ -16,6 +16,7 @@ from scan2sim.pipeline.steps.clip import CLIP
 from scan2sim.pipeline.steps.collision import COLLISION
 from scan2sim.pipeline.steps.decimate import DECIMATE
 from scan2sim.pipeline.steps.export import EXPORT
+from scan2sim.pipeline.steps.furniture import FURNITURE
 from scan2sim.pipeline.steps.geometry import GEOMETRY
 from scan2sim.pipeline.steps.ground import GROUND
 from scan2sim.pipeline.steps.ingest import INGEST
@@ -48,9 +49,9 @@ from scan2sim.texturing.texture import TEXTURE
 from scan2sim.texturing.unwrap import UNWRAP
 
 STEPS: tuple[Step, ...] = (
-    INGEST, PATH, CARVE, VIEWS, LABEL, SEGMENT, REACH, OVERLAP, SPLIT, VOXEL, GROUND, WALLS, POISSON, TRIM, ISLANDS,
-    CLIP, JOIN, DECIMATE, PLANTS, UNWRAP, VISIBILITY, EXPOSURE, AGREEMENT, CHOOSE, TEXTURE, LEVEL, COLLISION, EXPORT,
-    RASTERS, GEOMETRY, SCORE, PICTURES, PREVIEW, BORDERS,
+    INGEST, PATH, CARVE, VIEWS, LABEL, SEGMENT, REACH, OVERLAP, FURNITURE, SPLIT, VOXEL, GROUND, WALLS, POISSON, TRIM,
+    ISLANDS, CLIP, JOIN, DECIMATE, PLANTS, UNWRAP, VISIBILITY, EXPOSURE, AGREEMENT, CHOOSE, TEXTURE, LEVEL, COLLISION,
+    EXPORT, RASTERS, GEOMETRY, SCORE, PICTURES, PREVIEW, BORDERS,
 )  # fmt: skip
 PER_CLASS: tuple[Step, ...] = (VOXEL, POISSON, TRIM, ISLANDS, CLIP, JOIN, DECIMATE, CHOOSE, UNWRAP, TEXTURE, LEVEL)
 
@@ -137,7 +138,11 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
         others = {f"cloud.{name}": at(last, "cloud", name) for name in met}
         add(OVERLAP, {"cloud": cloud} | others, name=tile.name, buffer=tile.cell.buffer, **cell)
         cloud = at("overlap", "cloud")
-    add(SPLIT, {"cloud": cloud})
+    standing: dict[str, Path | Output] = {}
+    if path and settings.params(FURNITURE).when == "auto":
+        add(FURNITURE, {"cloud": cloud} | scanner, **cell)
+        standing = {name: at("furniture", name) for name in ("taken", "building", "vegetation", "geojson", "csv")}
+    add(SPLIT, {"cloud": cloud} | {name: standing[name] for name in standing if name == "taken"})
 
     vegetation = settings.params(SPLIT).vegetation
     groups = [g for g in GROUPS if g != "vegetation" or vegetation != "locations"]
@@ -174,14 +179,18 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
             others = {f"{k}.{name}": at(f"clip.{group}", k, name) for name in first for k in clipped}
             add(JOIN, clipped | others, group, name=tile.name, **cell)
             surface = at(f"join.{group}", "mesh")
-        add(DECIMATE, {"mesh": surface}, group, keep_border=bool(cell))
+        things = {"furniture": standing[group]} if group in standing else {}
+        add(DECIMATE, {"mesh": surface, **things}, group, keep_border=bool(cell))
     meshes = {f"mesh.{g}": at(f"decimate.{g}", "mesh") for g in groups}
     clouds = {f"cloud.{part}": at(f"voxel.{part}", "cloud") for part in (*GROUPS, "rest")}
+    own = {"cloud.furniture": at("split", "furniture")} if standing else {}
     invented = {f"made.{group}": points["made"] for group, points in made.items()}
-    plants: dict[str, Path | Output] = {}
+    lists: dict[str, Path | Output] = {}
+    if standing:
+        lists = {"furniture": standing["geojson"], "furniture_csv": standing["csv"]}
     if vegetation != "mesh":
         add(PLANTS, {name: at(f"voxel.{name}", "cloud") for name in ("vegetation", "terrain")}, **cell)
-        plants = {"plants": at("plants", "geojson"), "plants_csv": at("plants", "csv")}
+        lists |= {"plants": at("plants", "geojson"), "plants_csv": at("plants", "csv")}
 
     add(VISIBILITY, meshes | clouds | moving | seen)
     seen = seen | {"depth": at("visibility", "depth")}
@@ -197,14 +206,14 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
         by_photo = {**choice, **seen} if settings.params(UNWRAP, group).backend == "photo" else {}
         add(UNWRAP, mesh | by_photo, group)
         unwrapped = {name: at(f"unwrap.{group}", name) for name in ("mesh", "pages")}
-        add(TEXTURE, {**unwrapped, **choice, **clouds, **invented, **seen}, group)
+        add(TEXTURE, {**unwrapped, **choice, **clouds, **own, **invented, **seen}, group)
     textured: dict[str, Path | Output] = {g: at(f"texture.{g}", "textured") for g in groups}
     for group in groups if met else ():
         others = {f"neighbour.{name}": at(f"texture.{group}", "textured", name) for name in met}
         add(LEVEL, {"textured": textured[group]} | others, group)
         textured[group] = at(f"level.{group}", "textured")
     add(COLLISION, {g: at(f"decimate.{g}", "mesh") for g in groups}, keep_border=bool(cell))
-    add(EXPORT, textured | plants | {"collision": at("collision", "mesh")}, name=tile.name)
+    add(EXPORT, textured | lists | {"collision": at("collision", "mesh")}, name=tile.name)
     if settings.params(EXPORT).rasters:
         add(RASTERS, textured, name=tile.name, **_fineness(settings))
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pydantic import Field
 
+from scan2sim.pipeline.classes import GROUPS
 from scan2sim.pipeline.errors import DataError, StepError
 from scan2sim.pipeline.ranges import Seed
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
@@ -39,23 +41,28 @@ def collision(inputs: Inputs, params: CollisionParams, out: Path, report: Report
 
     They are simplified together, so the budget goes where the error would be greatest. Borders are
     kept where the budget allows it (or always, with `keep_border`); if not, a warning says so.
+    Street furniture (faces with a class) stays as it is, trunks too; where it would take more than half the budget, it
+    is simplified with the rest.
 
     Raises:
         DataError: no mesh has a face.
         StepError: the budget can't be met; with `keep_border`, the borders alone need over 200,000 triangles.
     """
-    from scan2sim.pipeline.steps.decimate import simplify
+    from scan2sim.pipeline.steps.decimate import simplify, with_things
 
     groups = ("terrain", "building", "vegetation") if params.vegetation else ("terrain", "building")
-    source = _joined(inputs, groups)
-    report(0.1, f"{len(source):,} triangles")
-    small, warnings = simplify(source, params.triangles), []
-    border_kept = len(small) <= params.triangles or params.keep_border
-    if len(small) > params.triangles and params.keep_border:
+    whole = _joined(inputs, groups)
+    source, things = _parted(whole, params.triangles)
+    report(0.1, f"{len(whole):,} triangles")
+    budget = params.triangles - len(things)
+    small, warnings = simplify(source, budget), []
+    border_kept = len(small) <= budget or params.keep_border
+    if len(small) > budget and params.keep_border:
         warnings.append(f"collision: the borders alone need {len(small):,} triangles, kept since other tiles join them")
     elif not border_kept:
         warnings.append(f"collision: the borders alone need {len(small):,} triangles, so they were thinned too")
-        small = simplify(small, params.triangles, preserve_border=False)
+        small = simplify(small, budget, preserve_border=False)
+    small = replace(with_things(small, things), label=None) if len(things) else small
     allowed = MOST if params.keep_border else params.triangles
     if len(small) > allowed:
         raise StepError(
@@ -64,10 +71,10 @@ def collision(inputs: Inputs, params: CollisionParams, out: Path, report: Report
             "Raise collision.triangles, or remove small islands",
         )
     report(0.7, "deviation")
-    deviation = _deviation(source, small, params.seed)
+    deviation = _deviation(whole, small, params.seed)
     small.save(out / "collision.npz")
     facts = {
-        "triangles_in": len(source),
+        "triangles_in": len(whole),
         "triangles": len(small),
         "border_kept": border_kept,
         "deviation_m": deviation,
@@ -81,7 +88,9 @@ def _joined(inputs: Inputs, groups: tuple[str, ...]) -> Mesh:
 
     from scan2sim.pipeline.types import Mesh
 
-    meshes = [mesh for group in groups if group in inputs and len(mesh := Mesh.load(inputs[group]))]
+    read = {group: Mesh.load(inputs[group]) for group in GROUPS if group in inputs}
+    parts = [mesh if group in groups else _parted(mesh, MOST)[1] for group, mesh in read.items()]
+    meshes = [mesh for mesh in parts if len(mesh)]
     if not meshes:
         raise DataError(
             "collision",
@@ -93,7 +102,18 @@ def _joined(inputs: Inputs, groups: tuple[str, ...]) -> Mesh:
         meshes[0].frame,
         np.concatenate([mesh.vertices for mesh in meshes]),
         np.concatenate([mesh.faces + start for mesh, start in zip(meshes, first[:-1], strict=True)]).astype(np.int32),
+        label=np.concatenate([np.zeros(len(m), np.uint8) if m.label is None else m.label for m in meshes]),
     )
+
+
+def _parted(mesh: Mesh, budget: int) -> tuple[Mesh, Mesh]:
+    """The surface, and the street furniture that stays as it is: none where it would take over half the budget."""
+    import numpy as np
+
+    own = np.zeros(len(mesh), bool) if mesh.label is None else mesh.label > 0
+    if own.sum() > budget / 2:
+        own[:] = False
+    return mesh.keep(~own), mesh.keep(own)
 
 
 def _deviation(source: Mesh, small: Mesh, seed: int) -> dict[str, float]:
@@ -119,4 +139,4 @@ def _deviation(source: Mesh, small: Mesh, seed: int) -> dict[str, float]:
     }
 
 
-COLLISION = Step("collision", 1, collision, CollisionParams)
+COLLISION = Step("collision", 2, collision, CollisionParams)

@@ -28,22 +28,44 @@ class DecimateParams(Params):
 def decimate(inputs: Inputs, params: DecimateParams, out: Path, report: Report) -> Done:
     """Collapse edges of `mesh` down to the target, borders kept (tiles and classes meet there).
 
+    What `furniture` (optional) holds is added as it is, within the target; its faces keep their classes, all others
+    have the class 0 then.
+
     Where the border alone is more than the target allows, the border is thinned as well (but for `keep_border`),
     and a warning says so.
     """
     from scan2sim.pipeline.types import Mesh
 
     mesh = Mesh.load(inputs["mesh"])
-    small, warnings = simplify(mesh, params.target), []
+    things = Mesh.load(inputs["furniture"]) if "furniture" in inputs else None
+    target = params.target - len(things or ())
+    small, warnings = simplify(mesh, target), []
     border_kept = True
-    if len(small) > params.target * 1.05 and params.keep_border:
+    if len(small) > target * 1.05 and params.keep_border:
         warnings.append(f"the border alone needs {len(small):,} triangles, {params.target:,} were asked for: kept")
-    elif len(small) > params.target * 1.05:
+    elif len(small) > target * 1.05:
         warnings.append(f"the border alone needs {len(small):,} triangles: thinned too, to {params.target:,}")
-        small, border_kept = simplify(small, params.target, preserve_border=False), False
+        small, border_kept = simplify(small, target, preserve_border=False), False
+    if things is not None and len(things):
+        small = with_things(small, things)
     small.save(out / "mesh.npz")
     facts = {"faces_in": len(mesh), "faces": len(small), "target": params.target, "border_kept": border_kept}
     return Done({"mesh": out / "mesh.npz"}, facts, warnings)
+
+
+def with_things(mesh: Mesh, things: Mesh) -> Mesh:
+    """Both as one, the faces of `things` with their classes."""
+    import numpy as np
+
+    from scan2sim.pipeline.types import Mesh
+
+    assert things.label is not None
+    return Mesh(
+        mesh.frame,
+        np.concatenate([mesh.vertices, things.vertices]),
+        np.concatenate([mesh.faces, things.faces + len(mesh.vertices)]).astype(np.int32),
+        label=np.concatenate([np.zeros(len(mesh), np.uint8), things.label]),
+    )
 
 
 def simplify(mesh: Mesh, target: int, *, preserve_border: bool = True) -> Mesh:
@@ -62,4 +84,4 @@ def simplify(mesh: Mesh, target: int, *, preserve_border: bool = True) -> Mesh:
     return Mesh(mesh.frame, vertices.astype(np.float32), faces.astype(np.int32)).keep(np.ones(len(faces), bool))
 
 
-DECIMATE = Step("decimate", 1, decimate, DecimateParams, {"vegetation": {"target": 300_000}})
+DECIMATE = Step("decimate", 2, decimate, DecimateParams, {"vegetation": {"target": 300_000}})

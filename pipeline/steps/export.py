@@ -17,7 +17,10 @@ if TYPE_CHECKING:
     from scan2sim.pipeline.io.textured import Textured
     from scan2sim.pipeline.types import Frame
 
-PLANT_LISTS = {"plants": "plants.geojson", "plants_csv": "plants.csv"}  # input to file in the world's folder
+LISTS = {
+    "plants": "plants.geojson", "plants_csv": "plants.csv",
+    "furniture": "furniture.geojson", "furniture_csv": "furniture.csv",
+}  # fmt: skip  # input to file in the world's folder
 
 
 def _pixel(size: bool | float) -> bool | float:
@@ -63,7 +66,7 @@ def export(inputs: Inputs, params: ExportParams, out: Path, report: Report) -> D
 
     Layout below `world/`: `<name>.sdf`, `<name>.glb`, `metadata.json`, and `models/<name>/` with
     `model.sdf`, `model.config` and `meshes/` (OBJ, MTL, Collada, one PNG or JPEG for every texture page, and
-    `collision.obj`). Where a list of `plants` and `plants_csv` is given, it is put beside the world.
+    `collision.obj`). Lists (`plants`, `furniture`, and these as `_csv`) that are given are put beside the world.
     OBJ and Collada are z-up in the tile's local metres; the tile's place is in the
     world's pose and `spherical_coordinates` and in `metadata.json` alone.
 
@@ -101,7 +104,7 @@ def export(inputs: Inputs, params: ExportParams, out: Path, report: Report) -> D
         visuals |= {f"meshes/{file}": group for file in written if file.endswith(suffix)}
     obj.write_plain(meshes / "collision.obj", solid)
     counts["collision.obj"] = len(solid)
-    for key, file in PLANT_LISTS.items():
+    for key, file in LISTS.items():
         if key in inputs:
             shutil.copyfile(inputs[key], world / file)
     if params.gazebo:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -46,6 +45,7 @@ def plants(inputs: Inputs, params: PlantsParams, out: Path, report: Report) -> D
     import numpy as np
 
     from scan2sim.pipeline.cells import Cell
+    from scan2sim.pipeline.io import geojson
     from scan2sim.pipeline.types import PointCloud
 
     cloud, ground = PointCloud.load(inputs["vegetation"]), PointCloud.load(inputs["terrain"])
@@ -61,16 +61,8 @@ def plants(inputs: Inputs, params: PlantsParams, out: Path, report: Report) -> D
     heading = "x,y,z,height_m,crown_radius_m"
     text = "\n".join([heading, *(",".join(str(value) for value in row.values()) for row in rows)])
     (out / "plants.csv").write_text(text + "\n", encoding="utf-8")
-    features = [
-        {
-            "type": "Feature",
-            "geometry": {"type": "Point", "coordinates": [row["x"], row["y"], row["z"]]},
-            "properties": {"height_m": row["height_m"], "crown_radius_m": row["crown_radius_m"]},
-        }
-        for row in rows
-    ]
-    body = {"type": "FeatureCollection", "crs": _geojson_crs(cloud.frame.crs), "features": features}
-    (out / "plants.geojson").write_text(json.dumps({k: v for k, v in body.items() if v}, indent=1), encoding="utf-8")
+    features = [((row["x"], row["y"], row["z"]), {k: row[k] for k in ("height_m", "crown_radius_m")}) for row in rows]
+    geojson.write_points(out / "plants.geojson", cloud.frame.crs, features)
     return Done(
         {"geojson": out / "plants.geojson", "csv": out / "plants.csv"}, {"points": len(cloud), "plants": len(rows)}
     )
@@ -112,16 +104,6 @@ def crowns(xyz: F32, ground: F32, params: PlantsParams) -> npt.NDArray[np.float6
     tall = ndimage.maximum(height, crown, plant)
     area = np.bincount(crown[crown > 0], minlength=count + 1)[1 : count + 1] * CELL**2
     return np.column_stack([(middle + 0.5) * CELL + low, base[row, column], tall, np.sqrt(area / np.pi)])
-
-
-def _geojson_crs(crs: str) -> dict[str, object] | None:
-    """The (pre-RFC 7946) member by which GIS programs know a GeoJSON file's CRS."""
-    if crs == "local":
-        return None
-    from pyproj import CRS
-
-    code = CRS.from_user_input(crs).to_epsg()
-    return {"type": "name", "properties": {"name": f"urn:ogc:def:crs:EPSG::{code}"}} if code else None
 
 
 PLANTS = Step("plants", 2, plants, PlantsParams)

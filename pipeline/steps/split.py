@@ -9,6 +9,8 @@ from scan2sim.pipeline.classes import GROUPS, NOISE, UNKNOWN, group_of, known, n
 from scan2sim.pipeline.errors import DataError
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
+FURNITURE = len(GROUPS) + 1
+"""Of a point, beside the groups' numbers: it is street furniture's."""
 TELL = 0.01
 """Share of points without a class from which on a run warns."""
 
@@ -27,7 +29,8 @@ class SplitParams(Params):
 def split(inputs: Inputs, params: SplitParams, out: Path, report: Report) -> Done:
     """Cut the classified `cloud` into `terrain`, `building`, `vegetation` and `rest`.
 
-    Signs and poles go with buildings; vehicles, people, wires, noise and what has no class are
+    Signs and poles go with buildings, but for the points that `taken` (optional, `index` of an .npz) says are street
+    furniture's: they become `furniture`; vehicles, people, wires, noise and what has no class are
     left out of the surface (`rest`), though they still hide what is behind them; noise is dropped.
 
     Raises:
@@ -40,15 +43,19 @@ def split(inputs: Inputs, params: SplitParams, out: Path, report: Report) -> Don
     cloud = PointCloud.load(inputs["cloud"])
     assert cloud.label is not None
     group = group_of()[cloud.label]
+    if "taken" in inputs:
+        with np.load(inputs["taken"]) as taken:
+            group[taken["index"]] = FURNITURE
     files, counts, warnings = {}, {}, []
-    for i, name in enumerate((*GROUPS, "rest")):
-        report(i / 4, name)
-        chosen = group == i if name != "rest" else (group == -1) & ~np.isin(cloud.label, NOISE)
+    parts = (*GROUPS, "rest", "furniture") if "taken" in inputs else (*GROUPS, "rest")
+    for i, name in enumerate(parts):
+        report(i / len(parts), name)
+        chosen = (group == -1) & ~np.isin(cloud.label, NOISE) if name == "rest" else group == parts.index(name)
         part = cloud.take(np.flatnonzero(chosen))
         part.save(out / f"{name}.npz")
         files[name] = out / f"{name}.npz"
         counts[name] = len(part)
-        if name != "rest" and len(part) == 0:
+        if name in GROUPS and len(part) == 0:
             warnings.append(f"no point is of class {name}: the world will have none")
     if sum(counts[name] for name in GROUPS) == 0:
         raise DataError(
@@ -71,4 +78,4 @@ def split(inputs: Inputs, params: SplitParams, out: Path, report: Report) -> Don
     return Done(files, {"points_in": len(cloud), "points": counts, "classes": classes}, warnings)
 
 
-SPLIT = Step("split", 2, split, SplitParams)
+SPLIT = Step("split", 3, split, SplitParams)
