@@ -1,8 +1,9 @@
 """Agreement: where photos disagree with the rest, and which of them do so as a whole.
 
 Every photo is predicted from those around it (`texturing.predict`). What at least two others agree on and it
-doesn't is a ghost (a moving car, a person, its shadow, a reflection) and masked. A photo that is shifted against
-its prediction has a pose that is off; one less sharp is blurred: told in the report, and left out beyond a limit.
+doesn't is a ghost (a moving car, a person, its shadow, a reflection) and masked, as is sky where a surface should show
+(`texturing.sky`). A photo that is shifted against its prediction has a pose that is off; one less sharp is blurred:
+told in the report, and left out beyond a limit.
 """
 
 from __future__ import annotations
@@ -47,6 +48,8 @@ SHARP = 0.6
 """Sharpness against that of the same camera's photos below which one counts as blurred."""
 FEW = 3
 """Photos of a camera from which its usual sharpness is known."""
+LOOSE = 0.3
+"""Metres by which a surface's outline may be off: three voxels of the mission's."""
 BURNT = 0.6
 """Share of overexposed pixels beyond which a photo is left out."""
 
@@ -56,6 +59,7 @@ class AgreementParams(Params):
 
     Attributes:
         ghosts: mask what the others agree on and a photo doesn't.
+        sky: mask sky that shows beside outlines, and what mixes with it.
         align: shift parts of photos by pixels so that they meet what the others show there.
         neighbours: photos that each is compared with.
         max_shift: pixels (of a photo scaled to 0.45 MP) by which a photo may be shifted against the others;
@@ -64,6 +68,7 @@ class AgreementParams(Params):
     """
 
     ghosts: bool = True
+    sky: bool = True
     align: bool = True
     neighbours: int = Field(8, ge=2, le=16)
     max_shift: float = Field(3.0, ge=0, le=100)
@@ -101,7 +106,7 @@ class Agreement:
         return self.sharp[i]
 
     def mask(self, i: int, view: View) -> U8:
-        """(h, w) uint8, 0 where photo `i` must not be used: its own mask and ghosts; (0, 0) for nowhere."""
+        """(h, w) uint8, 0 where photo `i` must not be used: its own mask, ghosts and sky; (0, 0) for nowhere."""
         import numpy as np
 
         from scan2sim.pipeline.io import image
@@ -121,7 +126,7 @@ def agreement(inputs: Inputs, params: AgreementParams, out: Path, report: Report
     """Compare every photo that is not held out with the others.
 
     Inputs: `views`, `depth` (folder of depth maps), `exposures`.
-    Folder: `agreement`, with `agreement.json` (a row a view) and `mask_<i>.png` where a photo has a mask or ghosts.
+    Folder: `agreement`, with `agreement.json` (a row a view), and `mask_<i>.png` where a photo has some, ghosts or sky.
     """
     import numpy as np
 
@@ -154,7 +159,10 @@ def agreement(inputs: Inputs, params: AgreementParams, out: Path, report: Report
             continue
         compared = compare(i, nearest[i], views, depth, photos, exposures, params)
         rows[i] |= compared.figures
-        mask = combined(compared.ghosts if params.ghosts else None, photo.mask)
+        own = photo.mask
+        if params.sky:
+            own, rows[i]["sky_share"] = without_sky(photo.levels[0], own, depth(i))
+        mask = combined(compared.ghosts if params.ghosts else None, own)
         if mask is not None:
             image.write(folder / f"mask_{i}.png", mask)
         if params.align and compared.warp is not None:
@@ -333,6 +341,20 @@ def ghost_mask(mine: F32, predicted: Prediction, white: npt.NDArray[np.bool_]) -
     return np.asarray(cv2.dilate(ghost.astype(np.uint8), np.ones((7, 7)))) > 0
 
 
+def without_sky(rgb: U8, mask: U8, depth: DepthMap) -> tuple[U8, float]:
+    """A photo's mask, (0, 0) for none, 0 also where it shows sky instead of a surface, and its share."""
+    import numpy as np
+
+    from scan2sim.pipeline.cameras import pixel_angle
+    from scan2sim.texturing.sky import sky
+
+    found = sky(rgb, depth.range, pixel_angle(depth.camera) * depth.camera.width / rgb.shape[1], LOOSE)
+    if found is None:
+        return mask, 0.0
+    allowed = np.where(found, 0, 255).astype(np.uint8)
+    return (np.minimum(allowed, mask) if mask.size else allowed), round(float(found.mean()), 5)
+
+
 def combined(ghosts: npt.NDArray[np.bool_] | None, mask: U8) -> U8 | None:
     """The photo's own mask and its ghosts as one, 0 where it must not be used; None where that is nowhere."""
     import cv2
@@ -381,9 +403,10 @@ def _facts(rows: Sequence[dict[str, Any]], used: Sequence[int]) -> dict[str, Any
         "photos": len(used),
         "left_out": [rows[i]["name"] for i in used if not rows[i]["usable"]],
         "ghost_share": round(sum(ghosts) / len(ghosts), 4) if ghosts else 0.0,
+        "sky_share": round(sum(row.get("sky_share", 0.0) for row in rows) / max(1, len(used)), 5),
         "shift_px": shifts,
         "largest_shift_px": max(shifts.values(), default=0.0),
     }
 
 
-AGREEMENT = Step("agreement", 1, agreement, AgreementParams)
+AGREEMENT = Step("agreement", 2, agreement, AgreementParams)
