@@ -44,14 +44,15 @@ from scan2sim.texturing.borders import BORDERS
 from scan2sim.texturing.choose import CHOOSE
 from scan2sim.texturing.exposure import EXPOSURE
 from scan2sim.texturing.level import LEVEL
+from scan2sim.texturing.refine import REFINE
 from scan2sim.texturing.score import SCORE
 from scan2sim.texturing.texture import TEXTURE
 from scan2sim.texturing.unwrap import UNWRAP
 
 STEPS: tuple[Step, ...] = (
     INGEST, PATH, CARVE, VIEWS, LABEL, SEGMENT, REACH, OVERLAP, FURNITURE, SPLIT, VOXEL, GROUND, WALLS, POISSON, TRIM,
-    ISLANDS, CLIP, JOIN, DECIMATE, PLANTS, UNWRAP, VISIBILITY, EXPOSURE, AGREEMENT, CHOOSE, TEXTURE, LEVEL, COLLISION,
-    EXPORT, RASTERS, GEOMETRY, SCORE, PICTURES, PREVIEW, BORDERS,
+    ISLANDS, CLIP, JOIN, DECIMATE, PLANTS, UNWRAP, REFINE, VISIBILITY, EXPOSURE, AGREEMENT, CHOOSE, TEXTURE, LEVEL,
+    COLLISION, EXPORT, RASTERS, GEOMETRY, SCORE, PICTURES, PREVIEW, BORDERS,
 )  # fmt: skip
 PER_CLASS: tuple[Step, ...] = (VOXEL, POISSON, TRIM, ISLANDS, CLIP, JOIN, DECIMATE, CHOOSE, UNWRAP, TEXTURE, LEVEL)
 
@@ -192,6 +193,9 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
         add(PLANTS, {name: at(f"voxel.{name}", "cloud") for name in ("vegetation", "terrain")}, **cell)
         lists |= {"plants": at("plants", "geojson"), "plants_csv": at("plants", "csv")}
 
+    if photographed and settings.params(REFINE).when == "auto":
+        add(REFINE, meshes | clouds | moving | seen)
+        seen = {"views": at("refine", "views")}
     add(VISIBILITY, meshes | clouds | moving | seen)
     seen = seen | {"depth": at("visibility", "depth")}
     prior = settings.params(EXPOSURE).prior

@@ -45,6 +45,18 @@ def from_json(entry: dict[str, Any]) -> View:
     )
 
 
+def linked(view: View, folder: Path, index: int) -> View:
+    """The view with links in `folder`, for its photo and mask: relative ones, as a file beside them names them."""
+
+    def link(file: Path, where: str) -> Path:
+        (folder / where).mkdir(exist_ok=True)
+        at = folder / where / f"{index:05d}_{file.name}"
+        at.symlink_to(file.resolve())
+        return at.relative_to(folder)
+
+    return replace(view, photo=link(view.photo, "photos"), mask=link(view.mask, "masks") if view.mask else None)
+
+
 def save(path: Path, views: Sequence[View], held_out: Sequence[bool] = ()) -> None:
     """Write views, and which of them are held out of texturing (none by default)."""
     held = list(held_out) or [False] * len(views)

@@ -72,8 +72,7 @@ def views(inputs: Inputs, params: ViewsParams, out: Path, report: Report) -> Don
         elif view.camera.model == "orthographic":
             kept.append(_cut(view, points, out / "photos", i))
         else:
-            photo = _linked(view.photo, out / "photos", i)
-            kept.append(replace(view, photo=photo, mask=mask and _linked(mask, out / "masks", i)))
+            kept.append(views_io.linked(view, out, i))
     if sees_nothing and not kept:
         raise DataError(
             inputs["photo.0"].parent,
@@ -92,14 +91,6 @@ def views(inputs: Inputs, params: ViewsParams, out: Path, report: Report) -> Don
     # links: a moved tile breaks them, which rebuilds this step alone, not what was made from the photos
     facts = {"photos": len(params.poses), "usable": len(kept), "held_out": sum(held)}
     return Done({"views": out / "views.json"}, facts, warnings)
-
-
-def _linked(file: Path, folder: Path, index: int) -> Path:
-    """A link in `folder` to a photo or mask, relative to the folder's own."""
-    folder.mkdir(exist_ok=True)
-    link = folder / f"{index:05d}_{file.name}"
-    link.symlink_to(file.resolve())
-    return link.relative_to(folder.parent)
 
 
 def _cut(view: View, points: F32, folder: Path, index: int) -> View:
