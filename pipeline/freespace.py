@@ -5,8 +5,12 @@ turn of a spinning scanner. In a window a voxel is *hit* where a return lies in 
 where so many rays went through it that they would have met a thing of its size. A place is free if it and all its
 neighbours were passed in several windows, and it was seldom hit. What no ray has been behind is never free: roads and
 walls stay however flatly they are seen, and whatever a pose is off by less than a voxel. Thin and see-through things
-stay as they are hit again and again. Rays are followed exactly, each from where the scanner was at its moment, so any
-scanner will do that sees a place more than once: one that spins in every turn, a profile scanner in every pass.
+stay as they are hit again and again. Each time that the scanner comes by is judged by itself: what it saw through once,
+however often it was hit an hour before, has left. A thing's outermost layer lies beside what no ray has passed (the
+road below, the sky above): it goes with the rest of its thing, where rays passed at least its own voxel.
+
+Rays are followed exactly, each from where the scanner was at its moment, so any scanner will do that sees a place more
+than once: one that spins in every turn, a profile scanner in every pass.
 
 After DUFOMap (Duberg et al., "DUFOMap: Efficient Dynamic Awareness Mapping", RA-L 2024), with votes over windows in
 place of its single sight. Import this module late: it loads numba.
@@ -26,6 +30,12 @@ BLOCK = 32.0
 """Metres: space is worked on in square blocks of this side, one a thread, which bounds memory."""
 RAYS = 2
 """Rays through a voxel in one window that make a pass: farther apart, they miss what is narrower than it."""
+FREE, OPEN = 1, 2
+"""What is said of a point: its voxel is free with all around it; or it alone is, passed twice as often as hit."""
+LAYER = 1.5
+"""Voxels from a point in free space up to which those that are open, of the same window, are of the same thing."""
+PAUSE = 100
+"""Windows without a point, after which the scanner comes by another time."""
 HALO = 2
 """Voxels around a block: its own voxels' neighbours, and theirs."""
 
@@ -48,11 +58,13 @@ def in_free_space(
         origins: (N, 3) where the scanner was when it measured each; NaN where that isn't known.
         windows: (N,) number of each point's window of time, ascending.
         voxel: metres; poses must be better than this.
-        reach: metres from the scanner up to which rays count.
+        reach: metres from the scanner up to which rays count: beyond, what angles are off by may exceed a voxel.
         votes: windows that must have passed a place.
         low, high: heights (local z, metres) between which points are asked about.
     """
-    starts = np.append(np.flatnonzero(np.diff(windows, prepend=windows[:1] - 1)), len(xyz))
+    first = np.flatnonzero(np.diff(windows, prepend=windows[:1] - 1))
+    again = np.append(False, np.diff(windows[first]) > PAUSE)
+    starts = np.append(first, len(xyz))
     asked = (xyz[:, 2] > low) & (xyz[:, 2] < high)
     path = origins[np.isfinite(origins[:, 0])]
     if not len(path):
@@ -62,7 +74,26 @@ def in_free_space(
     if not asked.any():
         return asked
     boxes = _boxes(xyz[asked])
-    return _in_free_space(xyz, origins, asked, starts, boxes, voxel, reach, votes)
+    said = _in_free_space(xyz, origins, asked, starts, again, boxes, voxel, reach, votes)
+    return _with_outer_layer(xyz, windows, said, LAYER * voxel)
+
+
+def _with_outer_layer(
+    xyz: F32, windows: npt.NDArray[np.int64], said: npt.NDArray[np.uint8], reach: float
+) -> npt.NDArray[np.bool_]:
+    """(N,) the points in free space, and those in the open that lie within `reach` of one of the same window."""
+    from scipy.spatial import cKDTree
+
+    free = said == FREE
+    index = np.flatnonzero((said == OPEN) & np.isin(windows, windows[free]))
+    if not len(index):
+        return free
+    apart = 2 * reach  # a fourth axis, on which windows are no neighbours
+    tree = cKDTree(np.column_stack([xyz[free], apart * windows[free]]))
+    places = np.column_stack([xyz[index], apart * windows[index]])
+    distance, _ = tree.query(places, distance_upper_bound=reach, workers=-1)
+    free[index] = np.isfinite(distance)
+    return free
 
 
 def _boxes(xyz: F32) -> F64:
@@ -77,13 +108,13 @@ def _boxes(xyz: F32) -> F64:
 
 
 @njit(cache=True, parallel=True)
-def _in_free_space(xyz, origins, asked, starts, boxes, voxel, reach, votes):  # type: ignore[no-untyped-def]
+def _in_free_space(xyz, origins, asked, starts, again, boxes, voxel, reach, votes):  # type: ignore[no-untyped-def]
     spans = np.empty((len(starts) - 1, 6), np.float64)
     for w in prange(len(spans)):
         spans[w] = _span(xyz, origins, starts[w], starts[w + 1])
-    out = np.zeros(len(xyz), np.bool_)
+    out = np.zeros(len(xyz), np.uint8)
     for b in prange(len(boxes)):
-        _carve(xyz, origins, asked, starts, spans, boxes[b], voxel, reach, votes, out)
+        _carve(xyz, origins, asked, starts, again, spans, boxes[b], voxel, reach, votes, out)
     return out
 
 
@@ -100,8 +131,8 @@ def _span(xyz, origins, first, end):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _carve(xyz, origins, asked, starts, spans, box, voxel, reach, votes, out):  # type: ignore[no-untyped-def]
-    """Say in `out` which of the points that are asked about, and lie in the box, are in free space."""
+def _carve(xyz, origins, asked, starts, again, spans, box, voxel, reach, votes, out):  # type: ignore[no-untyped-def]
+    """Say in `out` which of the points that are asked about, and lie in the box, are `FREE` or `OPEN`."""
     corner = box[:3] - HALO * voxel
     shape = np.empty(3, np.int64)
     for k in range(3):
@@ -109,26 +140,39 @@ def _carve(xyz, origins, asked, starts, spans, box, voxel, reach, votes, out):  
     far = corner + shape * voxel
     size = shape[0] * shape[1] * shape[2]
     passes, hits = np.zeros(size, np.uint16), np.zeros(size, np.uint16)
-    hit_in, passed_in = np.full(size, -1, np.int32), np.full(size, -1, np.int32)  # the last window that did
+    through, inside = np.zeros(size, np.uint16), np.zeros(size, np.uint16)  # passes and hits of the voxel alone
+    hit_in, passed_in, inside_in = np.full(size, -1, np.int32), np.full(size, -1, np.int32), np.full(size, -1, np.int32)
     rays = np.zeros(size, np.uint8)  # through the voxel, in that window
     for w in range(len(spans)):
+        if again[w]:
+            _say(xyz, asked, box, corner, shape, voxel, votes, passes, hits, through, inside, out)
+            for counts in (passes, hits, through, inside):
+                counts[:] = 0
         s = spans[w]
         if s[0] > far[0] or s[1] > far[1] or s[2] > far[2] or s[3] < corner[0] or s[4] < corner[1] or s[5] < corner[2]:
             continue
         for i in range(starts[w], starts[w + 1]):
-            _hit(xyz[i], corner, far, shape, voxel, w, hit_in, hits)
+            _hit(xyz[i], corner, far, shape, voxel, w, hit_in, hits, inside_in, inside)
         for i in range(starts[w], starts[w + 1]):
-            _pass(xyz[i], origins[i], corner, far, shape, voxel, reach, w, hit_in, passed_in, rays, passes)
+            _pass(xyz[i], origins[i], corner, far, shape, voxel, reach, w, hit_in, passed_in, rays, passes, through)
+    _say(xyz, asked, box, corner, shape, voxel, votes, passes, hits, through, inside, out)
+
+
+@njit(cache=True)
+def _say(xyz, asked, box, corner, shape, voxel, votes, passes, hits, through, inside, out):  # type: ignore[no-untyped-def]
+    """What the counts say of each point in the box, kept in `out` if it is more than was said before."""
     for i in range(len(xyz)):
         p = xyz[i]
-        if not asked[i] or p[0] < box[0] or p[1] < box[1] or p[2] < box[2]:
+        if not asked[i] or out[i] == FREE or p[0] < box[0] or p[1] < box[1] or p[2] < box[2]:
             continue
         if p[0] >= box[3] or p[1] >= box[4] or p[2] >= box[5]:
             continue
         x, y, z = int((p[0] - corner[0]) / voxel), int((p[1] - corner[1]) / voxel), int((p[2] - corner[2]) / voxel)
         at = (x * shape[1] + y) * shape[2] + z
-        if hits[at] <= passes[at]:
-            out[i] = _least(passes, x, y, z, shape) >= votes
+        if hits[at] <= passes[at] and _least(passes, x, y, z, shape) >= votes:
+            out[i] = FREE
+        elif through[at] >= votes and 2 * inside[at] <= through[at]:
+            out[i] = OPEN
 
 
 @njit(cache=True)
@@ -143,12 +187,16 @@ def _least(values, x, y, z, shape):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _hit(p, corner, far, shape, voxel, window, hit_in, hits):  # type: ignore[no-untyped-def]
+def _hit(p, corner, far, shape, voxel, window, hit_in, hits, inside_in, inside):  # type: ignore[no-untyped-def]
     """Mark the voxel of a return and its neighbours."""
     for k in range(3):
         if p[k] < corner[k] or p[k] >= far[k]:
             return
     x, y, z = int((p[0] - corner[0]) / voxel), int((p[1] - corner[1]) / voxel), int((p[2] - corner[2]) / voxel)
+    own = (x * shape[1] + y) * shape[2] + z
+    if inside_in[own] != window:
+        inside_in[own] = window
+        inside[own] += 1
     for jx in range(max(x - 1, 0), min(x + 2, shape[0])):
         for jy in range(max(y - 1, 0), min(y + 2, shape[1])):
             for jz in range(max(z - 1, 0), min(z + 2, shape[2])):
@@ -159,7 +207,7 @@ def _hit(p, corner, far, shape, voxel, window, hit_in, hits):  # type: ignore[no
 
 
 @njit(cache=True)
-def _pass(p, o, corner, far, shape, voxel, reach, window, hit_in, passed_in, rays, passes):  # type: ignore[no-untyped-def]
+def _pass(p, o, corner, far, shape, voxel, reach, window, hit_in, passed_in, rays, passes, through):  # type: ignore[no-untyped-def]
     """Walk along a ray from voxel to voxel (Amanatides and Woo, 1987), up to the last before its return."""
     dx, dy, dz = float(p[0] - o[0]), float(p[1] - o[1]), float(p[2] - o[2])
     r = math.sqrt(dx * dx + dy * dy + dz * dz)
@@ -194,12 +242,13 @@ def _pass(p, o, corner, far, shape, voxel, reach, window, hit_in, passed_in, ray
     along = begin
     while along < end and 0 <= ix < shape[0] and 0 <= iy < shape[1] and 0 <= iz < shape[2]:
         at = (ix * shape[1] + iy) * shape[2] + iz
-        if hit_in[at] != window:
-            if passed_in[at] != window:
-                passed_in[at], rays[at] = window, 0
-            if rays[at] < RAYS:
-                rays[at] += 1
-                if rays[at] == RAYS:
+        if passed_in[at] != window:
+            passed_in[at], rays[at] = window, 0
+        if rays[at] < RAYS:
+            rays[at] += 1
+            if rays[at] == RAYS:
+                through[at] += 1
+                if hit_in[at] != window:
                     passes[at] += 1
         if next_x < next_y and next_x < next_z:
             along, next_x, ix = next_x, next_x + each_x, ix + step_x

@@ -39,7 +39,7 @@ class CarveParams(Params):
         when: "auto": where there are the scanner's path and points' times; "never".
         voxel: metres, of the cells that rays pass; a place is free only with all of its neighbours, so what moved stays
             within so much of what stands, and poses may be off by so much.
-        reach: metres from the scanner up to which rays count.
+        reach: metres from the scanner up to which rays count: half a degree is a voxel at 20 m.
         votes: moments (of a tenth of a second) that must have seen through a place. Of a profile scanner, passes.
         camera: metres around every camera in which nothing stands; 0: that isn't looked at.
         cameras: (x, y, z) local metres; set by the recipe.
@@ -47,7 +47,7 @@ class CarveParams(Params):
 
     when: Literal["auto", "never"] = "auto"
     voxel: float = Field(0.2, ge=0.02, le=5)
-    reach: float = Field(40.0, ge=1, le=500)
+    reach: float = Field(20.0, ge=1, le=500)
     votes: int = Field(3, ge=1, le=1000)
     camera: float = Field(1.0, ge=0, le=10)
     cameras: tuple[tuple[Coordinate, Coordinate, Coordinate], ...] = ()
@@ -187,4 +187,4 @@ def _moved(cloud: PointCloud, origins: F64, path: Trajectory | None, params: Car
     return out
 
 
-CARVE = Step("carve", 1, carve, CarveParams)
+CARVE = Step("carve", 2, carve, CarveParams)

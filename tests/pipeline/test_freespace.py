@@ -53,16 +53,16 @@ def driving(time: float) -> dict[int, Any]:
     }
 
 
-def survey(seconds: float = SECONDS, *, moves: bool = True, off: float = 0.0, begin: float = 0.0) -> PointCloud:
-    """Turns of 64 beams, 2 cm of range noise; poses are off by `off` metres; labels are kinds."""
+def survey(seconds: float = SECONDS, *, off: float = 0.0, begin: float = 0.0, left: int = -1) -> PointCloud:
+    """Turns of 64 beams, 2 cm of range noise, poses off by `off` metres; `left` isn't there; labels are kinds."""
     random = np.random.default_rng(2)
     elevation = np.radians(np.linspace(-25, 12, 64))
     parts = []
     for turn in range(round(seconds * TURNS)):
         time = turn / TURNS
         scene, kinds = o3d.t.geometry.RaycastingScene(), []
-        things = [(k, mesh) for k, meshes in still().items() for mesh in meshes]
-        for kind, mesh in things + (list(driving(time).items()) if moves else []):
+        things = [(k, mesh) for k, meshes in still().items() for mesh in meshes if k != left]
+        for kind, mesh in things + list(driving(time).items()):
             scene.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(mesh))
             kinds.append(kind)
         azimuth = np.linspace(-np.pi, np.pi, 900, endpoint=False)
@@ -116,7 +116,7 @@ def street() -> PointCloud:
 def test_what_moved_goes_and_what_stands_stays(street: PointCloud, tmp_path: Path) -> None:
     done = carve(street, tmp_path, path())
     gone = lost(street, done)
-    assert all(gone[kind] > 0.4 for kind in MOVES)
+    assert all(gone[kind] > 0.65 for kind in MOVES)
     assert all(share < 0.01 for kind, share in gone.items() if kind not in MOVES)
     moving = PointCloud.load(done.files["moving"])
     assert len(moving) == done.facts["moved"] and moving.time is not None and moving.normal is not None
@@ -127,7 +127,7 @@ def test_what_moved_goes_and_what_stands_stays(street: PointCloud, tmp_path: Pat
 def test_poses_may_be_off_by_centimetres(tmp_path: Path) -> None:
     cloud = survey(off=0.05)
     gone = lost(cloud, carve(cloud, tmp_path, path()))
-    assert all(gone[kind] > 0.3 for kind in MOVES)
+    assert all(gone[kind] > 0.5 for kind in MOVES)
     assert all(share < 0.02 for kind, share in gone.items() if kind not in MOVES)
 
 
@@ -155,3 +155,13 @@ def test_the_recording_vehicle_and_cameras_have_room(street: PointCloud, tmp_pat
     kept = np.load(done.files["dropped"]) == 0
     assert kept[-5:].tolist() == [False, False, False, False, True]
     assert cloud.label is not None and kept[cloud.label == GROUND].all()
+
+
+def test_what_stood_in_one_pass_and_not_in_the_next_goes(tmp_path: Path) -> None:
+    """A survey of hours: the car that is parked in the first pass has left by the second."""
+    cloud = PointCloud.join([survey(1.5), survey(1.5, begin=7200.0, left=PARKED)])
+    both = path(1.5), path(1.5, begin=7200.0)
+    way = Trajectory(*(np.concatenate([getattr(one, of) for one in both]) for of in ("times", "positions")))
+    gone = lost(cloud, carve(cloud, tmp_path, way))
+    assert gone[PARKED] > 0.8
+    assert all(share < 0.01 for kind, share in gone.items() if kind not in (PARKED, *MOVES))
