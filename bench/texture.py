@@ -175,13 +175,14 @@ class Bench:
         """Compare renderings with the photos that were held out."""
         import numpy as np
 
+        from scan2sim.pipeline.render import Renderer, textured
         from scan2sim.texturing.evaluate import held_out
 
         held = scene.photos(held_out=True)
         depths = [scene.depth / f"{i}.npy" for i in held]
         shown: dict[str, list[Any]] = {}
         for method, row in rows.items():
-            for result in held_out([self.folder(scene, method)], list(held.values()), depths):
+            for result in held_out(Renderer([textured(self.folder(scene, method))]), list(held.values()), depths):
                 name = Path(result.view.name).name
                 row.photos[name] = {figure: getattr(result, figure, float("nan")) for figure in FIGURES}
                 shown.setdefault(name, [("photo", result.photo)]).append(

@@ -45,10 +45,13 @@ def paint(scene: Scene, given: dict[str, dict[str, Any]], folder: Path) -> Path:
 
 def figures(scene: Scene, folder: Path, clean: Path | None) -> dict[str, float]:
     """Of a texture: at the held-out photos, and on a street against its truth; ghosts where `clean` is given."""
+    from scan2sim.pipeline.render import Renderer, textured
     from scan2sim.texturing.evaluate import held_out
 
     held = scene.photos(held_out=True)
-    results = list(held_out([folder], list(held.values()), [scene.depth / f"{i}.npy" for i in held]))
+    results = list(
+        held_out(Renderer([textured(folder)]), list(held.values()), [scene.depth / f"{i}.npy" for i in held])
+    )
     out = {
         key: round(float(np.mean([getattr(result, key) for result in results])), 3)
         for key in ("psnr_db", "psnr_gain_db", "ssim", "sharpness")

@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from scan2sim.data_samples.layout import FRAME, Layout, Style, lay_out
-from scan2sim.data_samples.photos import Effects, cameras, develop, plan_shots, render
+from scan2sim.data_samples.photos import Effects, Shot, cameras, develop, plan_shots, render
 from scan2sim.data_samples.scanner import Drive, plan_drive, scan
 from scan2sim.data_samples.scene import FINE, Scene, srgb
+from scan2sim.pipeline.classes import CODE
 from scan2sim.pipeline.errors import SettingError
 from scan2sim.pipeline.step import Report, silent
 from scan2sim.pipeline.types import F64, Mesh, PointCloud, Trajectory
@@ -39,7 +40,8 @@ def generate(
         out: the folder; made if need be, files of the same names are replaced.
         length: metres of road.
         points: lidar returns; kept to the point.
-        photos: in all; taken at stations at most 5 m apart where there are enough of them.
+        photos: in all; taken at stations at most 5 m apart where there are enough of them. One that shows nothing of
+            the street (the last station's looks ahead) is left out.
         seed: of everything drawn.
         photo_width: pixels of a pinhole photo (4:3); panoramas are 1.28 times as wide (2:1).
         truth_density: true surface samples a square metre.
@@ -111,9 +113,13 @@ def _take_photos(
     kinds = cameras(width)
     shots = plan_shots(scene.layout, drive, photos, effects.exposure_ev)
     entries: list[dict[str, object]] = []
+    taken: list[Shot] = []
     for i, shot in enumerate(shots):
         report(i / len(shots), f"photo {i + 1} of {len(shots)}")
         seen = render(scene, drive, kinds[shot.camera], shot.T_world_cam, shot.time)
+        if np.isin(seen.label, (0, CODE["vehicle"])).all():
+            continue
+        taken.append(shot)
         image = develop(seen, shot.ev, effects, np.random.default_rng([scene.layout.seed, 5, i]))
         file = f"photos/{shot.name}.jpg"
         _, jpeg = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, effects.quality])
@@ -131,7 +137,7 @@ def _take_photos(
                 "time": shot.time,
             }
         )
-    lines = ["photo,exposure_ev", *(f"photos/{shot.name}.jpg,{shot.ev:.6f}" for shot in shots)]
+    lines = ["photo,exposure_ev", *(f"photos/{shot.name}.jpg,{shot.ev:.6f}" for shot in taken)]
     (out / "truth" / "exposures.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
     return entries
 

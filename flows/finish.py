@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from scan2sim.flows.display import warn
+from scan2sim.flows.findings import findings
 from scan2sim.flows.planning import Planned
 from scan2sim.flows.publish import publish, published, to_read
 from scan2sim.flows.report import figures, write_report
@@ -134,7 +135,7 @@ def _state(one: Made, out: Path) -> TileState:
         figures=_figures(one.tile, done) if one.tile and done else {},
         report=f"{TILES}/{one.name}/report.html" if done else None,
         thumbnail=_there(out / TILES / one.name / PICTURE),
-        warnings=[f"{label}: {text}" for label, manifest in done.items() for text in manifest.warnings],
+        warnings=[f"{one.about}: {one.text}" for one in findings(done)],
         borders=_borders(done),
     )
 

@@ -12,6 +12,7 @@ from typing import Any
 
 from scan2sim.flows import gazebo
 from scan2sim.flows.execute import versions
+from scan2sim.flows.findings import findings
 from scan2sim.flows.planning import Planned
 from scan2sim.pipeline.classes import GROUPS
 from scan2sim.pipeline.io import crs
@@ -69,6 +70,7 @@ def figures(tile: Tile, done: Mapping[str, Manifest]) -> dict[str, Any]:
         "versions": versions(),
         "seconds": round(sum(m.seconds for m in done.values()), 2),
         "peak_mb": max(m.peak_mb for m in done.values()),
+        "findings": [{"level": one.level, "about": one.about, "text": one.text} for one in findings(done)],
         "geometry": geometry,
         "texture": texture | facts["score"],
         "world": facts["export"],

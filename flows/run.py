@@ -13,6 +13,7 @@ from pathlib import Path
 from scan2sim.flows import gazebo
 from scan2sim.flows.display import RunDisplay, console, warn
 from scan2sim.flows.execute import Event, Executor, execute, locked, versions
+from scan2sim.flows.findings import findings
 from scan2sim.flows.planning import Planned, check, drop_damaged, plan
 from scan2sim.flows.publish import publish, to_read
 from scan2sim.flows.recipe import Node, recipe
@@ -24,6 +25,8 @@ from scan2sim.pipeline.store import Manifest, Store
 from scan2sim.pipeline.types import Tile
 
 STORE = "steps"
+WORST = 3
+"""Findings that are shown on the screen."""
 
 
 def run_tile(
@@ -64,9 +67,9 @@ def run_tile(
             changed = publish(store, planned, done, out, tile, settings)
             report = write_report(tile, planned, done, store, out, seconds=time.perf_counter() - began)
         store.sweep({p.node.label: p.key for p in planned})
-    show_warnings(done)
     for warning in changed:
         warn(warning)
+    show_findings(done)
     show_results(out / "world" / f"{tile.name}.sdf", report)
     if missing == 0:
         console.print(
@@ -104,6 +107,17 @@ def show_results(world: Path, report: Path) -> None:
     """Where the world and the report are, and how to open them, on the screen."""
     told = [*gazebo.lines(world), f"Report: {report}"]
     console.print("\n".join(told), highlight=False, soft_wrap=True, markup=False)
+
+
+def show_findings(done: dict[str, Manifest]) -> None:
+    """The worst of what is wrong with the world, on the screen; the report has all of it."""
+    found = findings(done)
+    if found and found[0].level == "unusable":
+        console.print("[bold red]This world can't be used as it is:[/]")
+    for one in found[:WORST]:
+        warn(f"{one.about}: {one.text}")
+    if len(found) > WORST:
+        console.print(f"[dim]{len(found) - WORST} more in the report")
 
 
 def show_warnings(done: dict[str, Manifest]) -> None:

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from scan2sim.pipeline.types import F32, F64, U8
 
 if TYPE_CHECKING:
-    from scan2sim.pipeline.render import Image
+    from scan2sim.pipeline.render import Image, Renderer
     from scan2sim.pipeline.types import View
 
 Mask = npt.NDArray[np.bool_]
@@ -56,7 +56,8 @@ class HeldOut:
         render: what the world looks like from there, with the index of the folder (`body`) and the metres from the
             camera (`range`) of every pixel.
         mask: (H, W) pixels that count: a surface that another photo saw, hidden from this one by nothing that
-            the world leaves out (a parked car), and not masked out.
+            the world leaves out (a parked car), and not masked out. Of a photo that shows none, any surface; of one
+            that shows no surface at all, everything: what the world lacks there is its fault, and counts.
         errors: pixel by pixel.
         coverage: share of the pixels with a surface that another photo saw.
         psnr_db, psnr_gain_db, ssim, sharpness: see `score`.
@@ -183,11 +184,11 @@ def _ssim(photo: U8, render: U8, mask: Mask) -> F32:
     return np.where(mask & (weight > 0.5), index, np.float32(np.nan)).astype(np.float32)
 
 
-def held_out(folders: Sequence[Path], views: Sequence[View], depths: Sequence[Path] | None = None) -> Iterator[HeldOut]:
+def held_out(world: Renderer, views: Sequence[View], depths: Sequence[Path] | None = None) -> Iterator[HeldOut]:
     """Render textured meshes from each of the views, and score; views whose photo or mask can't be read are skipped.
 
     Args:
-        folders: of the step `texture`.
+        world: the textured meshes.
         views: held out.
         depths: files of the views' depth maps, which tell where a photo shows something that the world leaves
             out; None: every pixel with a surface counts.
@@ -195,9 +196,7 @@ def held_out(folders: Sequence[Path], views: Sequence[View], depths: Sequence[Pa
     import cv2
 
     from scan2sim.pipeline.io import image
-    from scan2sim.pipeline.render import Renderer, textured
 
-    renderer = Renderer([textured(folder) for folder in folders])
     files: list[Path | None] = list(depths) if depths is not None else [None] * len(views)
     for view, depth in zip(views, files, strict=True):
         photo = image.read_rgb(view.photo)
@@ -206,13 +205,15 @@ def held_out(folders: Sequence[Path], views: Sequence[View], depths: Sequence[Pa
             continue
         if view.mask is not None and allowed is None:
             continue
-        render = renderer.view(view.camera, view.T_world_cam, samples=SAMPLES)
+        render = world.view(view.camera, view.T_world_cam, samples=SAMPLES)
         surface = render.hit if allowed is None else render.hit & (allowed > 0)
         if depth is not None:
             first = cv2.resize(np.load(depth), surface.shape[::-1], interpolation=cv2.INTER_NEAREST)
             surface &= render.range <= first * 1.02 + 0.1
         mask = surface & (render.seen == 255)
         coverage = float(mask.sum() / max(1, surface.sum()))
+        if not mask.any():
+            mask = surface if surface.any() else np.ones_like(surface) if allowed is None else allowed > 0
         of = errors(photo, render.rgb, mask)
         yield HeldOut(view, photo, render, mask, of, coverage, **_score(of, photo, render.rgb, mask))
 

@@ -17,9 +17,12 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from scan2sim.pipeline.types import F32
+    from scan2sim.pipeline.render import Renderer
+    from scan2sim.pipeline.types import F32, View
 
 FIGURES = ("psnr_db", "psnr_gain_db", "ssim", "sharpness")
+CLEARANCE = 1.0
+"""Metres about a camera in which nothing can have been."""
 
 
 class ScoreParams(Params):
@@ -42,20 +45,24 @@ def score(inputs: Inputs, params: ScoreParams, out: Path, report: Report) -> Don
     Pixels count where another photo saw the surface, and where this one does: not where it shows a car or
     person that the world leaves out (`depth`, the folder of depth maps, tells).
 
+    Held-out photos that show nothing of that count all the same, as what they are (`evaluate.HeldOut`).
+
     File: `error`, a folder with a picture of photo, rendering and difference for every held-out photo, and
     `index.json`, which names them. Facts, None where nothing counts: `held_out` photos; their mean `psnr_db` (as it
-    is), `psnr_gain_db` (after a gain a channel), `ssim` and `sharpness`; `photos`, the same for each; `by_class` and
-    `by_distance`, the same but sharpness of all their pixels; `truth_psnr_db` and `truth_psnr_near_db` for generated
-    tiles.
+    is), `psnr_gain_db` (after a gain a channel), `ssim` and `sharpness`; `photos`, the same for each, and `coverage`,
+    0 where no other photo saw anything of what it shows; `by_class` and `by_distance`, the same but sharpness of all
+    their pixels; `truth_psnr_db` and `truth_psnr_near_db` for generated tiles; `cameras`: how many there are
+    (`count`), and metres to the nearest surface for those that are within `CLEARANCE` of one (`near_m`).
     """
     import numpy as np
 
     from scan2sim.pipeline.io import views as views_io
+    from scan2sim.pipeline.render import Renderer, textured
     from scan2sim.pipeline.steps.pictures import Album
     from scan2sim.texturing import evaluate
 
     groups = [g for g in GROUPS if g in inputs]
-    folders = [inputs[g] for g in groups]
+    world = Renderer([textured(inputs[g]) for g in groups])
     views, held = views_io.load(inputs["views"]), views_io.load_held_out(inputs["views"])
     index = [i for i, out_ in enumerate(held) if out_]
     depths = [inputs["depth"] / f"{i}.npy" for i in index]
@@ -63,19 +70,19 @@ def score(inputs: Inputs, params: ScoreParams, out: Path, report: Report) -> Don
     album.folder.mkdir()
     photos: dict[str, dict[str, float | None]] = {}
     unread = {views[i].name: views[i].photo for i in index}
-    warnings = []
+    warnings: list[str] = []
     by_class, by_distance = np.zeros((len(groups), 5)), np.zeros((len(evaluate.BAND_NAMES), 5))
-    results = evaluate.held_out(folders, [views[i] for i in index], depths) if index else ()
+    results = evaluate.held_out(world, [views[i] for i in index], depths) if index else ()
     for i, result in enumerate(results):
         name = result.view.name
         report(0.9 * i / len(index), name)
         del unread[name]
         if not result.mask.any():
-            warnings.append(f"{name}: held out, but shows nothing that another photo saw: it is not scored")
+            warnings.append(f"{name}: held out, but all of it is masked out: it is not scored")
             continue
         photos[name] = _rounded({key: getattr(result, key) for key in (*FIGURES, "coverage")})
         by_class += evaluate.tally(result.errors, result.render.body, len(by_class))
-        by_distance += evaluate.tally(result.errors, np.digitize(result.render.range, evaluate.BANDS), len(by_distance))
+        by_distance += evaluate.tally(result.errors, _band(result.render.range), len(by_distance))
         picture, caption = evaluate.error_picture(result), _caption(photos[name])
         album.add(f"{i:03d}_{Path(name).name}", picture, "error", name, caption)
     album.save()
@@ -89,7 +96,8 @@ def score(inputs: Inputs, params: ScoreParams, out: Path, report: Report) -> Don
     }
     if "truth.points" in inputs:
         report(0.9, "true colours")
-        facts |= _truth(inputs, folders, params)
+        facts |= _truth(inputs, world, params)
+    facts["cameras"] = _cameras(world, views)
     return Done({"error": album.folder}, facts, warnings)
 
 
@@ -111,7 +119,28 @@ def _caption(figures: dict[str, float | None]) -> str:
     return ", ".join(parts) + "."
 
 
-def _truth(inputs: Inputs, folders: list[Path], params: ScoreParams) -> dict[str, float | None]:
+def _band(distance: F32) -> npt.NDArray[np.int64]:
+    """(H, W) which band a pixel is in, -1 where there is no surface."""
+    import numpy as np
+
+    from scan2sim.texturing.evaluate import BANDS
+
+    return np.where(np.isfinite(distance), np.digitize(distance, BANDS), -1)
+
+
+def _cameras(world: Renderer, views: Sequence[View]) -> dict[str, Any]:
+    """How many photos there are, and those taken within `CLEARANCE` of a surface, nearest first."""
+    import numpy as np
+
+    taken = [view for view in views if view.camera.model != "orthographic"]  # orthophotos were taken from nowhere
+    centres = np.array([view.centre for view in taken], np.float32).reshape(-1, 3)
+    places, _ = world.nearest_places(centres)
+    metres = {v.name: float(m) for v, m in zip(taken, np.linalg.norm(places - centres, axis=1), strict=True)}
+    near = sorted((name for name, m in metres.items() if m < CLEARANCE), key=lambda name: metres[name])
+    return {"count": len(taken), "near_m": {name: round(metres[name], 2) for name in near}}
+
+
+def _truth(inputs: Inputs, world: Renderer, params: ScoreParams) -> dict[str, float | None]:
     """PSNR of the texture against the true surface colours: where a photo saw it, and where one saw it from near.
 
     None where none did.
@@ -119,14 +148,11 @@ def _truth(inputs: Inputs, folders: list[Path], params: ScoreParams) -> dict[str
     import numpy as np
 
     from scan2sim.pipeline.io import las
-    from scan2sim.pipeline.render import Renderer, textured
     from scan2sim.texturing.evaluate import psnr
 
-    bodies = [textured(folder) for folder in folders]
-    truth = las.read(inputs["truth.points"], bodies[0].mesh.frame)
+    truth = las.read(inputs["truth.points"], world.bodies[0].mesh.frame)
     truth = truth.take(slice(None, None, max(1, len(truth) // params.truth_samples)))
     assert truth.rgb is not None
-    world = Renderer(bodies)
     rgb, seen, distance = world.nearest(truth.xyz)
     squared = ((rgb.astype(np.float64) - truth.rgb) ** 2).mean(axis=1)
     counts = (seen == 255) & (distance < params.truth_reach)
@@ -157,4 +183,4 @@ def _seen_from_near(inputs: Inputs, places: F32, normals: F32, near: float) -> n
     return seen
 
 
-SCORE = Step("score", 2, score, ScoreParams)
+SCORE = Step("score", 3, score, ScoreParams)

@@ -72,7 +72,7 @@ def test_without_held_out_photos_figures_are_none(street, tmp_path):
     assert json.loads((done.files["error"] / "index.json").read_text()) == []
 
 
-def test_held_out_photos_that_cannot_be_scored_are_named(street, tmp_path):
+def test_held_out_photos_of_what_the_world_lacks_count_and_those_that_cannot_be_read_are_named(street, tmp_path):
     away = look_at((-4, 0, 1.8), (-9, 0, 4))  # at the sky
     for pose in (POSES[0], POSES[1], away):
         street.add(CAMERAS["pinhole"], pose)
@@ -80,10 +80,21 @@ def test_held_out_photos_that_cannot_be_scored_are_named(street, tmp_path):
     inputs = inputs_of(street)
     Path(street.views[1].photo).write_bytes(b"no photo")
     done = score(inputs, ScoreParams(), tmp_path, silent)
-    assert strict(done.facts)["held_out"] == 0
-    assert len(done.warnings) == 2
-    assert "photo2" in done.warnings[0] and "shows nothing" in done.warnings[0]
-    assert "photo1.png" in done.warnings[1] and "can't be read" in done.warnings[1]
+    facts = strict(done.facts)
+    assert facts["held_out"] == 1 and facts["psnr_db"] == facts["photos"]["photo2"]["psnr_db"] is not None
+    assert facts["photos"]["photo2"]["coverage"] == 0
+    assert sum(band["pixels"] for band in facts["by_distance"].values()) == 0
+    (warning,) = done.warnings
+    assert "photo1.png" in warning and "can't be read" in warning
+
+
+def test_cameras_beside_a_surface_are_told_and_how_near_they_are(street, tmp_path):
+    low = POSES[1].copy()
+    low[2, 3] = 0.4  # the ground is at 0
+    for pose in (POSES[0], low):
+        street.add(CAMERAS["pinhole"], pose)
+    cameras = strict(score(inputs_of(street), ScoreParams(), tmp_path, silent).facts)["cameras"]
+    assert cameras == {"count": 2, "near_m": {"photo1": pytest.approx(0.4, abs=0.05)}}
 
 
 def test_what_photos_saw_from_near_is_held_against_the_truth_apart(textured, tmp_path):
