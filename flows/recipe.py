@@ -39,6 +39,7 @@ from scan2sim.pipeline.steps.walls import WALLS
 from scan2sim.pipeline.types import Tile
 from scan2sim.segmentation.label import LABEL
 from scan2sim.segmentation.segment import SEGMENT
+from scan2sim.segmentation.things import THINGS
 from scan2sim.texturing.agreement import AGREEMENT
 from scan2sim.texturing.borders import BORDERS
 from scan2sim.texturing.choose import CHOOSE
@@ -50,9 +51,9 @@ from scan2sim.texturing.texture import TEXTURE
 from scan2sim.texturing.unwrap import UNWRAP
 
 STEPS: tuple[Step, ...] = (
-    INGEST, PATH, CARVE, VIEWS, LABEL, SEGMENT, REACH, OVERLAP, FURNITURE, SPLIT, VOXEL, GROUND, WALLS, POISSON, TRIM,
-    ISLANDS, CLIP, JOIN, DECIMATE, PLANTS, UNWRAP, REFINE, VISIBILITY, EXPOSURE, AGREEMENT, CHOOSE, TEXTURE, LEVEL,
-    COLLISION, EXPORT, RASTERS, GEOMETRY, SCORE, PICTURES, PREVIEW, BORDERS,
+    INGEST, PATH, CARVE, VIEWS, LABEL, SEGMENT, THINGS, REACH, OVERLAP, FURNITURE, SPLIT, VOXEL, GROUND, WALLS, POISSON,
+    TRIM, ISLANDS, CLIP, JOIN, DECIMATE, PLANTS, UNWRAP, REFINE, VISIBILITY, EXPOSURE, AGREEMENT, CHOOSE, TEXTURE,
+    LEVEL, COLLISION, EXPORT, RASTERS, GEOMETRY, SCORE, PICTURES, PREVIEW, BORDERS,
 )  # fmt: skip
 PER_CLASS: tuple[Step, ...] = (VOXEL, POISSON, TRIM, ISLANDS, CLIP, JOIN, DECIMATE, CHOOSE, UNWRAP, TEXTURE, LEVEL)
 
@@ -129,6 +130,10 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
     cell: dict[str, Any] = {"seed": tile.cell.seed, "neighbours": dict(tile.cell.neighbours)} if tile.cell else {}
     met = [name for name in cell.get("neighbours", {}) if name in (beside or ())]
     first = [name for name in met if name < tile.name]  # they own the borders with this one
+    if settings.params(THINGS).find and (path or met):
+        classified = {name: at("segment", name) for name in ("cloud", "confidence")}
+        add(THINGS, classified | moving | scanner)
+        last = "things"
     limit = settings.params(REACH).limit
     if limit != "off" and (met or (path and (photographed or limit != "auto"))):
         shown = seen if photographed else {}

@@ -38,9 +38,11 @@ def segment_tile(path: Path, out: Path, settings: Settings) -> None:
     tile = read_tile(path)
     with locked(out):
         store = Store(out / STORE)
-        nodes = up_to("segment", recipe(tile, settings))
+        nodes = recipe(tile, settings)
+        last = "things" if any(node.label == "things" for node in nodes) else "segment"
+        nodes = up_to(last, nodes)
         planned = plan(nodes, store)
-        if drop_damaged(planned, store, {"ingest", "carve", "views", "label", "segment"}):
+        if drop_damaged(planned, store, {"ingest", "carve", "views", "label", "segment", "things"}):
             planned = plan(nodes, store)
         log = Log(out / "run.log")
         log.write(f"segment {tile.path}, settings {json.dumps(settings.values)}")
@@ -52,7 +54,7 @@ def segment_tile(path: Path, out: Path, settings: Settings) -> None:
             for label, manifest in done.items()
             for name, file in manifest.files.items()
         }
-        told, own = PointCloud.load(files["segment", "cloud"]).label, PointCloud.load(files["carve", "cloud"]).label
+        told, own = PointCloud.load(files[last, "cloud"]).label, PointCloud.load(files["carve", "cloud"]).label
         assert told is not None
         with np.load(files["segment", "confidence"]) as beside:
             columns = told, beside["confidence"], beside["source"]

@@ -1,0 +1,218 @@
+"""Things: vehicles and people as instances, all of each or nothing (kernels in instances.py)."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from scan2sim.pipeline.ranges import Voxel
+from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
+
+if TYPE_CHECKING:
+    from scan2sim.pipeline.types import F32, F64, U8, Frame, PointCloud
+    from scan2sim.segmentation.instances import Ints, Scan, Thing
+
+NEAR = 0.3
+"""Metres to a point that moved, within which a point is taken to be of the same thing."""
+SHAPES_WORD = 0.6
+"""What the word of shape alone counts beside a photo's, and how sure it is of itself."""
+LEAST_SURE, MOST_SURE = 0.67, 0.9
+"""Probabilities that a told class counts for: a photo's class is likelier than another, and never certain."""
+
+
+class ThingsParams(Params):
+    """How vehicles and people are found.
+
+    Attributes:
+        find: decide them as whole things; False leaves points as their classes are told.
+        size: metres of the voxels that are looked at.
+    """
+
+    find: bool = True
+    size: Voxel = 0.1
+
+
+def things(inputs: Inputs, params: ThingsParams, out: Path, report: Report) -> Done:
+    """Make vehicles and people in the classified `cloud` whole, with `confidence` (of `segment`).
+
+    `path` is the scanner's; `moving`, a cloud of points that were dropped because they moved, is read where given. A
+    cloud's own classes stay as they are. Tiles of a survey without a path keep their clouds.
+
+    Files: `cloud`; `things`, GeoJSON with every thing's box on the ground, in the tile's CRS, its `kind`, `length_m`,
+    `width_m`, `height_m`, `heading_deg` (from x, anticlockwise), `ground_z`, `points`, `moved` and `confidence`.
+    Facts: `vehicles`, of these `moved`, `people`; points that were `added` to them, and `given_back` to other classes.
+    """
+    from dataclasses import replace
+
+    import numpy as np
+
+    from scan2sim.pipeline.types import PointCloud
+
+    file, listed = out / "cloud.npz", out / "things.geojson"
+    report(0.0, "reading")
+    found: list[tuple[Thing, int]] = []
+    cloud = PointCloud.load(inputs["cloud"]) if "path" in inputs else None
+    label = None if cloud is None else cloud.label
+    if cloud is not None and label is not None:
+        found, label = decide(cloud, inputs, params, report)
+    if cloud is None or cloud.label is None or label is None or np.array_equal(label, cloud.label):
+        _pass_on(inputs["cloud"], file)
+        added = back = 0
+    else:
+        report(0.9, "writing")
+        movable = np.isin(cloud.label, _movable()), np.isin(label, _movable())
+        added, back = int((movable[1] & ~movable[0]).sum()), int((movable[0] & ~movable[1]).sum())
+        replace(cloud, label=label).save(file)
+    listed.write_text(json.dumps(geojson(found, cloud.frame if cloud else None), indent=1) + "\n", encoding="utf-8")
+    cars = [thing for thing, _ in found if thing.kind != "person"]
+    facts = {
+        "vehicles": len(cars),
+        "moved": sum(thing.moved for thing in cars),
+        "people": len(found) - len(cars),
+        "added": added,
+        "given_back": back,
+    }
+    return Done({"cloud": file, "things": listed}, facts)
+
+
+def decide(
+    cloud: PointCloud, inputs: Inputs, params: ThingsParams, report: Report
+) -> tuple[list[tuple[Thing, int]], U8]:
+    """Things with their numbers of points, and the class of every point (N,)."""
+    import numpy as np
+
+    from scan2sim.pipeline.classes import CODE
+    from scan2sim.pipeline.steps.voxel import voxel_groups
+    from scan2sim.pipeline.types import PointCloud, Trajectory
+    from scan2sim.segmentation import instances
+    from scan2sim.segmentation.segment import OWN
+
+    assert cloud.label is not None
+    with np.load(inputs["confidence"]) as told:
+        sure, source = told["confidence"], told["source"]
+    own = bool(len(source)) and bool((source == OWN).all())
+    if own and not np.isin(cloud.label, _movable()).any():
+        return [], cloud.label
+    order, starts = voxel_groups(cloud.xyz, params.size)
+    first, count = order[starts], np.diff(np.append(starts, len(order)))
+    moving = PointCloud.load(inputs["moving"]).xyz if "moving" in inputs else np.zeros((0, 3), np.float32)
+    report(0.3, "ground")
+    path = Trajectory.load(inputs["path"]).positions
+    scan = look(cloud.take(first), sure[first], source[first], moving, path)
+    report(0.5, "things")
+    found = instances.vehicles(scan) + instances.people(scan)
+    numbered = [(thing, int(count[thing.index].sum())) for thing in found]
+    if own:
+        return numbered, cloud.label
+    thin = scan.label.copy()
+    back = instances.no_vehicles(scan, found)
+    thin[back] = other_class(scan, back)
+    for thing in found:
+        thin[thing.index] = CODE["person" if thing.kind == "person" else "vehicle"]
+    thin[instances.remains(scan)] = CODE["vehicle"]
+    changed = np.flatnonzero(thin != scan.label)
+    label = cloud.label.copy()
+    at = np.concatenate([order[starts[i] : starts[i] + count[i]] for i in changed] or [np.zeros(0, np.int64)])
+    label[at] = np.repeat(thin[changed], count[changed])
+    return numbered, label
+
+
+def look(thin: PointCloud, sure: U8, source: U8, moving: F32, path: F64) -> Scan:
+    """What is known of one point a voxel.
+
+    Args:
+        thin: with labels.
+        sure, source: (N,) as `segment` writes them.
+        moving: (M, 3) points that were dropped because they moved.
+        path: (T, 3) of the scanner.
+    """
+    import numpy as np
+    from scipy.spatial import cKDTree
+
+    from scan2sim.pipeline.classes import CODE
+    from scan2sim.segmentation.geometric import split_ground
+    from scan2sim.segmentation.instances import Scan
+    from scan2sim.segmentation.segment import SHAPE
+
+    assert thin.label is not None
+    height, ground = split_ground(thin.xyz)
+    p = np.clip(sure / 255.0, LEAST_SURE, MOST_SURE)
+    odds = np.log(p / (1 - p)) * np.where(thin.label == CODE["vehicle"], 1.0, -1.0)
+    odds = np.where(source == SHAPE, SHAPES_WORD * odds, odds)
+    weight = np.where(source == SHAPE, SHAPES_WORD, 1.0).astype(np.float32)
+    moved = np.zeros(len(thin), bool)
+    if len(moving):
+        distance, _ = cKDTree(moving).query(thin.xyz, distance_upper_bound=NEAR, workers=-1)
+        moved = np.isfinite(distance)
+    return Scan(thin.xyz, height, ground, thin.label, odds.astype(np.float32), weight, moved, path)
+
+
+def other_class(scan: Scan, index: Ints) -> U8:
+    """The classes (K,) of points that are of no vehicle: of the nearest on the ground, or above it, that is of none."""
+    import numpy as np
+    from scipy.spatial import cKDTree
+
+    from scan2sim.pipeline.classes import CODE, group_of
+
+    terrain = group_of()[scan.label] == 0
+    out = scan.label[index].copy()
+    for low in (True, False):
+        chosen = np.flatnonzero((scan.ground[index] | (scan.height[index] < 0.1)) == low)
+        given = np.flatnonzero(terrain if low else ~terrain & ~np.isin(scan.label, _movable()))
+        if len(chosen) and len(given):
+            distance, near = cKDTree(scan.xyz[given]).query(scan.xyz[index[chosen]], workers=-1)
+            alone = np.full(len(chosen), CODE["wall_or_fence"], np.uint8)
+            out[chosen] = np.where((distance < 2.0) | low, scan.label[given[near]], alone)
+    return out
+
+
+def geojson(found: Sequence[tuple[Thing, int]], frame: Frame | None) -> dict[str, Any]:
+    """A feature a thing."""
+    import numpy as np
+
+    from scan2sim.pipeline.io import crs
+
+    features = []
+    for thing, points in found:
+        assert frame is not None
+        ring = np.column_stack([thing.corners, np.full(4, thing.centre[2])])
+        places = frame.to_crs(np.concatenate([ring, ring[:1]]))
+        features.append(
+            {
+                "type": "Feature",
+                "geometry": {"type": "Polygon", "coordinates": [places[:, :2].round(3).tolist()]},
+                "properties": {
+                    "kind": thing.kind,
+                    "length_m": round(thing.length, 2),
+                    "width_m": round(thing.width, 2),
+                    "height_m": round(thing.height, 2),
+                    "heading_deg": round(float(np.degrees(thing.heading)) % 180, 1),
+                    "ground_z": round(float(places[0, 2]), 3),
+                    "points": points,
+                    "moved": thing.moved,
+                    "confidence": round(float(1 / (1 + np.exp(-thing.odds))), 3),
+                },
+            }
+        )
+    body = {"type": "FeatureCollection", "crs": crs.geojson(frame.crs) if frame else None, "features": features}
+    return {name: value for name, value in body.items() if value is not None}
+
+
+def _movable() -> tuple[int, int]:
+    from scan2sim.pipeline.classes import CODE
+
+    return CODE["vehicle"], CODE["person"]
+
+
+def _pass_on(cloud: Path, file: Path) -> None:
+    try:
+        os.link(cloud, file)
+    except OSError:  # another disk, or a file system without links
+        shutil.copyfile(cloud, file)
+
+
+THINGS = Step("things", 1, things, ThingsParams)
