@@ -130,10 +130,11 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
     cell: dict[str, Any] = {"seed": tile.cell.seed, "neighbours": dict(tile.cell.neighbours)} if tile.cell else {}
     met = [name for name in cell.get("neighbours", {}) if name in (beside or ())]
     first = [name for name in met if name < tile.name]  # they own the borders with this one
+    listed: dict[str, Path | Output] = {}
     if settings.params(THINGS).find and (path or met):
         classified = {name: at("segment", name) for name in ("cloud", "confidence")}
         add(THINGS, classified | moving | scanner)
-        last = "things"
+        last, listed = "things", {"things": at("things", "things")} if path else {}
     limit = settings.params(REACH).limit
     if limit != "off" and (met or (path and (photographed or limit != "auto"))):
         shown = seen if photographed else {}
@@ -222,7 +223,7 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
         add(LEVEL, {"textured": textured[group]} | others, group)
         textured[group] = at(f"level.{group}", "textured")
     add(COLLISION, {g: at(f"decimate.{g}", "mesh") for g in groups}, keep_border=bool(cell))
-    add(EXPORT, textured | lists | {"collision": at("collision", "mesh")}, name=tile.name)
+    add(EXPORT, textured | lists | listed | {"collision": at("collision", "mesh")}, name=tile.name)
     if settings.params(EXPORT).rasters:
         add(RASTERS, textured, name=tile.name, **_fineness(settings))
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from scan2sim.pipeline.ranges import Voxel
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
@@ -67,7 +66,7 @@ def things(inputs: Inputs, params: ThingsParams, out: Path, report: Report) -> D
         movable = np.isin(cloud.label, _movable()), np.isin(label, _movable())
         added, back = int((movable[1] & ~movable[0]).sum()), int((movable[0] & ~movable[1]).sum())
         replace(cloud, label=label).save(file)
-    listed.write_text(json.dumps(geojson(found, cloud.frame if cloud else None), indent=1) + "\n", encoding="utf-8")
+    _write_list(listed, found, cloud.frame if cloud is not None else None)
     cars = [thing for thing, _ in found if thing.kind != "person"]
     facts = {
         "vehicles": len(cars),
@@ -170,36 +169,30 @@ def other_class(scan: Scan, index: Ints) -> U8:
     return out
 
 
-def geojson(found: Sequence[tuple[Thing, int]], frame: Frame | None) -> dict[str, Any]:
-    """A feature a thing."""
+def _write_list(path: Path, found: Sequence[tuple[Thing, int]], frame: Frame | None) -> None:
+    """A polygon a thing."""
     import numpy as np
 
-    from scan2sim.pipeline.io import crs
+    from scan2sim.pipeline.io import geojson
 
     features = []
     for thing, points in found:
         assert frame is not None
         ring = np.column_stack([thing.corners, np.full(4, thing.centre[2])])
         places = frame.to_crs(np.concatenate([ring, ring[:1]]))
-        features.append(
-            {
-                "type": "Feature",
-                "geometry": {"type": "Polygon", "coordinates": [places[:, :2].round(3).tolist()]},
-                "properties": {
-                    "kind": thing.kind,
-                    "length_m": round(thing.length, 2),
-                    "width_m": round(thing.width, 2),
-                    "height_m": round(thing.height, 2),
-                    "heading_deg": round(float(np.degrees(thing.heading)) % 180, 1),
-                    "ground_z": round(float(places[0, 2]), 3),
-                    "points": points,
-                    "moved": thing.moved,
-                    "confidence": round(float(1 / (1 + np.exp(-thing.odds))), 3),
-                },
-            }
-        )
-    body = {"type": "FeatureCollection", "crs": crs.geojson(frame.crs) if frame else None, "features": features}
-    return {name: value for name, value in body.items() if value is not None}
+        told = {
+            "kind": thing.kind,
+            "length_m": round(thing.length, 2),
+            "width_m": round(thing.width, 2),
+            "height_m": round(thing.height, 2),
+            "heading_deg": round(float(np.degrees(thing.heading)) % 180, 1),
+            "ground_z": round(float(places[0, 2]), 3),
+            "points": points,
+            "moved": thing.moved,
+            "confidence": round(float(1 / (1 + np.exp(-thing.odds))), 3),
+        }
+        features.append((places[:, :2].round(3).tolist(), told))
+    geojson.write_polygons(path, frame.crs if frame else "local", features)
 
 
 def _movable() -> tuple[int, int]:

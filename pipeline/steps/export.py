@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 LISTS = {
     "plants": "plants.geojson", "plants_csv": "plants.csv",
-    "furniture": "furniture.geojson", "furniture_csv": "furniture.csv",
+    "furniture": "furniture.geojson", "furniture_csv": "furniture.csv", "things": "things.geojson",
 }  # fmt: skip  # input to file in the world's folder
 
 
@@ -66,7 +66,7 @@ def export(inputs: Inputs, params: ExportParams, out: Path, report: Report) -> D
 
     Layout below `world/`: `<name>.sdf`, `<name>.glb`, `metadata.json`, and `models/<name>/` with
     `model.sdf`, `model.config` and `meshes/` (OBJ, MTL, Collada, one PNG or JPEG for every texture page, and
-    `collision.obj`). Lists (`plants`, `furniture`, and these as `_csv`) that are given are put beside the world.
+    `collision.obj`). Lists (`plants`, `furniture`, these as `_csv`, and `things`) that are given are put beside it.
     OBJ and Collada are z-up in the tile's local metres; the tile's place is in the
     world's pose and `spherical_coordinates` and in `metadata.json` alone.
 
@@ -221,4 +221,4 @@ def can_export(params: ExportParams) -> None:
         need("export.rasters", "rasterio")
 
 
-EXPORT = Step("export", 1, export, ExportParams, check=can_export)
+EXPORT = Step("export", 2, export, ExportParams, check=can_export)
