@@ -193,6 +193,10 @@ def _load(cls: Any, path: Path) -> Any:
     return cls(**arrays)
 
 
+UNCOLOURED = 128
+"""Grey level, in all channels, of a point whose colour isn't known, in a cloud whose others' is."""
+
+
 @dataclass(frozen=True)
 class PointCloud:
     """Points in local coordinates with what is known of each; absent attributes are None.
@@ -200,7 +204,7 @@ class PointCloud:
     Attributes:
         frame: CRS and origin.
         xyz: (N, 3) float32, local metres.
-        rgb: (N, 3) uint8.
+        rgb: (N, 3) uint8; `UNCOLOURED` where it isn't known.
         normal: (N, 3) float32, unit.
         label: (N,) uint8, LAS class codes (`pipeline.classes`).
         time: (N,) float64, GPS time in seconds.
@@ -217,6 +221,11 @@ class PointCloud:
 
     def __len__(self) -> int:
         return len(self.xyz)
+
+    @property
+    def coloured(self) -> npt.NDArray[np.bool_]:
+        """(N,) which points have a colour."""
+        return np.zeros(len(self), bool) if self.rgb is None else (self.rgb != UNCOLOURED).any(axis=1)
 
     def take(self, index: npt.NDArray[Any] | slice) -> Self:
         """The points that `index` (integers, mask or slice) selects."""
@@ -247,7 +256,7 @@ class PointCloud:
         return PointCloud(
             clouds[0].frame,
             column("xyz"),
-            column("rgb", (128, np.uint8)),
+            column("rgb", (UNCOLOURED, np.uint8)),
             column("normal"),
             column("label", (1, np.uint8)),
             column("time"),

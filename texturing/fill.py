@@ -12,14 +12,19 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
+from scan2sim.pipeline.heightfield import spacing
 from scan2sim.pipeline.types import F32, I32, U8
 from scan2sim.texturing.blend import _box, frame
 
 LATTICE = 0.08
 """Metres between the places where points are asked for their colour."""
 NEIGHBOURS = 4
-REACH = 1.0
-"""Metres beyond which a point's colour is no longer called the surface's own."""
+REACH = (0.25, 1.0)
+"""Metres beyond which a point's colour is no longer called the surface's own, at least and at most."""
+SPACINGS = 3.0
+"""In between it is so many times what points are apart."""
+FAR_NEIGHBOURS, FAR_STEP = 32, 8
+"""What is farther from every point takes the mean of so many of every so-manieth: one point's would be a flat patch."""
 FROM_POINTS, FILLED = 128, 64
 
 
@@ -37,20 +42,33 @@ class Colours:
 
         self._tree = cKDTree(xyz, balanced_tree=False, compact_nodes=False)
         self._rgb = rgb.astype(np.float32)
+        self._far = cKDTree(xyz[::FAR_STEP])
+        self._reach = float(np.clip(SPACINGS * spacing(xyz), *REACH))
         self._mark = np.broadcast_to(np.asarray(mark, np.uint8), len(xyz))
 
     def at(self, places: F32) -> tuple[F32, U8]:
         """(M, 3) colours, the inverse-square mean of the nearest points, and (M,) the nearest one's mark.
 
-        Where that is further than `REACH` it is `FILLED`.
+        Where that is too far to be the surface's own it is `FILLED`.
         """
         k = min(NEIGHBOURS, self._tree.n)
         distance, index = self._tree.query(places, k=k, workers=-1)
         distance, index = distance.reshape(len(places), k), index.reshape(len(places), k)
-        weight = (1.0 / (distance**2 + 1e-4)).astype(np.float32)
-        colour = np.einsum("mk,mkc->mc", weight, self._rgb[index]) / weight.sum(axis=1, keepdims=True)
-        mark = np.where(distance[:, 0] <= REACH, self._mark[index[:, 0]], FILLED)
-        return colour.astype(np.float32), mark.astype(np.uint8)
+        colour, far = _mean(distance, self._rgb[index]), distance[:, 0] > self._reach
+        if far.any():
+            k = min(FAR_NEIGHBOURS, self._far.n)
+            distance_far, index_far = self._far.query(places[far], k=k, workers=-1)
+            shape = (len(distance_far), k)
+            colour[far] = _mean(distance_far.reshape(shape), self._rgb[::FAR_STEP][index_far.reshape(shape)])
+        mark = np.where(distance[:, 0] <= self._reach, self._mark[index[:, 0]], FILLED)
+        return colour, mark.astype(np.uint8)
+
+
+def _mean(distance: npt.NDArray[np.floating], rgb: F32) -> F32:
+    """(M, 3) means of colours (M, K, 3), weighted by the inverse square of their distance (M, K)."""
+    weight = (1.0 / (distance**2 + 1e-4)).astype(np.float32)
+    mean: F32 = np.einsum("mk,mkc->mc", weight, rgb) / weight.sum(axis=1, keepdims=True)
+    return mean
 
 
 @dataclass(frozen=True)
@@ -85,7 +103,7 @@ def seen_points(page: Page, every: int) -> tuple[F32, U8]:
     """Places (N, 3) and colours (N, 3) of every n-th texel each way that a photo saw."""
     rows, columns = np.nonzero(page.seen[::every, ::every] == 255)
     rows, columns = rows * every, columns * every
-    return _texel_places(page.owner, page.flat, page.corners, rows, columns), page.rgb[rows, columns]
+    return texel_places(page.owner, page.flat, page.corners, rows, columns), page.rgb[rows, columns]
 
 
 def pad(rgb: U8, seen: U8, reach: int) -> None:
@@ -181,7 +199,8 @@ def _interpolate(rgb, seen, owner, flat, shape, start, step, colour, mark):  # t
 
 
 @njit(cache=True, parallel=True)
-def _texel_places(owner, flat, corners, rows, columns):  # type: ignore[no-untyped-def]
+def texel_places(owner, flat, corners, rows, columns):  # type: ignore[no-untyped-def]
+    """(N, 3) local metres of texels at rows and columns (N,) of a page, on the faces that own them."""
     out = np.empty((len(rows), 3), np.float32)
     for i in prange(len(rows)):
         f = owner[rows[i], columns[i]]

@@ -3,7 +3,8 @@
 Low frequencies are blended from all candidates of a face, weighted by distance (nearer counts more) and angle;
 what is finer comes from the one chosen photo, faded into its neighbour's over the triangles along a seam. Colour
 is a function of the place on the surface alone, so charts meet without seams. What no photo saw is coloured from
-the cloud's points, else from around, and marked so. Pages are painted in bands of rows and photos read when needed,
+the cloud's points; where they don't tell either, the ground goes on in its pattern (`plan.py`) and all else takes the
+mean colour around; both are marked. Pages are painted in bands of rows and photos read when needed,
 so memory is bounded by a band and a few photos.
 """
 
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from scan2sim.texturing.choose import Choice
     from scan2sim.texturing.fill import Colours, Page
     from scan2sim.texturing.photos import Exposures
+    from scan2sim.texturing.plan import Plan
 
 NEIGHBOUR_STEP = 8
 """Where points have no colour, every so many seen texels (each way) lend theirs to the unseen ones."""
@@ -56,6 +58,8 @@ class TextureParams(Params):
         bias: metres that a surface may lie behind what the depth map shows and still count as seen.
         feather: share of a photo's width over which its weight fades towards its border.
         padding: texels that colours are carried on outside of charts, for mip-maps.
+        continued: where neither photo nor coloured point tells anything, the surface goes on as around, patterns kept;
+            for what lies flat, as the ground does.
         device: what paints: "numba" the processors, "cuda" (or another device of torch) a GPU, to within one grey
             level the same; "auto": a GPU where torch and one are there.
     """
@@ -67,6 +71,7 @@ class TextureParams(Params):
     bias: Depth = 0.04
     feather: float = Field(0.04, ge=0.0001, le=0.5)
     padding: int = Field(16, ge=2, le=256)
+    continued: bool = False
     device: Device = "auto"
 
 
@@ -102,6 +107,7 @@ def texture(inputs: Inputs, params: TextureParams, out: Path, report: Report) ->
     )  # fmt: skip
     (colours, own), made = _colours_of(inputs), _made_colours(inputs)
     texels = np.zeros((len(mesh), 4), np.int64)
+    plan = _plan(mesh, sizes, inputs) if params.continued else None
     writer = Writer()
     for k, size in enumerate(sizes):
         faces = np.flatnonzero(mesh.page == k)
@@ -110,12 +116,64 @@ def texture(inputs: Inputs, params: TextureParams, out: Path, report: Report) ->
             lambda f, m="", k=k: report((k + f) / len(sizes), f"page {k + 1} of {len(sizes)} {m}"),
         )  # fmt: skip
         texels[faces] = _finish(page, faces, mesh, colours, None if own else made, params)
+        if plan is not None:
+            plan.add(page)
         writer.write(folder / f"page_{k}", page)
         del page
     writer.finish()
+    if plan is not None and texels[:, 3].any():
+        report(1.0, "ground goes on")
+        _go_on(plan, folder, mesh, texels[:, 3] > 0, params)
     skipped = sorted(painter.photos.skipped.values())
     warnings = [f"{reason}: not used for texture, other photos stand in" for reason in skipped]
     return Done({"textured": folder}, _facts(mesh, texels, sizes, painter), warnings)
+
+
+def _plan(mesh: Mesh, sizes: Sequence[dict[str, int]], inputs: Inputs) -> Plan:
+    """The picture from above of an unwrapped mesh, with the classes of the ground's points."""
+    from scan2sim.pipeline.types import PointCloud
+    from scan2sim.texturing.plan import Plan
+
+    cloud = PointCloud.load(inputs["cloud.terrain"])
+    return Plan(mesh, _texel(mesh, sizes), cloud.xyz, _labels(cloud))
+
+
+def _texel(mesh: Mesh, sizes: Sequence[dict[str, int]]) -> float:
+    """Metres that a texel spans where they are fine: of the first quarter of the faces."""
+    import numpy as np
+
+    assert mesh.uv is not None and mesh.page is not None
+    pixels = np.array([size["width"] * size["height"] for size in sizes], np.float64)[mesh.page]
+    u, v = mesh.uv[:, 1] - mesh.uv[:, 0], mesh.uv[:, 2] - mesh.uv[:, 0]
+    texels = np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]) / 2 * pixels
+    return float(np.percentile(np.sqrt(mesh.face_area / np.maximum(texels, 1e-9)), 25))
+
+
+def _go_on(plan: Plan, folder: Path, mesh: Mesh, wanting: npt.NDArray[np.bool_], params: TextureParams) -> None:
+    """Paint the pages of the faces that are `wanting` (F,) once more, where the ground goes on."""
+    import numpy as np
+
+    from scan2sim.pipeline.io import image
+    from scan2sim.texturing import blend, fill
+
+    ground = plan.go_on()
+    if ground is None:
+        return
+    assert mesh.page is not None and mesh.uv is not None
+    writer = Writer()
+    for k in np.unique(mesh.page[wanting]).tolist():
+        faces, path = np.flatnonzero(mesh.page == k), folder / f"page_{k}"
+        rgb, seen = (
+            image.read_rgb(path.with_name(f"{path.name}.png")),
+            image.read_levels(path.with_name(f"{path.name}_seen.png")),
+        )
+        assert rgb is not None and seen is not None  # both have just been written
+        flat = blend.texels(mesh.uv[faces], seen.shape[1], seen.shape[0])
+        page = fill.Page(rgb, seen, blend.owners(flat, seen.shape[1], seen.shape[0]), flat, mesh.corners[faces])
+        ground.paint(page)
+        fill.pad(page.rgb, page.seen, params.padding)
+        writer.write(path, page)
+    writer.finish()
 
 
 class Writer:
@@ -335,8 +393,13 @@ def _colours_of(inputs: Inputs) -> tuple[Colours | None, bool]:
     cloud = PointCloud.join(clouds)
     if cloud.rgb is None:
         return Colours(cloud.xyz, shaded(_labels(cloud), cloud.normal), FILLED), False
-    real = len(cloud) - sum(len(PointCloud.load(inputs[name])) for name in made)
-    return Colours(cloud.xyz, cloud.rgb, np.where(np.arange(len(cloud)) < real, FROM_POINTS, FILLED)), True
+    real = np.arange(len(cloud)) < len(cloud) - sum(len(PointCloud.load(inputs[name])) for name in made)
+    known = cloud.coloured
+    if not known.any():
+        return None, False
+    return Colours(
+        cloud.xyz[known], cloud.rgb[known], np.where(real, FROM_POINTS, FILLED)[known].astype(np.uint8)
+    ), True
 
 
 def _made_colours(inputs: Inputs) -> tuple[F32, U8]:
@@ -427,4 +490,4 @@ def can_texture(params: TextureParams) -> None:
         need(f"texture.device {params.device}", "torch")
 
 
-TEXTURE = Step("texture", 2, texture, TextureParams, check=can_texture)
+TEXTURE = Step("texture", 3, texture, TextureParams, {"terrain": {"continued": True}}, can_texture)

@@ -10,13 +10,15 @@ import numpy.typing as npt
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.io.image import read_rgb
 from scan2sim.pipeline.types import F32, F64, U8, Camera
+from scan2sim.pipeline.types import UNCOLOURED as GREY
 
 Bools = npt.NDArray[np.bool_]
 
-COLOUR_REACH = 0.5  # metres over which a point that its own photo doesn't show borrows a colour
+COLOUR_REACH = 0.2  # metres over which a point that its own photo doesn't show borrows a colour
 COLOUR_VOXEL = 0.1
+BIN = np.radians([0.3, 0.5])  # across and down, within which what is nearer hides what is farther
+BEHIND = 1.3  # times as far: the road itself recedes by so much within a bin
 NEAREST = 0.5  # metres: what is nearer to the lens gets no colour from it
-GREY = 128
 
 
 def read_bin(path: Path) -> tuple[F32, F32]:
@@ -70,7 +72,7 @@ def colour(
 ) -> None:
     """Fill `rgb` and `seen` (N,) of points (N, 3) that fall into the photo and no earlier one has shown.
 
-    Whether something stands between is not looked at: camera and scanner must be close to each other.
+    The points are those of the sweep taken beside it: what lies well behind others of them in the photo is hidden.
 
     Args:
         mask: (H, W), 0 where the photo must not be used.
@@ -89,13 +91,32 @@ def colour(
         raise InputError(photo, f"is {size}, but its calibration says {camera.width}x{camera.height}", remedy)
     local = (world - T_world_cam[:3, 3]) @ T_world_cam[:3, :3]
     uv, valid = project(camera, local)
-    good = valid & inside(camera, uv) & ~seen & (np.einsum("ij,ij->i", local, local) > NEAREST**2)
+    distance = np.linalg.norm(local, axis=1)
+    good = valid & inside(camera, uv) & (distance > NEAREST)
+    good[good] = ~_hidden(uv[good], distance[good], camera)
+    good &= ~seen
     u, v = np.clip(np.rint(uv[good]).astype(int), 0, [camera.width - 1, camera.height - 1]).T
     if mask is not None:
         shown = mask[v, u] > 0
         good[good], u, v = shown, u[shown], v[shown]
     rgb[good] = image[v, u]
     seen |= good
+
+
+def _hidden(uv: F64, distance: F64, camera: Camera) -> Bools:
+    """(N,) which points at pixels (N, 2) lie well behind others of the sweep in the same or the next column of bins.
+
+    Bins are as high as scan lines are apart: the road's own points, one line behind the other, hide none.
+    """
+    from scan2sim.pipeline.cameras import pixel_angle
+
+    bins = np.maximum(BIN / pixel_angle(camera), 1.0)  # pixels
+    width, height = np.ceil([camera.width, camera.height] / bins).astype(int)
+    u, v = np.clip(np.floor((uv + 0.5) / bins).astype(int), 0, [width - 1, height - 1]).T
+    nearest = np.full((height, width + 2), np.inf)
+    np.minimum.at(nearest, (v, u + 1), distance)
+    around = np.minimum(nearest[v, u], np.minimum(nearest[v, u + 1], nearest[v, u + 2]))
+    return np.asarray(distance > BEHIND * around + NEAREST, bool)
 
 
 def borrow_colours(xyz: F32, rgb: U8, seen: Bools, distance: F32) -> U8:

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from scan2sim.pipeline.types import F64, Frame, PointCloud
+from scan2sim.pipeline.types import F64, UNCOLOURED, Frame, PointCloud
 
 QUANTUM = 0.001
 """CRS units, of coordinates; a whole number of them makes a unit, so that tiles with whole offsets agree on them."""
-GREY, UNCLASSIFIED = 128, 1
+UNCLASSIFIED = 1
 POINT = np.dtype(
     [("place", "<i4", 3), ("rgb", "u1", 3), ("label", "u1"), ("time", "<f8"), ("intensity", "<u2"), ("own", "?")]
 )
@@ -61,7 +61,7 @@ class Spool:
             cloud, places = cloud.take(good), places[good]
         rows = np.zeros(len(cloud), POINT)
         rows["place"] = places
-        rows["rgb"] = GREY if cloud.rgb is None else cloud.rgb
+        rows["rgb"] = UNCOLOURED if cloud.rgb is None else cloud.rgb
         rows["label"] = UNCLASSIFIED if cloud.label is None else cloud.label
         for name in ("time", "intensity"):
             if (values := getattr(cloud, name)) is not None:

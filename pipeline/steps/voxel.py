@@ -68,14 +68,17 @@ def sample(cloud: PointCloud, size: float) -> PointCloud:
     counts = np.diff(np.append(starts, len(order)))
     first = order[starts]
 
-    def mean(values: np.ndarray) -> np.ndarray:
-        total = np.stack([np.add.reduceat(column[order].astype(np.float64), starts) for column in values.T], axis=1)
-        return total / counts[:, None]
+    def mean(values: np.ndarray, weight: np.ndarray | None = None) -> np.ndarray:
+        weighted = values if weight is None else values * weight[:, None]
+        total = np.stack([np.add.reduceat(column[order].astype(np.float64), starts) for column in weighted.T], axis=1)
+        return total / (counts if weight is None else np.add.reduceat(weight[order], starts))[:, None]
 
     thin = cloud.take(first)
     thin = replace(thin, xyz=on_grid(mean(cloud.xyz)).astype(np.float32), normal=None)
     if cloud.rgb is not None:
-        thin = replace(thin, rgb=np.rint(mean(cloud.rgb)).astype(np.uint8))
+        known = cloud.coloured  # what has no colour lends none to what has
+        weight = None if known.all() else np.where(known, 1.0, 1e-9)
+        thin = replace(thin, rgb=np.rint(mean(cloud.rgb, weight)).astype(np.uint8))
     return thin
 
 
@@ -103,4 +106,4 @@ def voxel_groups(xyz: F32, size: float) -> tuple[np.ndarray, np.ndarray]:  # typ
     return order, starts
 
 
-VOXEL = Step("voxel", 2, voxel, VoxelParams)
+VOXEL = Step("voxel", 3, voxel, VoxelParams)

@@ -102,6 +102,37 @@ def test_unseen_texels_get_the_colours_of_the_points(street):
     assert done.facts["coverage"] == 0 and done.facts["coloured_m2"] == pytest.approx(100, rel=0.02)
 
 
+def test_points_without_a_colour_lend_none(street):
+    cloud = points()
+    grey = cloud.xyz[:, 0] > 0.5
+    cloud.rgb[grey] = 128
+    street.clouds["terrain"] = cloud
+    rgb, seen, truth, x, _ = from_above(street.run()[0])
+    assert (seen[x < 0] == 128).all() and (seen[x > 1] == 64).all()
+    far = x > 1
+    assert (rgb[far] == 128).all(axis=-1).mean() < 0.01  # flat grey is what nothing at all is known of
+    assert abs(rgb[far].mean() - truth[x < 0].mean()) < 25
+
+
+def test_the_ground_goes_on_where_no_photo_saw_it(street):
+    for pose in POSES:
+        street.add(CAMERAS["pinhole"], pose)
+    cloud = points()
+    cloud.rgb[:] = 128
+    street.clouds["terrain"] = cloud
+    flat, *_ = from_above(street.run()[0])
+    folder, done = street.run(continued=True)
+    rgb, seen, truth, x, y = from_above(folder)
+    unseen = (seen == 64) & apart_from_the_box(x, y)
+    assert unseen.mean() > 0.01 and done.facts["filled_m2"] > 1
+
+    def apart(image):
+        return np.abs(image - truth)[unseen].mean()
+
+    assert apart(rgb) < 0.8 * apart(flat) and apart(rgb) < 0.6 * np.abs(128 - truth)[unseen].mean()
+    assert (flat[seen == 255] == rgb[seen == 255]).all(axis=-1).mean() > 0.97  # but where lookups mix both
+
+
 def test_the_classes_left_out_lend_no_colours(street):
     street.clouds["terrain"], street.clouds["rest"] = points(rgb=(10, 200, 10)), points(rgb=(255, 0, 0))
     rgb, *_ = from_above(street.run()[0])

@@ -177,7 +177,7 @@ def test_without_oxts_a_pose_file_makes_a_local_tile(drive: Drive, tmp_path: Pat
 
 
 def test_borrowed_colours_come_from_the_nearest_within_reach() -> None:
-    xyz = np.array([[0, 0, 0], [10, 0, 0], [0.3, 0, 0], [10.2, 0, 0], [5, 0, 0]], np.float32)
+    xyz = np.array([[0, 0, 0], [10, 0, 0], [0.15, 0, 0], [10.1, 0, 0], [5, 0, 0]], np.float32)
     rgb = np.array([[1, 2, 3], [7, 8, 9], [0, 0, 0], [0, 0, 0], [0, 0, 0]], np.uint8)
     out = borrow_colours(xyz, rgb, np.array([True, True, False, False, False]), np.ones(5, np.float32))
     assert out.tolist() == [[1, 2, 3], [7, 8, 9], [1, 2, 3], [7, 8, 9], [GREY] * 3]

@@ -1,0 +1,107 @@
+"""The ground from above, while its pages are painted: what photos saw of it goes on where none did.
+
+Import late: it loads numba.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from scan2sim.pipeline.heightfield import MOST
+from scan2sim.pipeline.types import F32, U8, Mesh
+from scan2sim.texturing.continuation import FACTOR, continued
+from scan2sim.texturing.fill import FILLED, Page, texel_places
+
+CELL = 0.03
+"""Metres of the picture's cells: grain, joints and markings, for a fraction of the texels."""
+
+Bools = npt.NDArray[np.bool_]
+
+
+class Plan:
+    """A picture of the ground from above.
+
+    Args:
+        mesh: the ground's.
+        texel: metres.
+        xyz, label: places (N, 3) and classes (N,) of its points: road isn't continued by grass.
+    """
+
+    def __init__(self, mesh: Mesh, texel: float, xyz: F32, label: U8) -> None:
+        low, high = mesh.vertices[:, :2].min(axis=0), mesh.vertices[:, :2].max(axis=0)
+        self.cell = max(CELL, texel, float(np.sqrt(np.prod(high - low + 1) / MOST)))
+        self.low, self._xyz, self._label = low.astype(np.float64), xyz, label
+        columns, rows = (np.ceil((high - low) / self.cell).astype(int) + 1).tolist()
+        self._sum, self._count = np.zeros((rows, columns, 3), np.float32), np.zeros((rows, columns), np.float32)
+        self._wanted = np.zeros((rows, columns), bool)
+
+    def add(self, page: Page) -> None:
+        """Take up what a page shows, and where it has been filled for want of something better."""
+        height = len(page.owner)
+        for first in range(0, height, 1024):  # places take many times a page's bytes
+            rows = slice(first, min(height, first + 1024))
+            for mask, seen in ((page.seen[rows] == 255, True), (page.seen[rows] == FILLED, False)):
+                row, column = np.nonzero(mask)
+                y, x = self.at(texel_places(page.owner, page.flat, page.corners, row + first, column))
+                if seen:
+                    flat = y * self._count.shape[1] + x
+                    for k in range(3):
+                        np.add.at(self._sum[..., k].reshape(-1), flat, page.rgb[row + first, column, k])
+                    np.add.at(self._count.reshape(-1), flat, np.float32(1))
+                else:
+                    self._wanted[y, x] = True
+
+    def go_on(self) -> Continued | None:
+        """The ground as it goes on where no photo saw it; None where none is wanted, or nothing is known."""
+        known = self._count > 0
+        self._wanted &= ~known
+        if not self._wanted.any() or not known.any():
+            return None
+        rgb = (self._sum / np.maximum(self._count, 1)[..., None]).astype(np.float32)
+        picture, filled = continued(rgb, known, _whole(self._wanted, known), self._kind())
+        return Continued(self, picture.astype(np.uint8), filled & self._wanted)
+
+    def _kind(self) -> npt.NDArray[np.int32]:
+        """Class of the nearest point for every coarse cell; -1 far from all."""
+        from scipy import ndimage
+
+        shape = tuple(-(-n // FACTOR) for n in self._count.shape)
+        kind = np.full(shape, -1, np.int32)
+        if not len(self._xyz):
+            return kind
+        y, x = self.at(self._xyz)
+        kind[y // FACTOR, x // FACTOR] = self._label
+        nearest = ndimage.distance_transform_edt(kind < 0, return_distances=False, return_indices=True)
+        return kind[tuple(nearest)]
+
+    def at(self, places: F32) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+        """Rows and columns (N,) of places (N, 3)."""
+        index = np.floor((places[:, :2] - self.low) / self.cell).astype(np.int64)
+        rows, columns = self._count.shape
+        return index[:, 1].clip(0, rows - 1), index[:, 0].clip(0, columns - 1)
+
+
+class Continued:
+    """The ground as it goes on: lends its colours to texels that nothing better is known of."""
+
+    def __init__(self, plan: Plan, picture: U8, filled: Bools) -> None:
+        self._plan, self._picture, self._filled = plan, picture, filled
+
+    def paint(self, page: Page) -> None:
+        """Colour the texels that are marked filled, in place, where the ground was continued."""
+        height = len(page.owner)
+        for first in range(0, height, 1024):
+            row, column = np.nonzero(page.seen[first : first + 1024] == FILLED)
+            row += first
+            y, x = self._plan.at(texel_places(page.owner, page.flat, page.corners, row, column))
+            here = self._filled[y, x]
+            page.rgb[row[here], column[here]] = self._picture[y[here], x[here]]
+
+
+def _whole(wanted: Bools, known: Bools) -> Bools:
+    """What is wanted, without pinholes: cells that no texel's middle fell into."""
+    import cv2
+
+    any_ = np.asarray(cv2.morphologyEx((wanted | known).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)))
+    return (any_ > 0) & ~known
