@@ -22,6 +22,8 @@ SEEN = (0.2, 0.6)
 """Shares of the surface seen by photos below which a world is poor, and below which it is worth a note."""
 MOVED = 0.05
 """Share of the points that moved beyond which they are worth a note."""
+REMAINS = 0.5
+"""Square metres of surface where a vehicle was taken out beyond which the place is poor: a bonnet's half."""
 LEFT_OUT = 0.1
 """Share of the photos left out beyond which a world is poor."""
 NAMED = 3
@@ -48,7 +50,8 @@ class Finding:
 def findings(done: Mapping[str, Manifest]) -> list[Finding]:
     """All findings of a run, worst first; those of a level and weight in the order of the steps."""
     facts = {label: manifest.facts for label, manifest in done.items()}
-    found = [*_cameras(facts), *_held_out(facts), *_unseen(facts), *_moved(facts), *_disagreeing(facts)]
+    told = (_cameras, _held_out, _unseen, _remains, _moved, _disagreeing)
+    found = [one for tell in told for one in tell(facts)]
     found += [Finding("note", label, text) for label, manifest in done.items() for text in manifest.warnings]
     return sorted(found, key=lambda one: (LEVELS.index(one.level), -one.weight))
 
@@ -108,6 +111,19 @@ def _unseen(facts: Facts) -> Iterator[Finding]:
             "texture",
             f"{1 - seen:.0%} of the surface was never seen by a photo: it has the points' colours, or made-up ones",
             1 - seen,
+        )
+
+
+def _remains(facts: Facts) -> Iterator[Finding]:
+    left = facts.get("score", {}).get("remains_m2", [])
+    bad = sorted((area for area in left if area > REMAINS), reverse=True)
+    if bad:
+        yield Finding(
+            "poor",
+            "score",
+            f"{_of(len(bad), len(left), 'vehicle')} not wholly gone: up to {bad[0]:.1f} m2 of surface stand where "
+            "one was taken out",
+            len(bad) / len(left),
         )
 
 

@@ -231,7 +231,7 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
     if tile.truth_mesh and tile.truth_points:
         truth = {"truth.mesh": tile.truth_mesh, "truth.points": tile.truth_points}
     add(GEOMETRY, meshes | clouds | invented | truth, **cell)
-    add(SCORE, textured | {name: seen[name] for name in ("views", "depth")} | truth)
+    add(SCORE, textured | {name: seen[name] for name in ("views", "depth")} | listed | truth)
     stages = {f"decimate.{g}": at(f"decimate.{g}", "mesh") for g in groups}
     if met:
         mine = {f"textured.{g}": at(f"level.{g}", "textured") for g in groups}

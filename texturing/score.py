@@ -52,11 +52,13 @@ def score(inputs: Inputs, params: ScoreParams, out: Path, report: Report) -> Don
     is), `psnr_gain_db` (after a gain a channel), `ssim` and `sharpness`; `photos`, the same for each, and `coverage`,
     0 where no other photo saw anything of what it shows; `by_class` and `by_distance`, the same but sharpness of all
     their pixels; `truth_psnr_db` and `truth_psnr_near_db` for generated tiles; `cameras`: how many there are
-    (`count`), and metres to the nearest surface for those that are within `CLEARANCE` of one (`near_m`).
+    (`count`), and metres to the nearest surface for those that are within `CLEARANCE` of one (`near_m`). Where `things`
+    are listed, `remains_m2`: surface left of each vehicle that was taken out (`pipeline.remains`).
     """
     import numpy as np
 
     from scan2sim.pipeline.io import views as views_io
+    from scan2sim.pipeline.remains import left_of_vehicles
     from scan2sim.pipeline.render import Renderer, textured
     from scan2sim.pipeline.steps.pictures import Album
     from scan2sim.texturing import evaluate
@@ -98,6 +100,9 @@ def score(inputs: Inputs, params: ScoreParams, out: Path, report: Report) -> Don
         report(0.9, "true colours")
         facts |= _truth(inputs, world, params)
     facts["cameras"] = _cameras(world, views)
+    if "things" in inputs:
+        left = left_of_vehicles([body.mesh for body in world.bodies], inputs["things"])
+        facts["remains_m2"] = [round(area, 2) for area in left]
     return Done({"error": album.folder}, facts, warnings)
 
 

@@ -73,6 +73,12 @@ def test_a_tile_without_photos_is_not_told_that_none_saw_it() -> None:
     assert not findings(run_of(views={"usable": 0}, **{"texture.terrain": {"seen_m2": 0.0}}))
 
 
+def test_vehicles_that_are_not_wholly_gone() -> None:
+    assert not findings(run_of(score={"remains_m2": [0.0, 0.3]}))
+    (one,) = findings(run_of(score={"remains_m2": [0.0, 2.53, 10.2]}))
+    assert one.level == "poor" and "2 of 3 vehicles" in one.text and "10.2 m2" in one.text
+
+
 def test_photos_that_disagree() -> None:
     (one,) = findings(run_of(agreement={"left_out": ["a", "b", "c"]}))
     assert one.level == "unusable" and "3 of 8 photos" in one.text and "a, b, c" in one.text
