@@ -200,7 +200,7 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
         lists |= {"plants": at("plants", "geojson"), "plants_csv": at("plants", "csv")}
 
     if photographed and settings.params(REFINE).when == "auto":
-        add(REFINE, meshes | clouds | moving | seen)
+        add(REFINE, meshes | {"cloud.rest": clouds["cloud.rest"]} | moving | seen)
         seen = {"views": at("refine", "views")}
     add(VISIBILITY, meshes | clouds | moving | seen)
     seen = seen | {"depth": at("visibility", "depth")}

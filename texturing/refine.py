@@ -1,7 +1,7 @@
 """Refine: the photos' poses, so that all of them show the same place of the surface at the same place.
 
-Corners of every photo are found again in those around it (`texturing.matches`), over the surface that the meshes and
-the cloud are; poses are then solved for all at once, with one correction a camera, held by the surface and by how wrong
+Corners of every photo are found again in those around it (`texturing.matches`), over the surface that the meshes are;
+poses are then solved for all at once, with one correction a camera, held by the surface and by how wrong
 poses can be (`texturing.bundle`). Photos that are held out of texturing move nobody: they take their camera's
 correction, and between their neighbours' own.
 """
@@ -74,7 +74,7 @@ class RefineParams(Params):
 
 
 def refine(inputs: Inputs, params: RefineParams, out: Path, report: Report) -> Done:
-    """Refine the poses of `views` over the surface of `mesh.*` and `cloud.*`, apart from what is `moving`.
+    """Refine the poses of `views` over the surface `mesh.*`, apart from what can move of `cloud.*`, and `moving`.
 
     File: `views`, as it was but for poses; those to the last bit where nothing is to be gained. Facts: `matches`;
     `displaced_px` and `displaced_after_px`, medians over them; whether poses were `moved`; `cameras` and `photos`, what
@@ -176,17 +176,19 @@ def _pictures(photos: Sequence[View], used: Sequence[int]) -> dict[int, Picture]
 
 
 def _surface(inputs: Inputs) -> tuple[Scene, Scene]:
-    """What hides, and of it what can move."""
+    """The meshes, all of them, and what can move of the clouds."""
     import numpy as np
 
     from scan2sim.pipeline import visibility as kernel
     from scan2sim.pipeline.types import Mesh, PointCloud
 
     meshes = [Mesh.load(path) for name, path in inputs.items() if name.startswith("mesh.")]
-    cloud = PointCloud.join([PointCloud.load(path) for name, path in inputs.items() if name.startswith("cloud.")])
-    can_move = np.zeros(len(cloud), bool) if cloud.label is None else np.isin(cloud.label, kernel.MOVABLE)
+    clouds = [PointCloud.load(path) for name, path in inputs.items() if name.startswith("cloud.")]
+    cloud = PointCloud.join(clouds) if clouds else None
+    if cloud is not None and cloud.label is not None:
+        cloud = cloud.take(np.isin(cloud.label, kernel.MOVABLE))
     moving = PointCloud.load(inputs["moving"]) if "moving" in inputs else None
-    return kernel.scene(meshes, cloud, moving=moving), kernel.scene([], cloud.take(can_move), moving=moving)
+    return kernel.scene(meshes), kernel.scene([], cloud, moving=moving)
 
 
 def _matched(
