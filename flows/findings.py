@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from scan2sim.pipeline.classes import GROUPS
+from scan2sim.pipeline.classes import SURFACES
 from scan2sim.pipeline.store import Manifest
 
 Level = Literal["unusable", "poor", "note"]
@@ -102,7 +102,7 @@ def _held_out(facts: Facts) -> Iterator[Finding]:
 def _unseen(facts: Facts) -> Iterator[Finding]:
     if not facts.get("views", {}).get("usable"):
         return
-    painted = [facts[f"texture.{group}"] for group in GROUPS if f"texture.{group}" in facts]
+    painted = [facts[f"texture.{group}"] for group in SURFACES if f"texture.{group}" in facts]
     area = sum(one.get("area_m2", 0.0) for one in painted)
     seen = sum(one.get("seen_m2", 0.0) for one in painted) / area if area else 1.0
     if seen < SEEN[1]:

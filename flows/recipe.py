@@ -149,11 +149,14 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
     if path and settings.params(FURNITURE).when == "auto":
         add(FURNITURE, {"cloud": cloud} | scanner, **cell)
         standing = {name: at("furniture", name) for name in ("taken", "building", "vegetation", "geojson", "csv")}
-    add(SPLIT, {"cloud": cloud} | {name: standing[name] for name in standing if name == "taken"})
+    kept = listed if settings.params(SPLIT).vehicles == "keep" else {}
+    add(SPLIT, {"cloud": cloud} | kept | {name: standing[name] for name in standing if name == "taken"})
 
     vegetation = settings.params(SPLIT).vegetation
     groups = [g for g in GROUPS if g != "vegetation" or vegetation != "locations"]
-    for part in (*GROUPS, "rest"):
+    groups += ["vehicle"] if kept else []
+    parted = (*GROUPS, "rest", "vehicle") if kept else (*GROUPS, "rest")
+    for part in parted:
         add(VOXEL, {"cloud": at("split", part)} | scanner, part)
     made: dict[str, dict[str, Path | Output]] = {}  # by group, what no airborne scanner sees
     around = {"name": tile.name, "buffer": tile.cell.buffer, **cell} if tile.cell else {}
@@ -189,7 +192,7 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
         things = {"furniture": standing[group]} if group in standing else {}
         add(DECIMATE, {"mesh": surface, **things}, group, keep_border=bool(cell))
     meshes = {f"mesh.{g}": at(f"decimate.{g}", "mesh") for g in groups}
-    clouds = {f"cloud.{part}": at(f"voxel.{part}", "cloud") for part in (*GROUPS, "rest")}
+    clouds = {f"cloud.{part}": at(f"voxel.{part}", "cloud") for part in parted}
     own = {"cloud.furniture": at("split", "furniture")} if standing else {}
     invented = {f"made.{group}": points["made"] for group, points in made.items()}
     lists: dict[str, Path | Output] = {}

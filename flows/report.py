@@ -14,7 +14,7 @@ from scan2sim.flows import gazebo
 from scan2sim.flows.execute import versions
 from scan2sim.flows.findings import findings
 from scan2sim.flows.planning import Planned
-from scan2sim.pipeline.classes import GROUPS
+from scan2sim.pipeline.classes import SURFACES
 from scan2sim.pipeline.io import crs
 from scan2sim.pipeline.store import Manifest, Store
 from scan2sim.pipeline.types import Tile
@@ -55,7 +55,7 @@ def figures(tile: Tile, done: Mapping[str, Manifest]) -> dict[str, Any]:
     for group, values in facts["geometry"].items():
         for name, value in values.items():
             geometry.setdefault(name, {})[group] = value
-    seen = {g: facts[f"texture.{g}"] for g in GROUPS if f"texture.{g}" in facts}
+    seen = {g: facts[f"texture.{g}"] for g in SURFACES if f"texture.{g}" in facts}
     area = sum(s.get("area_m2", 0.0) for s in seen.values())
     texture: dict[str, Any] = {
         "coverage": round(sum(s.get("seen_m2", 0.0) for s in seen.values()) / area, 4) if area else 0.0,
@@ -106,7 +106,7 @@ def _render(
     return environment.get_template(TEMPLATE).render(
         body=body,
         pictures=pictures,
-        groups=GROUPS,
+        groups=SURFACES,
         gazebo=opened,
         view=view and {**view, "folder": SCRIPTS, "about": {name: view[name] for name in ("start", "walk", "turn")}},
         script=Markup((PAGES / "walk.js").read_text(encoding="utf-8")),

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-from scan2sim.pipeline.classes import GROUPS
+from scan2sim.pipeline.classes import SURFACES
 from scan2sim.pipeline.errors import InputError, SettingError
 from scan2sim.pipeline.io import toml
 from scan2sim.pipeline.step import Params, Step
@@ -65,7 +65,7 @@ class Settings:
                 raise SettingError(name, "must be a table of parameters", f"Write [{name}] or --set {name}.param=value")
             fields = known[name].params.model_fields
             for key, value in table.items():
-                special = key in GROUPS and isinstance(value, Mapping)
+                special = key in SURFACES and isinstance(value, Mapping)
                 if special and name not in by_class:
                     raise SettingError(f"{name}.{key}", "this step is not run per class", f"Set {name}.param instead")
                 for param in value if special else (key,):
@@ -80,7 +80,7 @@ class Settings:
         """
         table = self.values.get(step.name, {})
         classes: dict[str, Mapping[str, Any]] = {
-            k: v for k, v in table.items() if k in GROUPS and isinstance(v, Mapping)
+            k: v for k, v in table.items() if k in SURFACES and isinstance(v, Mapping)
         }
         general = {k: v for k, v in table.items() if k not in classes}
         special = classes.get(group or "", {})

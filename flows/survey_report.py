@@ -19,7 +19,7 @@ import numpy.typing as npt
 from scan2sim.flows import gazebo
 from scan2sim.flows.execute import versions
 from scan2sim.flows.report import write_whole
-from scan2sim.pipeline.classes import GROUPS
+from scan2sim.pipeline.classes import SURFACES
 from scan2sim.pipeline.errors import from_os_error
 
 F64 = npt.NDArray[np.float64]
@@ -200,7 +200,7 @@ def _render(body: Mapping[str, Any], tiles: Sequence[TileState], path: F64, open
         map=_map(tiles, path),
         warnings=sorted(warnings.items(), key=lambda told: (-told[1], told[0])),
         thumbnails={tile.name: _thumbnail(tile.thumbnail) for tile in tiles if tile.thumbnail},
-        groups=GROUPS,
+        groups=SURFACES,
         gazebo=opened,
         shown=SHOWN,
     )

@@ -16,8 +16,10 @@ import numpy.typing as npt
 
 from scan2sim.pipeline.errors import SettingError
 
-Group = Literal["terrain", "building", "vegetation"]
+Group = Literal["terrain", "building", "vegetation", "vehicle"]
 GROUPS: tuple[Group, ...] = ("terrain", "building", "vegetation")
+SURFACES: tuple[Group, ...] = (*GROUPS, "vehicle")
+"""All that a world may have: the groups, and what is parked where `split.vehicles` keeps it."""
 
 
 class PointClass(NamedTuple):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from scan2sim.pipeline.classes import GROUPS
+from scan2sim.pipeline.classes import SURFACES
 from scan2sim.pipeline.step import Done, Inputs, Report, Step
 from scan2sim.pipeline.steps.clip import CellParams
 
@@ -28,7 +28,7 @@ def borders(inputs: Inputs, params: CellParams, out: Path, report: Report) -> Do
     found: dict[str, dict[str, dict[str, float]]] = {}
     for i, name in enumerate(names):
         report(i / len(names), name)
-        for group in GROUPS:
+        for group in SURFACES:
             if f"textured.{group}.{name}" in inputs:
                 own, other = (textured.read(inputs[key]) for key in (f"textured.{group}", f"textured.{group}.{name}"))
                 if own is not None and other is not None:

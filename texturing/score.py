@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
 
-from scan2sim.pipeline.classes import GROUPS
+from scan2sim.pipeline.classes import SURFACES
 from scan2sim.pipeline.ranges import Reach
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
@@ -63,7 +63,7 @@ def score(inputs: Inputs, params: ScoreParams, out: Path, report: Report) -> Don
     from scan2sim.pipeline.steps.pictures import Album
     from scan2sim.texturing import evaluate
 
-    groups = [g for g in GROUPS if g in inputs]
+    groups = [g for g in SURFACES if g in inputs]
     world = Renderer([textured(inputs[g]) for g in groups])
     views, held = views_io.load(inputs["views"]), views_io.load_held_out(inputs["views"])
     index = [i for i, out_ in enumerate(held) if out_]
@@ -101,7 +101,8 @@ def score(inputs: Inputs, params: ScoreParams, out: Path, report: Report) -> Don
         facts |= _truth(inputs, world, params)
     facts["cameras"] = _cameras(world, views)
     if "things" in inputs:
-        left = left_of_vehicles([body.mesh for body in world.bodies], inputs["things"])
+        others = [body.mesh for group, body in zip(groups, world.bodies, strict=True) if group != "vehicle"]
+        left = left_of_vehicles(others, inputs["things"])
         facts["remains_m2"] = [round(area, 2) for area in left]
     return Done({"error": album.folder}, facts, warnings)
 

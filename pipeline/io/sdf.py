@@ -28,7 +28,10 @@ from scan2sim.pipeline.classes import CODE
 from scan2sim.pipeline.io import crs
 from scan2sim.pipeline.types import Frame
 
-LABEL = {"terrain": CODE["terrain"], "building": CODE["building"], "vegetation": CODE["high_vegetation"]}
+LABEL = {
+    "terrain": CODE["terrain"], "building": CODE["building"], "vegetation": CODE["high_vegetation"],
+    "vehicle": CODE["vehicle"],
+}  # fmt: skip
 HEADROOM = 500.0
 """Metres that a level reaches above and below its tile: whatever flies over it sees it."""
 Vector = tuple[float, float, float]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from pydantic import Field
 
-from scan2sim.pipeline.classes import GROUPS
+from scan2sim.pipeline.classes import SURFACES
 from scan2sim.pipeline.errors import DataError, StepError
 from scan2sim.pipeline.ranges import Seed
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
@@ -37,7 +37,7 @@ class CollisionParams(Params):
 
 
 def collision(inputs: Inputs, params: CollisionParams, out: Path, report: Report) -> Done:
-    """Simplify `terrain` and `building` (and `vegetation`, if asked) into one mesh.
+    """Simplify `terrain`, `building` and `vehicle` (and `vegetation`, if asked) into one mesh.
 
     They are simplified together, so the budget goes where the error would be greatest. Borders are
     kept where the budget allows it (or always, with `keep_border`); if not, a warning says so.
@@ -50,7 +50,8 @@ def collision(inputs: Inputs, params: CollisionParams, out: Path, report: Report
     """
     from scan2sim.pipeline.steps.decimate import simplify, with_things
 
-    groups = ("terrain", "building", "vegetation") if params.vegetation else ("terrain", "building")
+    left_out = {"vegetation"} if not params.vegetation else set()
+    groups = tuple(g for g in SURFACES if g not in left_out and (g in inputs or g != "vehicle"))
     whole = _joined(inputs, groups)
     source, things = _parted(whole, params.triangles)
     report(0.1, f"{len(whole):,} triangles")
@@ -88,7 +89,7 @@ def _joined(inputs: Inputs, groups: tuple[str, ...]) -> Mesh:
 
     from scan2sim.pipeline.types import Mesh
 
-    read = {group: Mesh.load(inputs[group]) for group in GROUPS if group in inputs}
+    read = {group: Mesh.load(inputs[group]) for group in SURFACES if group in inputs}
     parts = [mesh if group in groups else _parted(mesh, MOST)[1] for group, mesh in read.items()]
     meshes = [mesh for mesh in parts if len(mesh)]
     if not meshes:

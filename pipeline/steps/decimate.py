@@ -17,7 +17,7 @@ class DecimateParams(Params):
     """How many triangles are left.
 
     Attributes:
-        target: triangles; the mission's 100 K for terrain and buildings, 300 K for vegetation.
+        target: triangles; the mission's 100 K for terrain and buildings, 300 K for vegetation; 50 K for vehicles.
         keep_border: never thin the border, be there too many triangles; set by the recipe where tiles meet.
     """
 
@@ -84,4 +84,6 @@ def simplify(mesh: Mesh, target: int, *, preserve_border: bool = True) -> Mesh:
     return Mesh(mesh.frame, vertices.astype(np.float32), faces.astype(np.int32)).keep(np.ones(len(faces), bool))
 
 
-DECIMATE = Step("decimate", 2, decimate, DecimateParams, {"vegetation": {"target": 300_000}})
+DECIMATE = Step(
+    "decimate", 2, decimate, DecimateParams, {"vegetation": {"target": 300_000}, "vehicle": {"target": 50_000}}
+)

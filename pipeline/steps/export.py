@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field
 
-from scan2sim.pipeline.classes import GROUPS
+from scan2sim.pipeline.classes import SURFACES
 from scan2sim.pipeline.errors import DataError, SettingError
 from scan2sim.pipeline.extras import need
 from scan2sim.pipeline.ranges import Coordinate, Name
@@ -83,7 +83,7 @@ def export(inputs: Inputs, params: ExportParams, out: Path, report: Report) -> D
 
     if params.gazebo and not (params.obj or params.collada):
         raise SettingError("export", "gazebo needs a mesh format", "Set export.obj=true or export.collada=true")
-    read = {group: textured.read(inputs[group]) for group in GROUPS if group in inputs}
+    read = {group: textured.read(inputs[group]) for group in SURFACES if group in inputs}
     surfaces: dict[str, Textured] = {group: surface for group, surface in read.items() if surface is not None}
     if not surfaces:
         raise DataError("export", "there is nothing to show: every surface is empty", "Check the classes of the cloud")

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
-from scan2sim.pipeline.classes import GROUPS, colour_of
+from scan2sim.pipeline.classes import SURFACES, colour_of
 from scan2sim.pipeline.io import image
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
@@ -21,7 +21,12 @@ if TYPE_CHECKING:
     from scan2sim.pipeline.render import Image
     from scan2sim.pipeline.types import F64, U8, Camera, PointCloud
 
-GROUP_RGB = {"terrain": (176, 158, 138), "building": (206, 160, 132), "vegetation": (126, 172, 104)}
+GROUP_RGB = {
+    "terrain": (176, 158, 138),
+    "building": (206, 160, 132),
+    "vegetation": (126, 172, 104),
+    "vehicle": (120, 140, 190),
+}
 SEEN_RGB = {255: (92, 160, 96), 128: (222, 170, 70), 64: (196, 84, 76)}
 EYE_HEIGHT = 1.6  # metres above the ground, a driver's
 COARSE = 0.17  # metres a pixel of the map of points, enough for every voxel to fill its own
@@ -79,7 +84,7 @@ def pictures(inputs: Inputs, params: PicturesParams, out: Path, report: Report) 
     album = Album(folder)
     cloud = PointCloud.join([PointCloud.load(file) for name, file in inputs.items() if name.startswith("cloud.")])
     path = Trajectory.load(inputs["path"]) if "path" in inputs else None
-    groups = [g for g in GROUPS if g in inputs]
+    groups = [g for g in SURFACES if g in inputs]
     plain = render.Renderer([render.Body(Mesh.load(inputs[f"decimate.{g}"]), colour=GROUP_RGB[g]) for g in groups])
     world = render.Renderer([render.textured(inputs[g]) for g in groups])
     low, high = bounds([body.mesh.vertices for body in world.bodies if len(body.mesh)] or [cloud.xyz])

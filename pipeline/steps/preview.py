@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
 
-from scan2sim.pipeline.classes import GROUPS
+from scan2sim.pipeline.classes import SURFACES
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ def preview(inputs: Inputs, params: PreviewParams, out: Path, report: Report) ->
     from scan2sim.pipeline.steps.pictures import bird_pose, bounds, driver_pose, whole_pose
     from scan2sim.pipeline.types import Trajectory
 
-    read = {group: textured.read(inputs[group]) for group in GROUPS if group in inputs}
+    read = {group: textured.read(inputs[group]) for group in SURFACES if group in inputs}
     surfaces: dict[str, Textured] = {group: surface for group, surface in read.items() if surface is not None}
     triangles = sum(map(len, surfaces.values()))
     if not 0 < triangles <= params.triangles:

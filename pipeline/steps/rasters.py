@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
 
-from scan2sim.pipeline.classes import GROUPS
+from scan2sim.pipeline.classes import SURFACES
 from scan2sim.pipeline.errors import DataError, SettingError
 from scan2sim.pipeline.ranges import Name, Texel
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
@@ -57,7 +57,7 @@ def rasters(inputs: Inputs, params: RastersParams, out: Path, report: Report) ->
     from scan2sim.pipeline.io import geotiff
     from scan2sim.pipeline.io.crs import LOCAL
 
-    bodies = {group: render.textured(inputs[group]) for group in GROUPS if group in inputs}
+    bodies = {group: render.textured(inputs[group]) for group in SURFACES if group in inputs}
     bodies = {group: body for group, body in bodies.items() if len(body.mesh)}
     if not bodies:
         raise DataError("rasters", "there is nothing to show: every surface is empty", "Check the classes of the cloud")

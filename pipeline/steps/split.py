@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-from scan2sim.pipeline.classes import GROUPS, NOISE, UNKNOWN, group_of, known, name_of
+from scan2sim.pipeline.classes import CODE, GROUPS, NOISE, UNKNOWN, group_of, known, name_of
 from scan2sim.pipeline.errors import DataError
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
-FURNITURE = len(GROUPS) + 1
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from scan2sim.pipeline.types import PointCloud
+
+FURNITURE, VEHICLE = len(GROUPS) + 1, len(GROUPS) + 2
 """Of a point, beside the groups' numbers: it is street furniture's."""
 TELL = 0.01
 """Share of points without a class from which on a run warns."""
+AROUND = 0.4
+"""Metres around a vehicle's box within which points of the class are its own: mirrors, antennas."""
 
 
 class SplitParams(Params):
@@ -21,16 +29,19 @@ class SplitParams(Params):
     Attributes:
         vegetation: "mesh" (as the mission does), "locations" (each plant's place instead of a
             mesh), or "both".
+        vehicles: "remove", or "keep" what is parked as a surface of its own (of streets with a path); what moved goes.
     """
 
     vegetation: Literal["mesh", "locations", "both"] = "mesh"
+    vehicles: Literal["remove", "keep"] = "remove"
 
 
 def split(inputs: Inputs, params: SplitParams, out: Path, report: Report) -> Done:
     """Cut the classified `cloud` into `terrain`, `building`, `vegetation` and `rest`.
 
     Signs and poles go with buildings, but for the points that `taken` (optional, `index` of an .npz) says are street
-    furniture's: they become `furniture`; vehicles, people, wires, noise and what has no class are
+    furniture's: they become `furniture`. To keep vehicles, `things` lists their boxes: points of the class in those of
+    parked ones become `vehicle`. Other vehicles, people, wires, noise and what has no class are
     left out of the surface (`rest`), though they still hide what is behind them; noise is dropped.
 
     Raises:
@@ -47,10 +58,17 @@ def split(inputs: Inputs, params: SplitParams, out: Path, report: Report) -> Don
         with np.load(inputs["taken"]) as taken:
             group[taken["index"]] = FURNITURE
     files, counts, warnings = {}, {}, []
-    parts = (*GROUPS, "rest", "furniture") if "taken" in inputs else (*GROUPS, "rest")
+    parts = [*GROUPS, "rest"] + (["furniture"] if "taken" in inputs else [])
+    if params.vehicles == "keep" and "things" in inputs:
+        group[parked(cloud, inputs["things"])] = VEHICLE
+        parts.append("vehicle")
+    elif params.vehicles == "keep":
+        warnings.append("vehicles are kept only where a path tells which are parked (and things.find looks for them)")
+    number: dict[str, int] = {name: i for i, name in enumerate(GROUPS)}
+    number |= {"furniture": FURNITURE, "vehicle": VEHICLE}
     for i, name in enumerate(parts):
         report(i / len(parts), name)
-        chosen = (group == -1) & ~np.isin(cloud.label, NOISE) if name == "rest" else group == parts.index(name)
+        chosen = (group == -1) & ~np.isin(cloud.label, NOISE) if name == "rest" else group == number[name]
         part = cloud.take(np.flatnonzero(chosen))
         part.save(out / f"{name}.npz")
         files[name] = out / f"{name}.npz"
@@ -78,4 +96,27 @@ def split(inputs: Inputs, params: SplitParams, out: Path, report: Report) -> Don
     return Done(files, {"points_in": len(cloud), "points": counts, "classes": classes}, warnings)
 
 
-SPLIT = Step("split", 3, split, SplitParams)
+def parked(cloud: PointCloud, things: Path) -> npt.NDArray[np.bool_]:
+    """(N,) which points of the class vehicle are in a box of `things` (GeoJSON of the step) that didn't move."""
+    import json
+
+    import numpy as np
+
+    inside = np.zeros(len(cloud), bool)
+    vehicle = np.flatnonzero(cloud.label == CODE["vehicle"])
+    for feature in json.loads(things.read_text(encoding="utf-8"))["features"]:
+        told = feature["properties"]
+        if told["moved"] or told["kind"] == "person":
+            continue
+        ring = np.array(feature["geometry"]["coordinates"][0][:4])
+        corners = cloud.frame.to_local(np.column_stack([ring, np.full(4, told["ground_z"])]))
+        away = cloud.xyz[vehicle] - corners.mean(axis=0)
+        own = np.abs(away[:, 2] - told["height_m"] / 2) < told["height_m"] / 2 + AROUND
+        for side in (corners[0] - corners[1], corners[1] - corners[2]):
+            length = np.linalg.norm(side)
+            own &= np.abs(away @ side) < length * (length / 2 + AROUND)
+        inside[vehicle[own]] = True
+    return inside
+
+
+SPLIT = Step("split", 4, split, SplitParams)

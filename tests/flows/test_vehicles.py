@@ -1,0 +1,92 @@
+"""Parked vehicles: left out by default, a surface of their own where asked; what moved is in no world."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from scan2sim.data_samples.layout import lay_out
+from scan2sim.data_samples.scene import build
+from scan2sim.data_samples.street import generate
+from scan2sim.flows.cli import app
+from scan2sim.flows.recipe import recipe
+from scan2sim.flows.settings import Settings
+from scan2sim.pipeline.classes import CODE
+from scan2sim.pipeline.io.tile import read_tile
+from scan2sim.pipeline.step import silent
+from scan2sim.pipeline.steps.split import SPLIT
+from scan2sim.pipeline.types import Frame, Mesh, PointCloud
+from tests.conftest import ROOT
+
+KEEP = Settings({"split": {"vehicles": "keep"}})
+STREET = ROOT / "data_samples" / "tile"
+
+
+def test_only_where_asked_there_are_steps_for_vehicles() -> None:
+    tile = read_tile(STREET)
+    plain, kept = ({node.label: node for node in recipe(tile, s)} for s in (Settings(), KEEP))
+    assert not any(label.endswith(".vehicle") for label in plain)
+    assert {"voxel.vehicle", "poisson.vehicle", "decimate.vehicle", "texture.vehicle"} <= kept.keys()
+    assert "vehicle" in kept["export"].inputs and "vehicle" in kept["collision"].inputs
+    assert kept["decimate.vehicle"].params.target == 50_000  # type: ignore[attr-defined]
+    airborne = {node.label for node in recipe(replace(tile, views=(), trajectory=None), KEEP)}
+    assert not any(label.endswith(".vehicle") for label in airborne)
+
+
+def test_what_is_parked_is_kept_and_what_moved_is_not(tmp_path: Path) -> None:
+    frame = Frame("EPSG:32633", (500_000.0, 5_400_000.0, 200.0))
+    random = np.random.default_rng(0)
+    places = {"parked": (0.0, 0.0), "moved": (10.0, 0.0), "alone": (20.0, 0.0)}
+    body = random.uniform((-2.2, -0.9, 0.2), (2.2, 0.9, 1.5), (500, 3))
+    road = np.column_stack([random.uniform(-5, 25, (500, 2)), np.zeros(500)])
+    xyz = np.concatenate([road, *(body + (*xy, 0.0) for xy in places.values())]).astype(np.float32)
+    label = np.repeat([CODE["road"], CODE["vehicle"]], [500, 1500]).astype(np.uint8)
+    PointCloud(frame, xyz, label=label).save(tmp_path / "cloud.npz")
+    features = [
+        {
+            "geometry": {
+                "coordinates": [
+                    (frame.to_crs(np.array([[x + u, y + v, 0] for u, v in ring]))[:, :2]).tolist()
+                    for ring in [[(2.2, 0.9), (-2.2, 0.9), (-2.2, -0.9), (2.2, -0.9), (2.2, 0.9)]]
+                ]
+            },
+            "properties": {"kind": "car", "moved": name == "moved", "ground_z": 200.0, "height_m": 1.5},
+        }
+        for name, (x, y) in places.items()
+        if name != "alone"  # told to be a vehicle's, but of no vehicle that was found
+    ]
+    (tmp_path / "things.geojson").write_text(json.dumps({"features": features}))
+    inputs = {"cloud": tmp_path / "cloud.npz", "things": tmp_path / "things.geojson"}
+    (tmp_path / "out").mkdir()
+    done = SPLIT.run(inputs, SPLIT.params(vehicles="keep"), tmp_path / "out", silent)
+    kept = PointCloud.load(done.files["vehicle"]).xyz
+    assert len(kept) == 500 and np.abs(kept[:, 0]).max() < 2.3
+    assert done.facts["points"]["rest"] == 1000
+
+
+@pytest.mark.slow
+def test_a_world_with_its_parked_cars(tmp_path: Path) -> None:
+    """Both worlds of a street: the cars' surface is where cars are, textured, in every format; or nothing is there."""
+    tile = generate(tmp_path / "tile", length=20, points=400_000, photos=16, seed=3, photo_width=640).parent
+    layout = lay_out(20, 3, None)
+    parked = build(layout)[1]
+    assert layout.parked
+    for name in ("remove", "keep"):
+        out = tmp_path / name
+        result = CliRunner().invoke(app, ["run", str(tile), "--out", str(out), "--set", f"split.vehicles={name}"])
+        assert result.exit_code == 0, result.output
+    assert not list((tmp_path / "remove").rglob("vehicle.*"))
+    meshes = next((tmp_path / "keep" / "world" / "models").rglob("meshes"))
+    assert {"vehicle.obj", "vehicle.dae", "vehicle.mtl", "vehicle_0.png"} <= {f.name for f in meshes.iterdir()}
+    assert "vehicle.obj" in (meshes.parent / "model.sdf").read_text()
+    report = json.loads((tmp_path / "keep" / "report.json").read_text())
+    assert 0 < report["geometry"]["triangles"]["vehicle"] <= 50_000
+    assert report["texture"]["coverage_by_class"]["vehicle"] > 0.3
+    made = Mesh.load(next((tmp_path / "keep" / "steps" / "decimate.vehicle").rglob("mesh.npz")))
+    low, high = parked.vertices.min(axis=0)[:2] - 0.5, parked.vertices.max(axis=0)[:2] + 0.5
+    assert ((made.vertices[:, :2] > low) & (made.vertices[:, :2] < high)).all(), "the moving car is in no world"
