@@ -536,7 +536,8 @@ def import_sweeps_and_poses(
         shape = sweeps_io.camera_of_photos(
             photos, model="auto" if file else camera, focal=focal, centre=centre, file=file
         )
-        pictures = sweeps_io.Pictures(photos, shape, photo_times, mask)
+        beside = None if extrinsics is None else sweeps_io.photo_extrinsics(extrinsics, photos)
+        pictures = sweeps_io.Pictures(photos, shape, photo_times, mask, beside)
     told: list[str] = []
     with progress("import") as report:
         path = sweeps_io.import_sweeps(

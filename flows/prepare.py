@@ -221,7 +221,9 @@ def _sweeps(
             shape = io.camera_of_photos(
                 here / entry.photos, model=model, focal=entry.focal, centre=entry.centre, file=file
             )
-            pictures = io.Pictures(here / entry.photos, shape, entry.photo_times and here / entry.photo_times)
+            beside = io.photo_extrinsics(here / entry.extrinsics, here / entry.photos) if entry.extrinsics else None
+            times = entry.photo_times and here / entry.photo_times
+            pictures = io.Pictures(here / entry.photos, shape, times, extrinsics=beside)
         io.import_sweeps(
             here / entry.folder, place, out, photos=pictures, times=entry.times and here / entry.times,
             extrinsics=io.read_extrinsics(here / entry.extrinsics) if entry.extrinsics else None,

@@ -56,12 +56,15 @@ class Pictures:
         camera: that took them.
         times: file of their times, seconds, one a line, or None: by their names, or by their order.
         mask: picture, 0 where none of them must be used (the car itself), or None.
+        extrinsics: (4, 4) T_camera_scanner of their camera where it isn't the one whose poses are given
+            (`photo_extrinsics`), or None.
     """
 
     folder: Path
     camera: Camera
     times: Path | None = None
     mask: Path | None = None
+    extrinsics: F64 | None = None
 
 
 def import_sweeps(
@@ -206,6 +209,34 @@ def read_extrinsics(path: Path) -> F64:
     u, _, vt = np.linalg.svd(R)  # rounded digits: nearest true rotation
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = u @ vt, rows[:3, 3]
+    return T
+
+
+def photo_extrinsics(path: Path, photos: Path) -> F64 | None:
+    """(4, 4) T_camera_scanner of the camera of a folder of photos, by `calib.txt` of KITTI's odometry.
+
+    `Tr` is of camera 0, whose poses that set gives; the photos of `image_2` were taken 6 cm beside it, as P2 says.
+
+    Returns:
+        None where the file isn't KITTI's, or the folder's name isn't that of one of its cameras: photos are then of the
+        camera that `read_extrinsics` tells.
+
+    Raises:
+        InputError: as `read_extrinsics`; the file has no sound P of that camera.
+    """
+    name = re.fullmatch(r"image_0?(\d)", photos.resolve().name)
+    named = {key.strip(): rest for key, colon, rest in (line.partition(":") for line in files.lines(path)) if colon}
+    if name is None or "Tr" not in named:
+        return None
+    T, key = read_extrinsics(path), f"P{name[1]}"
+    try:
+        P = _numbers(named[key]).reshape(3, 4)
+        T[:3, 3] += np.linalg.solve(P[:, :3], P[:, 3])
+        if not np.isfinite(T).all():
+            raise ValueError("not finite")
+    except (KeyError, ValueError, np.linalg.LinAlgError) as error:
+        remedy = "Unpack the calibration again, or give T_camera_scanner of the photos' camera"
+        raise InputError(path, f"has no sound `{key}` ({error})", remedy) from None
     return T
 
 
@@ -442,7 +473,8 @@ def _shots(
         if picture is None or picture.shape[:2] != size:
             raise InputError(photos.mask, f"is no picture of {size[1]}x{size[0]}", "Give a mask of the photos' size")
         mask = picture[..., 0]
-    T = np.concatenate([way.at(moments[i : i + 1]) for i in good]) @ np.linalg.inv(T_camera_scanner)
+    own = T_camera_scanner if photos.extrinsics is None else photos.extrinsics
+    T = np.concatenate([way.at(moments[i : i + 1]) for i in good]) @ np.linalg.inv(own)
     return _Shots([files[i] for i in good], moments[good], T, mask)
 
 

@@ -22,6 +22,7 @@ from scan2sim.pipeline.io.sweeps import (
     Pictures,
     camera_of_photos,
     import_sweeps,
+    photo_extrinsics,
     read_camera,
     read_extrinsics,
     read_sweep,
@@ -310,6 +311,32 @@ def test_extrinsics_of_all_kinds_of_files(tmp_path: Path, form: str) -> None:
         }[form]
     )
     assert np.allclose(read_extrinsics(file), T, atol=1e-8)
+
+
+def test_photos_of_kittis_second_camera_stand_beside_the_first(drive: Drive, tmp_path: Path) -> None:
+    """`Tr` is of camera 0; P2 tells that camera 2 sees what is 6 cm to the left of it."""
+    K, offset = np.array([[700.0, 0, 600], [0, 700, 180], [0, 0, 1]]), np.array([0.0613, -0.001, 0.003])
+    P2 = np.column_stack([K, K @ offset])
+    calib = tmp_path / "calib.txt"
+    calib.write_text("".join(f"{k}: {' '.join(f'{v:.9e}' for v in M.ravel())}\n" for k, M in
+                             (("P0", np.eye(3, 4)), ("P2", P2), ("Tr", T_CAMERA_SCANNER[:3]))))  # fmt: skip
+    own = tmp_path / "image_2"
+    own.mkdir()
+    for file in sorted((drive.folder / "photos").iterdir()):
+        (own / file.name).symlink_to(file)
+    assert photo_extrinsics(calib, drive.folder / "photos") is None
+    assert photo_extrinsics(drive.folder / "extrinsics.txt", own) is None
+    beside = photo_extrinsics(calib, own)
+    centres = []
+    for i, extrinsics in enumerate((None, beside)):
+        pictures = Pictures(own, CAMERA, extrinsics=extrinsics)
+        tile = read_tile(import_sweeps(**drive.asked, out=tmp_path / str(i), photos=pictures, link=True))
+        centres.append((tile.views[0].T_world_cam, tile.views[0].centre))
+    moved = centres[0][0][:3, :3].T @ (centres[1][1] - centres[0][1])
+    np.testing.assert_allclose(moved, -offset, atol=1e-6)
+    calib.write_text("P2: 1 2 3\nTr: " + " ".join(f"{v:.9f}" for v in T_CAMERA_SCANNER[:3].ravel()) + "\n")
+    with pytest.raises(InputError, match="no sound `P2`"):
+        photo_extrinsics(calib, own)
 
 
 @pytest.mark.parametrize(
