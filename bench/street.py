@@ -13,7 +13,8 @@ on raw 0009, by hand on odometry 04 (`street_truth.json`). Sky and places withou
 the share of the held-out frame's own returns within 30 m that fall on such pixels, so that leaving surface out shows.
 
 - odo04, raw0009: the streets by the defaults. keep: raw 0009 with `split.vehicles=keep`, all pixels counting.
-- synthetic: figures against the synthetic streets' truth, by the benches that measure them (`BESIDE`).
+- synthetic: figures against the truth of a synthetic street (`street_synthetic.py`), and of straight edges
+  (`bench.edges`).
 - time: the street of nine million points by this checkout and by an older one (`--old FOLDER`).
 
 A part's figures stay in its `figures.json` below `--out`; what isn't run again is told from there. Pictures of photo
@@ -36,7 +37,7 @@ from typing import Any
 
 import numpy as np
 
-from bench import street_boxes, street_score
+from bench import street_boxes, street_score, street_synthetic
 from bench.measure import measure
 from bench.street_world import BACKGROUND, U8, Bools, Photo, Seen, World, photos
 
@@ -46,8 +47,8 @@ HELD_OUT = (4, 12, 20)
 NEAR, PER_PHOTO = 30.0, 0.05
 """Metres within which returns are to be covered, and seconds from the photo's time to those of its own sweep."""
 PARTS = ("odo04", "raw0009", "keep", "synthetic", "time")
-BESIDE = {"static_lost": "bench.carve", "pole_recall": "bench.furniture", "edge_cm": "bench.edges"}
-"""Figures by the benches that measure them on the synthetic streets."""
+EDGES = "bench.edges"
+"""Measures `edge_cm`."""
 OPENMVS = {"odo04": "17.6 / .63 / 1.20 (on a carved mesh)", "raw0009": "18.5 / .80 / 1.14 (on this chain's mesh)"}
 """TextureMesh: dB, SSIM, sharpness; measured over 51 and 25 frames."""
 SIGN = 12.0
@@ -182,19 +183,17 @@ def can_keep() -> bool:
     return "vehicles" in SPLIT.params.model_fields
 
 
-def synthetic() -> dict[str, Any]:
-    """Figures of the benches beside, null where there is none yet."""
-    out: dict[str, Any] = {}
-    for key, module in BESIDE.items():
-        if importlib.util.find_spec(module) is None:
-            print(f"{key}: null, there is no {module}")
-            out[key] = None
-            continue
-        told = subprocess.run([sys.executable, "-m", module], check=True, capture_output=True, text=True).stdout
-        print(told, end="")
-        result = next(line for line in reversed(told.splitlines()) if line.startswith("RESULT "))
-        out[key] = json.loads(result.removeprefix("RESULT "))[key]
-    return out
+def synthetic(folder: Path) -> dict[str, Any]:
+    """Figures against truth; that of edges null where its bench isn't there."""
+    out: dict[str, Any] = dict(street_synthetic.figures(folder, scan2sim))
+    if importlib.util.find_spec(EDGES) is None:
+        print(f"edge_cm: null, there is no {EDGES}")
+        return out | {"edge_cm": None}
+    command = [sys.executable, "-m", EDGES, str(folder / "tile"), str(folder / "run")]
+    told = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    print(told, end="")
+    result = next(line for line in reversed(told.splitlines()) if line.startswith("RESULT "))
+    return out | {"edge_cm": json.loads(result.removeprefix("RESULT "))["edge_cm"]}
 
 
 def times(folder: Path, old: Path | None) -> dict[str, Any]:
@@ -289,7 +288,7 @@ def main() -> None:
             tile, run = made(street, folder, settings, run=not arguments.score_only)
             found = scored(street, tile, run, out / "pictures" / part, keep=part == "keep")
         else:
-            found = synthetic() if part == "synthetic" else times(folder, arguments.old)
+            found = synthetic(folder) if part == "synthetic" else times(folder, arguments.old)
         (folder / "figures.json").write_text(json.dumps(found, indent=1), encoding="utf-8")
     files = {part: out / part / "figures.json" for part in PARTS}
     figures = {part: json.loads(f.read_text(encoding="utf-8")) for part, f in files.items() if f.is_file()}
