@@ -25,6 +25,7 @@ from scan2sim.pipeline.steps.join import JOIN
 from scan2sim.pipeline.steps.overlap import OVERLAP
 from scan2sim.pipeline.steps.path import PATH
 from scan2sim.pipeline.steps.pictures import PICTURES
+from scan2sim.pipeline.steps.planes import PLANES
 from scan2sim.pipeline.steps.plants import PLANTS
 from scan2sim.pipeline.steps.poisson import POISSON
 from scan2sim.pipeline.steps.preview import PREVIEW
@@ -52,7 +53,7 @@ from scan2sim.texturing.unwrap import UNWRAP
 
 STEPS: tuple[Step, ...] = (
     INGEST, PATH, CARVE, VIEWS, LABEL, SEGMENT, THINGS, REACH, OVERLAP, FURNITURE, SPLIT, VOXEL, GROUND, WALLS, POISSON,
-    TRIM, ISLANDS, CLIP, JOIN, DECIMATE, PLANTS, UNWRAP, REFINE, VISIBILITY, EXPOSURE, AGREEMENT, CHOOSE, TEXTURE,
+    TRIM, PLANES, ISLANDS, CLIP, JOIN, DECIMATE, PLANTS, UNWRAP, REFINE, VISIBILITY, EXPOSURE, AGREEMENT, CHOOSE, TEXTURE,
     LEVEL, COLLISION, EXPORT, RASTERS, GEOMETRY, SCORE, PICTURES, PREVIEW, BORDERS,
 )  # fmt: skip
 PER_CLASS: tuple[Step, ...] = (VOXEL, POISSON, TRIM, ISLANDS, CLIP, JOIN, DECIMATE, CHOOSE, UNWRAP, TEXTURE, LEVEL)
@@ -179,7 +180,14 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
         borne = {"cloud": cloud, **made.get(group, {})}
         add(POISSON, borne, group, voxel=size, aligned=bool(cell))
         add(TRIM, {"mesh": at(f"poisson.{group}", "mesh"), **borne}, group, voxel=size)
-        add(ISLANDS, {"mesh": at(f"trim.{group}", "mesh")}, group)
+        surface = at(f"trim.{group}", "mesh")
+        when = settings.params(PLANES).when
+        if group == "building" and (when == "always" or (when == "auto" and path)):
+            others = {f"other.{part}": at(f"voxel.{part}", "cloud") for part in (*GROUPS, "rest") if part != group}
+            points = {"cloud": cloud, "points": at("split", group)}
+            add(PLANES, {"mesh": surface, **points, **others}, voxel=size)
+            surface = at("planes", "mesh")
+        add(ISLANDS, {"mesh": surface}, group)
         surface = at(f"islands.{group}", "mesh")
         if cell:
             add(CLIP, {"mesh": surface}, group, **cell)

@@ -1,0 +1,79 @@
+"""Planes: a mesh laid onto the planes of its points, with straight edges where they meet and end."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+from scan2sim.pipeline.ranges import Voxel
+from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
+
+
+class PlanesParams(Params):
+    """Whether buildings get straight edges.
+
+    Limits follow from the voxels and from the noise that flat places of the cloud have.
+
+    Attributes:
+        when: "auto" where a scanner drove by (there is a path), "always", or "never".
+        voxel: size that the cloud was thinned to; set by the recipe.
+    """
+
+    when: Literal["auto", "always", "never"] = "auto"
+    voxel: Voxel = 0.10
+
+
+def planes(inputs: Inputs, params: PlanesParams, out: Path, report: Report) -> Done:
+    """Find the planes of `cloud`, thinned of `points`, and lay `mesh` onto them.
+
+    Where two planes meet, the mesh folds there; where one ends before a parallel one (a window's reveal), it gets the
+    face between them; where one ends and nothing is behind, none of `other.*` either, so does the mesh.
+    """
+    import numpy as np
+
+    from scan2sim.pipeline import extents, sharpen
+    from scan2sim.pipeline.planes import Planes, detect
+    from scan2sim.pipeline.types import Mesh, PointCloud
+
+    mesh, cloud, voxel = Mesh.load(inputs["mesh"]), PointCloud.load(inputs["cloud"]), params.voxel
+    assert cloud.normal is not None
+    found, which, tolerance = detect(cloud.xyz, cloud.normal, voxel)
+    facts: dict[str, Any] = {"faces_in": len(mesh), "planes": len(found)}
+    if not len(found) or not len(mesh):
+        mesh.save(out / "mesh.npz")
+        return Done({"mesh": out / "mesh.npz"}, facts | {"faces": len(mesh), "on_planes": 0.0})
+    report(0.2, "extents")
+    points = PointCloud.load(inputs["points"]).xyz
+    own = extents.members(points, found, cloud.xyz, which, voxel, tolerance)
+    sides = extents.sides(points, own, found, voxel)
+    faces, between, of_face = extents.steps(sides, found, cloud.xyz, which, voxel)
+    others = [PointCloud.load(path).xyz for name, path in inputs.items() if name.startswith("other.")]
+    border = mesh.vertices[sharpen.border_of(mesh)]
+    ends, of_side = extents.free(
+        sides, found, cloud.xyz, which, np.concatenate([np.zeros((0, 3), np.float32), *others]), border, voxel
+    )
+    report(0.5, "vertices")
+    on = which >= 0
+    laid = sharpen.plane_of(
+        mesh,
+        every := Planes.join([found, faces]),
+        np.concatenate([cloud.xyz[on], between]).astype(np.float32),
+        np.concatenate([which[on], of_face + len(found)]).astype(np.int32),
+        voxel,
+        tolerance,
+    )
+    laid = extents.ended(mesh.vertices.astype(np.float64), laid, every, sides, ends, of_side, cloud.xyz, voxel)
+    report(0.7, "edges")
+    sharp = sharpen.sharpen(mesh, Planes.join([every, sides.planes]), laid, len(every), voxel)
+    sharp.mesh.save(out / "mesh.npz")
+    facts |= {
+        "faces": len(sharp.mesh),
+        "on_planes": round(float((sharp.which >= 0).mean()), 3) if len(sharp.which) else 0.0,
+        "steps": len(faces),
+        "straight_ends_m": round(len(ends) * voxel, 1),
+        "tolerance_m": round(tolerance, 4),
+    }
+    return Done({"mesh": out / "mesh.npz"}, facts)
+
+
+PLANES = Step("planes", 1, planes, PlanesParams)

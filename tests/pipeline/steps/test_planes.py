@@ -1,0 +1,93 @@
+"""Planes: a wall's corner and end are straight where Poisson has rounded them, and what is round stays so."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scan2sim.pipeline.step import Done, Step, silent
+from scan2sim.pipeline.steps.islands import ISLANDS
+from scan2sim.pipeline.steps.planes import PLANES
+from scan2sim.pipeline.steps.poisson import POISSON
+from scan2sim.pipeline.steps.trim import TRIM
+from scan2sim.pipeline.steps.voxel import VOXEL
+from scan2sim.pipeline.types import F64, Frame, Mesh, PointCloud, Trajectory
+
+NOISE = 0.01
+PATH = Trajectory(np.array([0.0, 1.0]), np.array([[-8.0, -8.0, 2.0], [-7.0, -9.0, 2.0]]))
+
+
+def go(step: Step, folder: Path, inputs: dict[str, Path], **given: Any) -> Done:
+    out = folder / step.name
+    out.mkdir(exist_ok=True)
+    return step.run(inputs, step.params(**given), out, silent)
+
+
+def laid(xyz: F64, folder: Path, *, others: F64 | None = None) -> tuple[Mesh, Mesh, dict[str, Any]]:
+    """The mesh of points, what the step makes of it, and its facts."""
+    noisy = (xyz + np.random.default_rng(1).normal(0, NOISE, xyz.shape)).astype(np.float32)
+    points, path, other = (folder / f"{name}.npz" for name in ("points", "path", "other"))
+    PointCloud(Frame(), noisy).save(points)
+    PATH.save(path)
+    PointCloud(Frame(), (np.zeros((0, 3)) if others is None else others).astype(np.float32)).save(other)
+    cloud = go(VOXEL, folder, {"cloud": points, "path": path}).files["cloud"]
+    rough = go(POISSON, folder, {"cloud": cloud}).files["mesh"]
+    mesh = go(TRIM, folder, {"mesh": rough, "cloud": cloud}).files["mesh"]
+    done = go(PLANES, folder, {"mesh": mesh, "cloud": cloud, "points": points, "other.terrain": other})
+    pieces = go(ISLANDS, folder, {"mesh": done.files["mesh"]}).files["mesh"]
+    return Mesh.load(mesh), Mesh.load(pieces), done.facts
+
+
+def wall(start: tuple[float, float], end: tuple[float, float], height: float = 3.0, density: int = 900) -> F64:
+    """Points of an upright wall."""
+    random = np.random.default_rng(0)
+    a, b = np.array(start), np.array(end)
+    u = random.uniform(0, 1, (int(density * height * np.linalg.norm(b - a)), 1))
+    return np.column_stack([a + u * (b - a), random.uniform(0, height, len(u))])
+
+
+def reach(mesh: Mesh, way: tuple[float, float, float], low: float, high: float) -> F64:
+    """Per 10 cm of height between two heights, how far the mesh reaches in a direction."""
+    far = mesh.vertices @ np.array(way)
+    level = np.floor(mesh.vertices[:, 2] / 0.1).astype(int)
+    return np.array([far[level == k].max() for k in range(int(low / 0.1), int(high / 0.1))])
+
+
+def test_a_corner_is_sharp(tmp_path: Path) -> None:
+    before, after, facts = laid(np.concatenate([wall((0, 0), (0, 4)), wall((0, 0), (4, 0))]), tmp_path)
+    corner = np.array([-1.0, -1.0, 0.0]) / np.sqrt(2)  # it reaches to 0 in this direction
+    assert facts["planes"] == 2
+    assert np.median(reach(before, tuple(corner), 0.5, 2.5)) < -0.02
+    assert np.abs(reach(after, tuple(corner), 0.5, 2.5)).max() < 0.01
+
+
+def test_a_wall_ends_where_its_points_end_but_goes_on_into_the_ground(tmp_path: Path) -> None:
+    x, y = np.meshgrid(np.arange(-1, 5, 0.1), np.arange(-2, 2, 0.1))
+    ground = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+    before, after, _ = laid(wall((0, 0), (4, 0)), tmp_path, others=ground)
+    assert np.median(reach(before, (1, 0, 0), 0.5, 2.5)) > 4.1  # what trim leaves
+    assert np.abs(reach(after, (1, 0, 0), 0.5, 2.5) - 4).max() < 0.02
+    assert np.abs(reach(after, (-1, 0, 0), 0.5, 2.5)).max() < 0.02
+    assert after.vertices[:, 2].min() < -0.05
+    assert np.quantile(np.abs(after.vertices[:, 1]), 0.99) < 0.005
+
+
+def test_a_window_has_reveals(tmp_path: Path) -> None:
+    front = wall((0, 0), (4, 0))
+    hole = (front[:, 0] > 1.5) & (front[:, 0] < 2.7) & (front[:, 2] > 0.8) & (front[:, 2] < 2.2)
+    pane = front[hole] + [0, 0.15, 0]
+    _, after, facts = laid(np.concatenate([front[~hole], pane]), tmp_path)
+    middle = (np.abs(after.vertices[:, 2] - 1.5) < 0.4) & (np.abs(after.vertices[:, 0] - 2.1) < 0.8)
+    between = after.vertices[middle & (after.vertices[:, 1] > 0.01) & (after.vertices[:, 1] < 0.14)]
+    assert facts["steps"] >= 4
+    assert np.quantile(np.minimum(np.abs(between[:, 0] - 1.5), np.abs(between[:, 0] - 2.7)), 0.75) < 0.03
+
+
+def test_what_is_round_stays_as_it_is(tmp_path: Path) -> None:
+    random = np.random.default_rng(0)
+    angle, z = random.uniform(0, 2 * np.pi, 12_000), random.uniform(0, 3, 12_000)
+    before, after, facts = laid(np.column_stack([0.6 * np.cos(angle), 0.6 * np.sin(angle), z]), tmp_path)
+    assert facts["planes"] == 0
+    assert np.array_equal(before.vertices, after.vertices) and np.array_equal(before.faces, after.faces)
