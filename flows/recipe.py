@@ -53,8 +53,8 @@ from scan2sim.texturing.unwrap import UNWRAP
 
 STEPS: tuple[Step, ...] = (
     INGEST, PATH, CARVE, VIEWS, LABEL, SEGMENT, THINGS, REACH, OVERLAP, FURNITURE, SPLIT, VOXEL, GROUND, WALLS, POISSON,
-    TRIM, PLANES, ISLANDS, CLIP, JOIN, DECIMATE, PLANTS, UNWRAP, REFINE, VISIBILITY, EXPOSURE, AGREEMENT, CHOOSE, TEXTURE,
-    LEVEL, COLLISION, EXPORT, RASTERS, GEOMETRY, SCORE, PICTURES, PREVIEW, BORDERS,
+    TRIM, PLANES, ISLANDS, CLIP, JOIN, DECIMATE, PLANTS, UNWRAP, REFINE, VISIBILITY, EXPOSURE, AGREEMENT, CHOOSE,
+    TEXTURE, LEVEL, COLLISION, EXPORT, RASTERS, GEOMETRY, SCORE, PICTURES, PREVIEW, BORDERS,
 )  # fmt: skip
 PER_CLASS: tuple[Step, ...] = (VOXEL, POISSON, TRIM, ISLANDS, CLIP, JOIN, DECIMATE, CHOOSE, UNWRAP, TEXTURE, LEVEL)
 
@@ -183,7 +183,7 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
         surface = at(f"trim.{group}", "mesh")
         when = settings.params(PLANES).when
         if group == "building" and (when == "always" or (when == "auto" and path)):
-            others = {f"other.{part}": at(f"voxel.{part}", "cloud") for part in (*GROUPS, "rest") if part != group}
+            others = {f"other.{part}": at(f"voxel.{part}", "cloud") for part in parted if part != group}
             points = {"cloud": cloud, "points": at("split", group)}
             add(PLANES, {"mesh": surface, **points, **others}, voxel=size)
             surface = at("planes", "mesh")

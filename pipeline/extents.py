@@ -172,8 +172,18 @@ def sides(xyz: F32, own: I32, planes: Planes, voxel: float) -> Sides:
     )
 
 
-def steps(found: Sides, planes: Planes, thin: F32, which: I32, voxel: float) -> tuple[Planes, F64, I32]:
+def steps(
+    found: Sides, planes: Planes, thin: F32, which: I32, voxel: float, tolerance: float
+) -> tuple[Planes, F64, I32]:
     """Faces between parallel planes of which the one in front ends: reveals of windows, ledges.
+
+    Args:
+        found: sides of the planes.
+        planes: of the points.
+        thin: (M, 3) the thinned points.
+        which: (M,) their planes, -1 for none.
+        voxel: metres.
+        tolerance: metres by which points miss planes: what is twice as far behind is another plane.
 
     Returns:
         The faces' planes, square to both; points (M, 3) on them, and whose each is (M,).
@@ -194,7 +204,7 @@ def steps(found: Sides, planes: Planes, thin: F32, which: I32, voxel: float) -> 
         ok = (back >= 0) & (back != found.plane[of]) & (behind < 0)
         ok &= (planes.normal[back] * normal[of]).sum(axis=1) > PARALLEL
         down = planes.beyond(places, back)
-        ok &= (down > STEP_LEAST * voxel) & (down < STEP_MOST * voxel)
+        ok &= (down > max(STEP_LEAST * voxel, 2 * tolerance)) & (down < STEP_MOST * voxel)
         behind[ok] = back[ok]
     normals: list[F64] = []
     offsets: list[float] = []

@@ -46,7 +46,7 @@ def planes(inputs: Inputs, params: PlanesParams, out: Path, report: Report) -> D
     points = PointCloud.load(inputs["points"]).xyz
     own = extents.members(points, found, cloud.xyz, which, voxel, tolerance)
     sides = extents.sides(points, own, found, voxel)
-    faces, between, of_face = extents.steps(sides, found, cloud.xyz, which, voxel)
+    faces, between, of_face = extents.steps(sides, found, cloud.xyz, which, voxel, tolerance)
     others = [PointCloud.load(path).xyz for name, path in inputs.items() if name.startswith("other.")]
     border = mesh.vertices[sharpen.border_of(mesh)]
     ends, of_side = extents.free(
