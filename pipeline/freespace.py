@@ -109,29 +109,30 @@ def _boxes(xyz: F32) -> F64:
 
 @njit(cache=True, parallel=True)
 def _in_free_space(xyz, origins, asked, starts, again, boxes, voxel, reach, votes):  # type: ignore[no-untyped-def]
-    spans = np.empty((len(starts) - 1, 6), np.float64)
+    ends, spans = np.empty((len(starts) - 1, 6), np.float64), np.empty((len(starts) - 1, 6), np.float64)
     for w in prange(len(spans)):
-        spans[w] = _span(xyz, origins, starts[w], starts[w + 1])
+        ends[w] = _span(xyz, starts[w], starts[w + 1], 0.0)
+        spans[w] = _span(origins, starts[w], starts[w + 1], reach)
     out = np.zeros(len(xyz), np.uint8)
     for b in prange(len(boxes)):
-        _carve(xyz, origins, asked, starts, again, spans, boxes[b], voxel, reach, votes, out)
+        _carve(xyz, origins, asked, starts, again, ends, spans, boxes[b], voxel, reach, votes, out)
     return out
 
 
 @njit(cache=True)
-def _span(xyz, origins, first, end):  # type: ignore[no-untyped-def]
-    """Least and greatest corner of the box of a window's rays."""
+def _span(places, first, end, reach):  # type: ignore[no-untyped-def]
+    """Least and greatest corner of the box that holds all within `reach` of places."""
     span = np.array([np.inf, np.inf, np.inf, -np.inf, -np.inf, -np.inf])
     for i in range(first, end):
-        if not math.isnan(origins[i, 0]):
+        if not math.isnan(places[i, 0]):
             for k in range(3):
-                span[k] = min(span[k], xyz[i, k], origins[i, k])
-                span[k + 3] = max(span[k + 3], xyz[i, k], origins[i, k])
+                span[k] = min(span[k], places[i, k] - reach)
+                span[k + 3] = max(span[k + 3], places[i, k] + reach)
     return span
 
 
 @njit(cache=True)
-def _carve(xyz, origins, asked, starts, again, spans, box, voxel, reach, votes, out):  # type: ignore[no-untyped-def]
+def _carve(xyz, origins, asked, starts, again, ends, spans, box, voxel, reach, votes, out):  # type: ignore[no-untyped-def]
     """Say in `out` which of the points that are asked about, and lie in the box, are `FREE` or `OPEN`."""
     corner = box[:3] - HALO * voxel
     shape = np.empty(3, np.int64)
@@ -148,12 +149,9 @@ def _carve(xyz, origins, asked, starts, again, spans, box, voxel, reach, votes, 
             _say(xyz, asked, box, corner, shape, voxel, votes, passes, hits, through, inside, out)
             for counts in (passes, hits, through, inside):
                 counts[:] = 0
-        s = spans[w]
-        if s[0] > far[0] or s[1] > far[1] or s[2] > far[2] or s[3] < corner[0] or s[4] < corner[1] or s[5] < corner[2]:
-            continue
-        for i in range(starts[w], starts[w + 1]):
+        for i in range(starts[w], starts[w + 1] if _meet(ends[w], corner, far) else starts[w]):
             _hit(xyz[i], corner, far, shape, voxel, w, hit_in, hits, inside_in, inside)
-        for i in range(starts[w], starts[w + 1]):
+        for i in range(starts[w], starts[w + 1] if _meet(spans[w], corner, far) else starts[w]):
             _pass(xyz[i], origins[i], corner, far, shape, voxel, reach, w, hit_in, passed_in, rays, passes, through)
     _say(xyz, asked, box, corner, shape, voxel, votes, passes, hits, through, inside, out)
 
@@ -176,6 +174,15 @@ def _say(xyz, asked, box, corner, shape, voxel, votes, passes, hits, through, in
 
 
 @njit(cache=True)
+def _meet(span, corner, far):  # type: ignore[no-untyped-def]
+    """Whether two boxes meet."""
+    apart = False
+    for k in range(3):
+        apart |= span[k] > far[k] or span[k + 3] < corner[k]
+    return not apart
+
+
+@njit(cache=True)
 def _least(values, x, y, z, shape):  # type: ignore[no-untyped-def]
     """The least value of a voxel and its 26 neighbours."""
     least = values[(x * shape[1] + y) * shape[2] + z]
@@ -194,9 +201,10 @@ def _hit(p, corner, far, shape, voxel, window, hit_in, hits, inside_in, inside):
             return
     x, y, z = int((p[0] - corner[0]) / voxel), int((p[1] - corner[1]) / voxel), int((p[2] - corner[2]) / voxel)
     own = (x * shape[1] + y) * shape[2] + z
-    if inside_in[own] != window:
-        inside_in[own] = window
-        inside[own] += 1
+    if inside_in[own] == window:  # and so are its neighbours
+        return
+    inside_in[own] = window
+    inside[own] += 1
     for jx in range(max(x - 1, 0), min(x + 2, shape[0])):
         for jy in range(max(y - 1, 0), min(y + 2, shape[1])):
             for jz in range(max(z - 1, 0), min(z + 2, shape[2])):
