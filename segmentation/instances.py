@@ -75,6 +75,10 @@ WIDEST = 6.0
 """Metres: what is wider is no vehicle either, nor a row of them side by side."""
 FIXED = (CODE["building"], CODE["pole"], CODE["road_sign"])
 """Classes of which nothing goes because something drove past near by."""
+TOUCHING = 0.02
+"""Share of a cluster's points near which others moved, from which on it touches them."""
+LANE = 3.0
+"""Metres."""
 CARVED = 0.3
 """Share of a thing's points near which others moved, from which on all of it moved."""
 
@@ -146,6 +150,7 @@ class Scan:
         odds: logarithm of the odds that photos, or shape alone, give to vehicle.
         weight: what that counts.
         moved: near points that moved.
+        brief: scanned, with all around, within a second: what stands is seen for longer.
         path: (T, 3) of the scanner.
     """
 
@@ -156,6 +161,7 @@ class Scan:
     odds: F32
     weight: F32
     moved: Bools
+    brief: Bools
     path: F64
 
 
@@ -202,10 +208,19 @@ def no_vehicles(scan: Scan, found: Sequence[Thing]) -> Ints:
 
 
 def remains(scan: Scan) -> Ints:
-    """Indices of points above the ground in clusters of which most are near what moved."""
-    member = ~scan.ground & _between(scan.height, (FEET, BAND[1])) & ~np.isin(scan.label, FIXED)
-    parts = [c for c in clusters(scan.xyz, member) if scan.moved.any() and scan.moved[c].mean() > 0.5]
-    return np.concatenate([*parts, np.zeros(0, np.int64)])
+    """Indices of points of what moved, and wasn't carved: where a trail begins and ends, nothing sees through it.
+
+    These are clusters above the ground, no wider than a lane, that touch what was carved, and were there for a moment
+    only. A garden that is seen through a gate is there for a moment, too, but wider.
+    """
+    above = ~scan.ground & _between(scan.height, (FEET, TALLEST)) & ~np.isin(scan.label, FIXED)
+    near = [
+        c
+        for c in clusters(scan.xyz, above & scan.brief)
+        if scan.moved[c].mean() > TOUCHING and rectangle(scan.xyz[c, :2]).width < LANE
+    ]
+    near += [c for c in clusters(scan.xyz, above) if scan.moved[c].mean() > 0.5]
+    return np.unique(np.concatenate([*near, np.zeros(0, np.int64)]))
 
 
 def people(scan: Scan) -> list[Thing]:

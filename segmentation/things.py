@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from scan2sim.pipeline.types import F32, F64, U8, Frame, PointCloud
     from scan2sim.segmentation.instances import Ints, Scan, Thing
 
+PASSING, AROUND, NEIGHBOURS = 1.0, 0.5, 16
+"""Seconds within which of what passes all is scanned that is within so many metres, of so many neighbours."""
 NEAR = 0.3
 """Metres to a point that moved, within which a point is taken to be of the same thing."""
 SHAPES_WORD = 0.6
@@ -101,7 +103,11 @@ def decide(
     moving = PointCloud.load(inputs["moving"]).xyz if "moving" in inputs else np.zeros((0, 3), np.float32)
     report(0.3, "ground")
     path = Trajectory.load(inputs["path"]).positions
-    scan = look(cloud.take(first), sure[first], source[first], moving, path)
+    moments = None
+    if cloud.time is not None:
+        ordered = cloud.time[order]
+        moments = np.minimum.reduceat(ordered, starts), np.maximum.reduceat(ordered, starts)
+    scan = look(cloud.take(first), sure[first], source[first], moving, moments, path)
     report(0.5, "things")
     found = instances.vehicles(scan) + instances.people(scan)
     numbered = [(thing, int(count[thing.index].sum())) for thing in found]
@@ -120,13 +126,14 @@ def decide(
     return numbered, label
 
 
-def look(thin: PointCloud, sure: U8, source: U8, moving: F32, path: F64) -> Scan:
+def look(thin: PointCloud, sure: U8, source: U8, moving: F32, moments: tuple[F64, F64] | None, path: F64) -> Scan:
     """What is known of one point a voxel.
 
     Args:
         thin: with labels.
         sure, source: (N,) as `segment` writes them.
         moving: (M, 3) points that were dropped because they moved.
+        moments: (N,) each, seconds: when the voxel's points were scanned first and last; None where nothing tells.
         path: (T, 3) of the scanner.
     """
     import numpy as np
@@ -147,7 +154,16 @@ def look(thin: PointCloud, sure: U8, source: U8, moving: F32, path: F64) -> Scan
     if len(moving):
         distance, _ = cKDTree(moving).query(thin.xyz, distance_upper_bound=NEAR, workers=-1)
         moved = np.isfinite(distance)
-    return Scan(thin.xyz, height, ground, thin.label, odds.astype(np.float32), weight, moved, path)
+    brief = np.zeros(len(thin), bool)
+    if len(moving) and moments is not None:
+        above = np.flatnonzero(~ground)
+        k = min(NEIGHBOURS, len(above))
+        distance, near = cKDTree(thin.xyz[above]).query(thin.xyz[above], k=k, workers=-1)
+        near = np.where(
+            distance.reshape(len(above), -1) < AROUND, near.reshape(len(above), -1), np.arange(len(above))[:, None]
+        )
+        brief[above] = moments[1][above][near].max(axis=1) - moments[0][above][near].min(axis=1) < PASSING
+    return Scan(thin.xyz, height, ground, thin.label, odds.astype(np.float32), weight, moved, brief, path)
 
 
 def other_class(scan: Scan, index: Ints) -> U8:
@@ -208,4 +224,4 @@ def _pass_on(cloud: Path, file: Path) -> None:
         shutil.copyfile(cloud, file)
 
 
-THINGS = Step("things", 1, things, ThingsParams)
+THINGS = Step("things", 2, things, ThingsParams)

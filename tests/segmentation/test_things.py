@@ -132,12 +132,26 @@ def test_a_car_seen_from_one_side_reaches_behind_it(tmp_path: Path) -> None:
     assert (after["car"] == VEHICLE).mean() > 0.98 and (after["hedge"] == HEDGE).mean() > 0.95
 
 
-def test_what_is_left_of_what_moved_goes(tmp_path: Path) -> None:
+def test_the_middle_of_what_moved_goes(tmp_path: Path) -> None:
     rest = shell((3.0, 0.4, 1.2), (-6, -3))
     inputs = street(tmp_path, rest=rest)
     PointCloud(FRAME, rest[::2] + np.float32(0.1)).save(tmp_path / "moving.npz")
     done = go(inputs | {"moving": tmp_path / "moving.npz"}, tmp_path)
     assert (told(done, rest)["0"] == VEHICLE).mean() > 0.95
+
+
+def test_the_end_of_a_trail_goes_with_it(tmp_path: Path) -> None:
+    """Where a van was last, no later ray passes: carve leaves it, as a moment's bush. A bush stands for longer."""
+    end, bush = shell((4.5, 2.0, 2.0), (-6, -3)), shell((4.5, 2.0, 2.0), (4, -1))
+    inputs = street(tmp_path, end=end, bush=bush)
+    cloud = PointCloud.load(inputs["cloud"])
+    time = np.random.default_rng(0).uniform(0, 5, len(cloud))
+    time[-len(end) - len(bush) : -len(bush)] /= 20
+    replace(cloud, time=time).save(inputs["cloud"])
+    before = [xyz[xyz[:, 0] < xyz[:, 0].min() + 0.1] - np.float32([0.15, 0, 0]) for xyz in (end, bush)]
+    PointCloud(FRAME, np.concatenate(before)).save(tmp_path / "moving.npz")
+    after = told(go(inputs | {"moving": tmp_path / "moving.npz"}, tmp_path), end, bush)
+    assert (after["0"] == VEHICLE).mean() > 0.97 and (after["1"] == HEDGE).all()
 
 
 def test_classes_of_the_cloud_itself_stay_as_they_are(tmp_path: Path) -> None:
