@@ -24,9 +24,8 @@ from scan2sim.texturing.matches import Matches
 
 OUTLIER = 1.0
 """Pixels (of the compared size) beyond which an observation's say falls (Cauchy); twice the median if that is more."""
-TOLD = 3.0
-"""Pixels: standard deviation of an observation against the priors. More than a match's own, as neighbouring matches err
-together, with the surface that they are on."""
+TOLD = 0.5
+"""Pixels: standard deviation of an observation: a match's own, and the surface's part in it."""
 ON_SURFACE, ALONG_SURFACE = 0.02, 0.5
 """Metres by which a place may leave the surface (the scanner's noise) and slide along it."""
 ROUNDS = 8
