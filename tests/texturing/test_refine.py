@@ -1,19 +1,24 @@
 """Poses of photos that are known to be wrong come back to where they were; right ones stay."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from scan2sim.flows.recipe import Output, recipe
+from scan2sim.flows.settings import Settings
 from scan2sim.pipeline.cameras import inside, project
 from scan2sim.pipeline.io import views as views_io
+from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.render import look_at
 from scan2sim.pipeline.step import silent
 from scan2sim.pipeline.types import View
 from scan2sim.texturing.refine import RefineParams, lenses, refine
 from tests.texturing.corner import CAMERAS, GROUND, grid, join
 
+ROOT = Path(__file__).resolve().parents[2]
 WALLS = join(  # of a court: ground and three walls leave nothing to slide along
     grid((1, -5, 0), (0, 0, 5), (0, 10, 0)),
     grid((-5, 5, 0), (6, 0, 0), (0, 0, 5)),
@@ -132,3 +137,12 @@ def test_cameras_of_a_pair_are_two():
     view = View("left/0", camera, np.eye(4), None)
     names, index = lenses([view, replace(view, name="right/0"), replace(view, name="left/1")])
     assert names == ["left", "right"] and index.tolist() == [0, 1, 0]
+
+
+def test_tiles_without_photos_have_no_such_node():
+    tile = read_tile(ROOT / "data_samples" / "tile" / "tile.toml")
+    nodes = {node.label: node for node in recipe(tile, Settings())}
+    assert nodes["visibility"].inputs["views"] == nodes["score"].inputs["views"] == Output("refine", "views")
+    assert nodes["segment"].inputs["views"] == Output("views", "views")
+    for other, settings in ((replace(tile, views=()), {}), (tile, {"refine": {"when": "never"}})):
+        assert "refine" not in {node.step.name for node in recipe(other, Settings(settings))}
