@@ -30,8 +30,9 @@ BLOCK = 32.0
 """Metres: space is worked on in square blocks of this side, one a thread, which bounds memory."""
 RAYS = 2
 """Rays through a voxel in one window that make a pass: farther apart, they miss what is narrower than it."""
-FREE, OPEN = 1, 2
-"""What is said of a point: its voxel is free with all around it; or it alone is, passed twice as often as hit."""
+FREE, OPEN, STANDS = 1, 2, 3
+"""What is said of a point: its voxel is free with all around it; or it alone is, passed twice as often as hit; or it
+was looked at as often, and is neither. 0: it wasn't."""
 LAYER = 1.5
 """Voxels from a point in free space up to which those that are open, of the same window, are of the same thing."""
 PAUSE = 100
@@ -50,8 +51,8 @@ def in_free_space(
     votes: int,
     low: float = -np.inf,
     high: float = np.inf,
-) -> npt.NDArray[np.bool_]:
-    """(N,) which points lie where other rays have found nothing.
+) -> tuple[npt.NDArray[np.bool_], float]:
+    """(N,) which points lie where other rays have found nothing; and the share of points that rays can tell of.
 
     Args:
         xyz: (N, 3) local metres, in order of time.
@@ -68,14 +69,14 @@ def in_free_space(
     asked = (xyz[:, 2] > low) & (xyz[:, 2] < high)
     path = origins[np.isfinite(origins[:, 0])]
     if not len(path):
-        return np.zeros(len(xyz), bool)
+        return np.zeros(len(xyz), bool), 0.0
     corner, far = path.min(axis=0) - reach, path.max(axis=0) + reach
     asked &= ((xyz > corner) & (xyz < far)).all(axis=1)
     if not asked.any():
-        return asked
+        return asked, 0.0
     boxes = _boxes(xyz[asked])
     said = _in_free_space(xyz, origins, asked, starts, again, boxes, voxel, reach, votes)
-    return _with_outer_layer(xyz, windows, said, LAYER * voxel)
+    return _with_outer_layer(xyz, windows, said, LAYER * voxel), float((said[asked] > 0).mean())
 
 
 def _with_outer_layer(
@@ -171,6 +172,8 @@ def _say(xyz, asked, box, corner, shape, voxel, votes, passes, hits, through, in
             out[i] = FREE
         elif through[at] >= votes and 2 * inside[at] <= through[at]:
             out[i] = OPEN
+        elif out[i] == 0 and hits[at] + passes[at] >= votes:
+            out[i] = STANDS
 
 
 @njit(cache=True)

@@ -28,6 +28,8 @@ ABOVE = 4.0
 """Metres above the path from which on nothing moves: lorries are no higher above the ground."""
 AIRBORNE = 60.0
 """Metres of median range from which on a scanner flies: its rays pass no place from several sides."""
+SEEN_AGAIN = 0.1
+"""Share of points that were looked at `votes` times below which the step says that rays tell next to nothing."""
 MANY = 0.2
 """Share of points that moved above which a run warns."""
 
@@ -72,6 +74,7 @@ def carve(inputs: Inputs, params: CarveParams, out: Path, report: Report) -> Don
     report(0.0, "reading")
     cloud = PointCloud.load(inputs["cloud"])
     path = Trajectory.load(inputs["path"]) if "path" in inputs else None
+    told = 0.0
     moved, origins, why = np.zeros(len(cloud), bool), np.zeros((0, 3)), "the scanner's path isn't known"
     way = own = None
     if path is not None:
@@ -82,7 +85,8 @@ def carve(inputs: Inputs, params: CarveParams, out: Path, report: Report) -> Don
             own = in_swept(cloud.xyz, way)
     if not why:
         report(0.2, "following rays")
-        moved = _moved(cloud, origins, path, params)
+        moved, told = _moved(cloud, origins, path, params)
+        why = "" if told > SEEN_AGAIN else "nearly every place was seen once alone"
     near = in_first_metre(cloud.xyz, np.array(params.cameras, np.float64).reshape(-1, 3), params.camera, way)
     own = np.zeros(len(cloud), bool) if own is None else own & ~moved
     near &= ~moved & ~own
@@ -93,6 +97,7 @@ def carve(inputs: Inputs, params: CarveParams, out: Path, report: Report) -> Don
         "moving_share": round(moving_share, 5),
         "own_volume": int(own.sum()),
         "first_metre": int(near.sum()),
+        "looked_at_again": round(told, 3),
         "rays": why or "followed",
     }
     gone = moved | own | near
@@ -141,7 +146,7 @@ def _origins(cloud: PointCloud, path: Trajectory) -> tuple[F64, str]:
     """(N, 3) where the scanner was at each point's time, NaN where that isn't known; and why it isn't at all, or ""."""
     import numpy as np
 
-    if cloud.time is None or np.ptp(cloud.time) == 0:
+    if cloud.time is None:
         return np.zeros((0, 3)), "the points have no times"
     known = np.isfinite(path.times)
     times, positions = path.times[known], path.positions[known]
@@ -164,8 +169,8 @@ def _origins(cloud: PointCloud, path: Trajectory) -> tuple[F64, str]:
     return origins, ""
 
 
-def _moved(cloud: PointCloud, origins: F64, path: Trajectory | None, params: CarveParams) -> Bools:
-    """(N,) which points other rays passed through."""
+def _moved(cloud: PointCloud, origins: F64, path: Trajectory | None, params: CarveParams) -> tuple[Bools, float]:
+    """(N,) which points other rays passed through, and the share of those that rays can tell of."""
     import numpy as np
 
     from scan2sim.pipeline.freespace import in_free_space
@@ -173,7 +178,7 @@ def _moved(cloud: PointCloud, origins: F64, path: Trajectory | None, params: Car
     assert cloud.time is not None and path is not None
     order = np.argsort(cloud.time, kind="stable")
     time = cloud.time[order]
-    free = in_free_space(
+    free, told = in_free_space(
         cloud.xyz[order],
         origins[order].astype(np.float32),
         np.floor((time - time[0]) / WINDOW + 0.5).astype(np.int64),
@@ -184,7 +189,7 @@ def _moved(cloud: PointCloud, origins: F64, path: Trajectory | None, params: Car
     )
     out = np.empty(len(cloud), bool)
     out[order] = free
-    return out
+    return out, told
 
 
-CARVE = Step("carve", 2, carve, CarveParams)
+CARVE = Step("carve", 3, carve, CarveParams)

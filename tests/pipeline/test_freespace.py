@@ -142,8 +142,19 @@ def test_without_path_times_or_a_second_look_all_stays(street: PointCloud, tmp_p
         assert why in str(done.facts["rays"]) and not len(PointCloud.load(done.files["moving"]))
         assert way is not None or len(PointCloud.load(done.files["cloud"])) == len(cloud)
     assert street.time is not None
-    once = street.take(street.time == 0.5)
-    assert carve(once, tmp_path / "once", path()).facts["moved"] == 0
+    once = carve(street.take(street.time == 0.5), tmp_path / "once", path())
+    assert once.facts["moved"] == 0 and "seen once" in str(once.facts["rays"])
+
+
+def test_a_profile_scanner_tells_nothing_in_one_pass(tmp_path: Path) -> None:
+    """It sees each place once, beside itself; the car that it passes stays, and the facts say why."""
+    random = np.random.default_rng(3)
+    x = random.uniform(0, 20, 60_000)
+    y = np.where((x > 8) & (x < 12), 3.0, 6.0)
+    xyz = np.column_stack([x, y, random.uniform(0, 2, len(x))]).astype(np.float32)
+    done = carve(PointCloud(Frame(), xyz, time=x / SPEED), tmp_path, path())
+    assert done.facts["moved"] == 0 and "seen once" in str(done.facts["rays"])
+    assert len(PointCloud.load(done.files["cloud"])) == len(x)
 
 
 def test_the_recording_vehicle_and_cameras_have_room(street: PointCloud, tmp_path: Path) -> None:

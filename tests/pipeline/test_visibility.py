@@ -139,6 +139,18 @@ def test_the_trail_of_what_drove_past_hides_only_while_it_was_there():
     assert not sees_wall(parked, 110.0)
 
 
+def test_what_was_carved_as_moving_hides_only_at_its_own_moment():
+    wall, car = side_of(8.0, -2, 2.05, 0, 3.05), side_of(4.0, -1, 0.5, 0.5, 2.5)
+    moving = cloud_of(car, time=np.full(len(car), 100.0))
+    hides = scene([WALL], cloud_of(wall), moving=moving)
+
+    def sees_wall(time):
+        depth = depth_map(CAMERAS["pinhole"], forward_pose(), hides, time=time)
+        return bool(visible(depth, ON_WALL[:1], FACING[:1])[0])
+
+    assert [sees_wall(time) for time in (99.8, 100.0, 100.2)] == [True, False, True]
+
+
 def test_a_bulge_that_no_point_bears_out_hides_nothing():
     wall, sign = side_of(8.0, -2, 2.05, 0, 3.05), side_of(4.0, -0.3, 0.35, 1.5, 2.1)
     flat = grid(20, 11, 0.1, (0, 1.8, 0))
