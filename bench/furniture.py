@@ -1,0 +1,163 @@
+"""Street furniture and sky against the synthetic streets' truth.
+
+`python -m bench.furniture [--seeds 0 1 2] [--length 100 --points 4e6] [--parts shape sky] [--out bench-out/furniture]`
+- shape: streets are scanned, and the step `furniture` run on their clouds as it stands. `pole_recall`: share of lamps
+  and signs within 20 cm of whose true place one is told of, no trunk; `trunk_recall` of trees; `pole_precision`: share
+  of all things told of that stand within 30 cm of a lamp, sign or tree. `sign_plate_cm`, `pole_cm`: mean distance of
+  true surface samples of plates, and of poles below them, to the meshes.
+- sky: the small street's world with `agreement.sky` off and on: `sky_share`: share of the surface of crowns and
+  buildings that is bluer and brighter than the truth by far; `truth_db`: likeness to the true colours there.
+
+Ends with `RESULT {json}`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scan2sim.data_samples import SMALL
+from scan2sim.data_samples.layout import FRAME, lay_out
+from scan2sim.pipeline.classes import CODE
+from scan2sim.pipeline.io import las
+from scan2sim.pipeline.io.tile import read_tile
+from scan2sim.pipeline.render import Renderer, textured
+from scan2sim.pipeline.step import silent
+from scan2sim.pipeline.steps.furniture import FURNITURE, FurnitureParams
+from scan2sim.pipeline.steps.geometry import distances, spread
+from scan2sim.pipeline.types import F32, Mesh
+
+ROOT = Path(__file__).resolve().parent.parent
+PLACE, CLOSE = 0.2, 0.3
+"""Metres within which a thing is found, and told of rightly."""
+BLUER, BRIGHTER = 30.0, 20.0
+"""Grey levels of blue less red, and of luminance, beyond the truth's from which on a texel shows sky."""
+REACH = 0.15
+"""Metres within which a true sample tells a texel's colour."""
+
+
+def main() -> None:
+    """Run the parts asked for."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--length", type=float, default=100.0)
+    parser.add_argument("--points", type=float, default=4e6)
+    parser.add_argument("--parts", nargs="+", default=["shape"], choices=("shape", "sky"))
+    parser.add_argument("--out", type=Path, default=ROOT / "bench-out" / "furniture")
+    arguments = parser.parse_args()
+    result: dict[str, Any] = {}
+    if "shape" in arguments.parts:
+        result |= shape(arguments.out, arguments.seeds, arguments.length, arguments.points)
+    if "sky" in arguments.parts:
+        result |= {"sky": {str(on).lower(): sky(arguments.out / f"sky_{on}", on) for on in (False, True)}}
+    print("RESULT " + json.dumps(result))
+
+
+def shape(out: Path, seeds: list[int], length: float, points: float) -> dict[str, float]:
+    """Recall, precision and distances over all streets."""
+    from scan2sim.data_samples.street import generate
+
+    found: dict[str, list[Any]] = {"pole": [], "trunk": [], "right": [], "plate": [], "shaft": []}
+    for seed in seeds:
+        street = out / f"street_{length:g}_{points:g}_{seed}"
+        if not (street / "tile.toml").is_file():
+            generate(street, length=length, points=points, photos=0, seed=seed)
+        for name, values in _street(street, seed, length).items():
+            found[name] += values
+        told = {name: f"{np.mean(values):.3f} of {len(values)}" for name, values in found.items() if values}
+        print(f"seed {seed}: {told}", flush=True)
+    return {
+        "pole_recall": round(float(np.mean(found["pole"])), 3),
+        "trunk_recall": round(float(np.mean(found["trunk"])), 3),
+        "pole_precision": round(float(np.mean(found["right"])), 3),
+        "sign_plate_cm": round(100 * float(np.mean(found["plate"])), 2),
+        "pole_cm": round(100 * float(np.mean(found["shaft"])), 2),
+    }
+
+
+def _street(street: Path, seed: int, length: float) -> dict[str, list[Any]]:
+    """What is found of one street's things."""
+    tile = read_tile(street / "tile.toml")
+    assert tile.trajectory is not None and tile.truth_mesh is not None
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        las.read(tile.clouds[0], tile.frame).save(folder / "cloud.npz")
+        tile.trajectory.save(folder / "path.npz")
+        inputs = {"cloud": folder / "cloud.npz", "path": folder / "path.npz"}
+        done = FURNITURE.run(inputs, FurnitureParams(), folder, silent)
+        features = json.loads(done.files["geojson"].read_text())["features"]
+        mesh = Mesh.load(done.files["building"])
+    at = np.array([f["geometry"]["coordinates"][:2] for f in features]).reshape(-1, 2) - tile.frame.origin[:2]
+    trunk = np.array([f["properties"]["kind"] == "trunk" for f in features], bool)
+    layout = lay_out(length, seed)
+    shift = np.subtract(FRAME.origin, tile.frame.origin)[:2]
+    posts = np.array([layout.axis.place(p.s, p.t)[0] for p in layout.posts]) + shift
+    trees = np.array([layout.axis.place(t.s, t.t)[0] for t in layout.trees if not t.bush]) + shift
+
+    def apart(a: Any, b: Any) -> Any:
+        return np.linalg.norm(a[:, None] - b[None], axis=2).min(axis=1, initial=np.inf)
+
+    truth = Mesh.load(tile.truth_mesh).moved_to(mesh.frame)
+    assert truth.label is not None
+    plates = spread(truth.keep(truth.label == CODE["road_sign"]), 20_000)
+    shafts = spread(truth.keep(truth.label == CODE["pole"]), 20_000)
+    ground = layout.height(*layout.axis.locate(shafts[:, :2] - shift))
+    above = shafts[:, 2] - ground
+    shafts = shafts[(above > 0.3) & (above < 2.0)]
+    return {
+        "pole": (apart(posts, at[~trunk]) < PLACE).tolist(),
+        "trunk": (apart(trees, at[trunk]) < CLOSE).tolist(),
+        "right": (apart(at, np.concatenate([posts, trees])) < CLOSE).tolist(),
+        "plate": distances(plates, mesh).tolist(),
+        "shaft": distances(shafts, mesh).tolist(),
+    }
+
+
+def sky(out: Path, on: bool) -> dict[str, float]:
+    """The small street's world: sky on crowns and buildings, and how like the truth they are."""
+    scan2sim = str(Path(sys.executable).parent / "scan2sim")
+    command = [scan2sim, "run", str(SMALL), "--out", str(out), "--set", f"agreement.sky={str(on).lower()}"]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    report = json.loads((out / "report.json").read_text())
+    folders = {g: out / "steps" / f"texture.{g}" for g in ("building", "vegetation")}
+    made = {g: max(f.glob("*/textured"), key=lambda p: p.stat().st_mtime) for g, f in folders.items()}
+    figures = {f"{group}_{k}": v for group, folder in made.items() for k, v in on_surface(folder).items()}
+    return figures | {"coverage": report["texture"]["coverage"]}
+
+
+def on_surface(folder: Path) -> dict[str, float]:
+    """Of what photos painted: share that shows sky, and PSNR against the true colours, from places on the surface."""
+    from scipy.spatial import cKDTree
+
+    body = textured(folder)
+    tile = read_tile(SMALL / "tile.toml")
+    assert tile.truth_points is not None
+    truth = las.read(tile.truth_points, body.mesh.frame)
+    assert truth.rgb is not None
+    places = spread(body.mesh, 200_000)
+    rgb, seen, _ = Renderer([body]).nearest(places)
+    distance, near = cKDTree(truth.xyz).query(places, distance_upper_bound=REACH, workers=-1)
+    held = np.isfinite(distance) & (seen == 255)
+    shown, true = rgb[held].astype(np.float32), truth.rgb[near[held]].astype(np.float32)
+    blue, light = _blue(shown) - _blue(true), shown.mean(axis=1) - true.mean(axis=1)
+    error = float(np.mean((shown - true) ** 2))
+    return {
+        "sky_share": round(float(((blue > BLUER) & (light > BRIGHTER)).mean()), 5),
+        "truth_db": round(10 * float(np.log10(255**2 / error)), 2),
+        "painted": round(float((seen == 255).mean()), 4),
+    }
+
+
+def _blue(rgb: F32) -> F32:
+    return np.asarray(rgb[:, 2] - rgb[:, 0], np.float32)
+
+
+if __name__ == "__main__":
+    main()
