@@ -17,8 +17,15 @@ from scan2sim.pipeline.ranges import Cosine, Depth, Reach
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
     from scan2sim.pipeline.types import F32, I32, U8, Mesh, View
     from scan2sim.pipeline.visibility import DepthMap
+
+
+FLAT = 0.99
+"""cos of the angle between two faces of one side of a plate."""
 
 
 class ChooseParams(Params):
@@ -88,6 +95,7 @@ def choose(inputs: Inputs, params: ChooseParams, out: Path, report: Report) -> D
 
     usable = [i for i in range(len(views)) if agreement.usable[i]]
     choice, seams = choose_views(mesh, views, usable, depth, agreement.mask, agreement.sharpness, params, report)
+    choice = with_whole_signs(choice, mesh)
     choice.save(out / "choice.npz")
     seen = float((choice.label >= 0).mean()) if len(mesh) else 0.0
     return Done({"choice": out / "choice.npz"}, {"faces": len(mesh), "seen": round(seen, 4), "seam_share": seams})
@@ -123,6 +131,45 @@ def choose_views(
     return Choice(best.view, best.quality, chosen), round(share, 4)
 
 
+def with_whole_signs(choice: Choice, mesh: Mesh) -> Choice:
+    """The choice with one photo for each side of a sign's plate, if one sees all of it: the best of these, alone.
+
+    Photos that are a pixel off would blur what is to be read.
+    """
+    import numpy as np
+
+    from scan2sim.pipeline.classes import CODE
+    from scan2sim.texturing.labels import adjacent
+
+    if mesh.label is None or not (mesh.label == CODE["road_sign"]).any():
+        return choice
+    view, quality, label = choice.view.copy(), choice.quality.copy(), choice.label.copy()
+    faces = np.flatnonzero(mesh.label == CODE["road_sign"])
+    for side in _sides(mesh, faces, adjacent(mesh.faces[faces])[0]):
+        shown, good = view[side], quality[side]
+        area = mesh.face_area[side][:, None]
+        whole = [v for v in np.unique(shown[shown >= 0]) if (shown == v).any(axis=1).all()]
+        if whole:
+            best = whole[int(np.argmax([(good * area)[shown == v].sum() for v in whole]))]
+            own = (good * (shown == best)).max(axis=1)
+            view[side], quality[side] = -1, 0
+            view[side, 0], quality[side, 0], label[side] = best, own, best
+    return Choice(view, quality, label)
+
+
+def _sides(mesh: Mesh, faces: npt.NDArray[np.int64], pairs: I32) -> list[npt.NDArray[np.int64]]:
+    """Faces (N,) in connected pieces that look one way; `pairs` (E, 2) of neighbours, indices into them."""
+    import numpy as np
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    normal = mesh.face_normal[faces]
+    p = pairs[np.einsum("ij,ij->i", normal[pairs[:, 0]], normal[pairs[:, 1]]) > FLAT]
+    links = coo_array((np.ones(len(p), np.int8), (p[:, 0], p[:, 1])), shape=(len(faces), len(faces)))
+    count, piece = connected_components(links, directed=False)
+    return [faces[piece == k] for k in range(count)]
+
+
 def seams(mesh: Mesh, smoothness: float) -> tuple[I32, F32, F32]:
     """Neighbouring faces (E, 2), the lengths (E,) of their edges in metres, and what a seam there costs (E,)."""
     import numpy as np
@@ -135,4 +182,4 @@ def seams(mesh: Mesh, smoothness: float) -> tuple[I32, F32, F32]:
     return pairs, length, (smoothness * np.minimum(length / median, 4)).astype(np.float32)
 
 
-CHOOSE = Step("choose", 2, choose, ChooseParams)
+CHOOSE = Step("choose", 3, choose, ChooseParams)

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
 
+from scan2sim.pipeline.classes import CODE
 from scan2sim.pipeline.errors import SettingError, StepError
 from scan2sim.pipeline.ranges import Seconds, Texel
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
@@ -49,6 +50,8 @@ class UnwrapParams(Params):
         unseen: how many times wider texels are where no photo sees the surface: points have no finer colours
             ("photo" alone knows).
         texel: metres a texel spans; 1 cm, vegetation 3 cm.
+        signs: how many times narrower texels are on the plates of signs, so that they can be read ("photo" alone
+            knows).
         page_size: pages are at most this wide and high, texels.
         gutter: texels between charts; 2 for vegetation, whose charts are small and many.
         block_faces: triangles unwrapped at once.
@@ -58,6 +61,7 @@ class UnwrapParams(Params):
     backend: Literal["photo", "xatlas", "uvatlas"] = "photo"
     unseen: float = Field(4.0, ge=1, le=100)
     texel: Texel = 0.01
+    signs: float = Field(2.5, ge=1, le=100)
     page_size: int = Field(4096, ge=64, le=8192)
     gutter: int = Field(4, ge=1, le=64)
     block_faces: int = Field(60_000, ge=100, le=1_000_000)
@@ -86,7 +90,11 @@ def unwrap(inputs: Inputs, params: UnwrapParams, out: Path, report: Report) -> D
             own = np.append(pixel, 0.0)[label]
             coarse = params.model_copy(update={"texel": params.texel * params.unseen})
             draped = params.model_copy(update={"texel": max(params.texel, PER_PIXEL * float(own.max()))})
-            parts = [((label >= 0) & (own == 0), params), ((label >= 0) & (own > 0), draped)]
+            finer = params.model_copy(update={"texel": params.texel / params.signs})
+            sign = np.zeros(len(mesh), bool) if mesh.label is None else mesh.label == CODE["road_sign"]
+            by_distance = (label >= 0) & (own == 0)
+            parts = [(by_distance & ~sign, params), ((label >= 0) & (own > 0), draped)]
+            parts += [(by_distance & sign, finer)] if sign.any() else []
             texel = np.select([faces for faces, _ in parts], [fine.texel for _, fine in parts], coarse.texel)
             check_size(float((mesh.face_area / texel**2).sum(dtype=np.float64)), params)
             for faces, fine in parts:
@@ -346,7 +354,7 @@ def stretch(corners: npt.NDArray[Any], flat: npt.NDArray[Any]) -> npt.NDArray[An
 
 UNWRAP = Step(
     "unwrap",
-    2,
+    3,
     unwrap,
     UnwrapParams,
     {"vegetation": {"texel": 0.03, "gutter": 2}},
