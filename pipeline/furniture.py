@@ -14,9 +14,10 @@ import numpy.typing as npt
 
 from scan2sim.pipeline import primitives
 from scan2sim.pipeline.classes import CODE, group_of
+from scan2sim.pipeline.lamps import Arm, arm
 from scan2sim.pipeline.plates import Plate, plates
 from scan2sim.pipeline.primitives import Triangles
-from scan2sim.pipeline.standing import SLAB, Stem, refined, stems, within
+from scan2sim.pipeline.standing import SLAB, Columns, Stem, refined, stems
 from scan2sim.pipeline.types import F32, F64, PointCloud, Trajectory
 
 Kind = Literal["pole", "sign", "lamp", "trunk"]
@@ -34,6 +35,8 @@ STOUT = 25.0
 """A trunk below a crown is at most this many times as long as it is thick: lamps stand in crowns, too."""
 AROUND = 0.9
 """Metres around a pole in which its plates lie."""
+AROUND_LAMP = 3.6
+"""Metres around a pole in which its lamp hangs."""
 HANGS = 0.8
 """Metres above the ground where plates begin."""
 BEFORE = 0.2
@@ -57,11 +60,13 @@ class Thing:
         kind: what it is.
         stem: its pole or trunk, from the ground up.
         plates: what it carries.
+        arm: what reaches out from its top, or None.
     """
 
     kind: Kind
     stem: Stem
     plates: tuple[Plate, ...] = ()
+    arm: Arm | None = None
 
     @property
     def foot(self) -> F64:
@@ -81,7 +86,7 @@ class Thing:
         own = (self.stem.distance(xyz) < thin) & (xyz[:, 2] > low) & (xyz[:, 2] < high)
         for plate in self.plates:
             own |= plate.holds(xyz, margin=thin, thin=thin + 0.04)
-        return own
+        return own if self.arm is None else own | self.arm.held(xyz, thin)
 
     def meshes(self) -> list[tuple[Triangles, int]]:
         """Its parts, and the class code of each."""
@@ -92,7 +97,7 @@ class Thing:
         for plate in self.plates:
             corners = plate.centre + plate.outline[:, :1] * plate.across + plate.outline[:, 1:] * (0, 0, 1)
             parts.append((primitives.plate(corners, -SHEET * plate.normal), CODE["road_sign"]))
-        return parts
+        return parts + [(part, CODE["pole"]) for part in (self.arm.meshes() if self.arm else [])]
 
 
 def find(cloud: PointCloud, height: F32, path: Trajectory) -> list[Thing]:
@@ -107,19 +112,22 @@ def find(cloud: PointCloud, height: F32, path: Trajectory) -> list[Thing]:
     if not len(xyz):
         return []
     assert cloud.label is not None
-    found = stems(xyz, height, LEAST)
+    columns = Columns(xyz)
     leafy = group_of()[cloud.label] == 2
-    near = within(xyz, np.array([stem.middle for stem in found]).reshape(-1, 2), CROWN)
     things = []
-    for stem, n in zip(found, near, strict=True):
+    for stem in stems(columns, height, LEAST):
+        n = columns.near(stem.middle, CROWN)
         ground = float(np.median(xyz[n, 2] - height[n]))
         standing = _grounded(stem, ground)
         if _is_trunk(stem, xyz[n], leafy[n]):
             things.append(Thing("trunk", standing))
         else:
             carried = _carried(standing, xyz[n], height[n])
-            things.append(Thing("sign" if carried else "pole", _up_to(standing, carried), tuple(carried)))
-    return things + _lonely(cloud, height, path, things)
+            around = columns.near(stem.middle, AROUND_LAMP)
+            lamp = arm(standing, ground, xyz[around].astype(np.float64), leafy[around])
+            kind: Kind = "lamp" if lamp else "sign" if carried else "pole"
+            things.append(Thing(kind, _up_to(standing, carried), tuple(carried), lamp))
+    return things + _lonely(cloud, columns, height, path, things)
 
 
 def _grounded(stem: Stem, ground: float) -> Stem:
@@ -172,7 +180,7 @@ def _carried(stem: Stem, xyz: F32, height: F32) -> list[Plate]:
     return good
 
 
-def _lonely(cloud: PointCloud, height: F32, path: Trajectory, things: list[Thing]) -> list[Thing]:
+def _lonely(cloud: PointCloud, columns: Columns, height: F32, path: Trajectory, things: list[Thing]) -> list[Thing]:
     """Signs that throw light back, on poles that do not stand free."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -194,7 +202,7 @@ def _lonely(cloud: PointCloud, height: F32, path: Trajectory, things: list[Thing
         own = bright[piece == k]
         middle = xyz[own, :2].mean(axis=0).astype(np.float64)
         carried = plates(xyz[own].astype(np.float64), np.ones(len(own), bool), _viewer(cloud, own, path), most=2)
-        (near,) = within(xyz, middle[None], 0.5)
+        near = columns.near(middle, 0.5)
         stem = _below(xyz[near], height[near], middle, float(xyz[own, 2].min()))
         if stem is not None and carried:
             found.append(Thing("sign", _up_to(stem, carried), tuple(carried)))

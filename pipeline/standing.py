@@ -109,19 +109,22 @@ class Stem:
         return np.hypot(*(xyz[:, :2] - xy).T) - radius
 
 
-def stems(xyz: F32, height: F32, least: float) -> list[Stem]:
+def stems(columns: Columns, height: F32, least: float) -> list[Stem]:
     """All stems of a cloud.
 
     Args:
-        xyz: (N, 3) local metres.
+        columns: of its N points.
         height: (N,) metres above the ground; only points within reach of things that stand there.
         least: metres that a stem is long at least.
     """
-    found = _chains(_discs(xyz, height), least)
-    fitted = [_fit(xyz[near], chain) for chain, near in zip(found, _around(xyz, found), strict=True)]
-    tubes = [stem for stem in fitted if stem is not None]
-    near = within(xyz, np.array([stem.middle for stem in tubes]).reshape(-1, 2), 2 * CLEAR)
-    return _once([stem for stem, n in zip(tubes, near, strict=True) if _stands(stem, xyz[n], height[n])])
+    xyz, found = columns.xyz, []
+    for chain in _chains(_discs(columns.xyz, height), least):
+        stem = _fit(xyz[_around(columns, chain)], chain)
+        if stem is not None:
+            near = columns.near(stem.middle, 2 * CLEAR)
+            if _stands(stem, xyz[near], height[near]):
+                found.append(stem)
+    return _once(found)
 
 
 def _stands(stem: Stem, xyz: F32, height: F32) -> bool:
@@ -269,47 +272,39 @@ def _rough(run: F64) -> float:
     return 1.48 / math.sqrt(1.5) * float(np.median(np.abs(bend)))
 
 
-def _around(xyz: F32, chains: list[Chain]) -> list[Ints]:
-    """For each chain the points of its discs."""
-    middles = np.array([chain.at(np.array([(chain.low + chain.high) / 2]))[0] for chain in chains]).reshape(-1, 2)
-    found = []
-    for near, chain in zip(within(xyz, middles, WIDEST + 0.4), chains, strict=True):
-        z = xyz[near, 2]
-        level = np.searchsorted(chain.free, z).clip(1, len(chain.free) - 1)
-        apart = np.minimum(np.abs(z - chain.free[level - 1]), np.abs(z - chain.free[level]))
-        aside = np.hypot(*(xyz[near, :2] - chain.at(z)).T)
-        found.append(near[(apart <= SLAB / 2) & (aside < WIDEST / 2 + ASIDE)])
-    return found
+def _around(columns: Columns, chain: Chain) -> Ints:
+    """The points of a chain's discs."""
+    near = columns.near(chain.at(np.array([(chain.low + chain.high) / 2]))[0], WIDEST + 0.4)
+    z = columns.xyz[near, 2]
+    level = np.searchsorted(chain.free, z).clip(1, len(chain.free) - 1)
+    apart = np.minimum(np.abs(z - chain.free[level - 1]), np.abs(z - chain.free[level]))
+    aside = np.hypot(*(columns.xyz[near, :2] - chain.at(z)).T)
+    return near[(apart <= SLAB / 2) & (aside < WIDEST / 2 + ASIDE)]
 
 
-def within(xyz: F32, places: F64, radius: float) -> list[Ints]:
-    """For each place (P, 2) the points (N, 3) in the square of twice the radius around it."""
-    if not len(places):
-        return []
-    cell = 1.0
-    low = np.floor(xyz[:, :2].min(axis=0) / cell).astype(np.int64)
-    at = np.floor(xyz[:, :2] / cell).astype(np.int64) - low
-    size = at.max(axis=0) + 1
-    wanted = np.zeros(size, bool)
-    boxes = []
-    for place in places:
-        first = np.clip(np.floor((place - radius) / cell).astype(np.int64) - low, 0, size - 1)
-        last = np.clip(np.floor((place + radius) / cell).astype(np.int64) - low, 0, size - 1)
-        wanted[first[0] : last[0] + 1, first[1] : last[1] + 1] = True
-        boxes.append((first, last))
-    some = np.flatnonzero(wanted[at[:, 0], at[:, 1]])
-    code = at[some, 0] * size[1] + at[some, 1]
-    order = np.argsort(code, kind="stable")
-    some, code = some[order], code[order]
-    found = []
-    for place, (first, last) in zip(places, boxes, strict=True):
-        rows = [
-            some[np.searchsorted(code, r * size[1] + first[1]) : np.searchsorted(code, r * size[1] + last[1], "right")]
-            for r in range(first[0], last[0] + 1)
-        ]
-        near = np.concatenate(rows)
-        found.append(near[(np.abs(xyz[near, :2] - place) <= radius).all(axis=1)])
-    return found
+class Columns:
+    """Points sorted by square metre of the ground plan, to look for those around a place.
+
+    Args:
+        xyz: (N, 3) local metres.
+    """
+
+    def __init__(self, xyz: F32) -> None:
+        self.xyz = xyz
+        self._low = np.floor(xyz[:, :2].min(axis=0)).astype(np.int32)
+        at = np.floor(xyz[:, :2]).astype(np.int32) - self._low
+        self._size = at.max(axis=0) + 1
+        code = at[:, 0] * self._size[1] + at[:, 1]
+        self._order = np.argsort(code, kind="stable")
+        self._start = np.searchsorted(code[self._order], np.arange(int(self._size.prod()) + 1))
+
+    def near(self, place: F64, radius: float) -> Ints:
+        """Indices of the points in the square of twice the radius around a place (2,)."""
+        first = np.clip(np.floor(place - radius).astype(int) - self._low, 0, self._size - 1)
+        last = np.clip(np.floor(place + radius).astype(int) - self._low, 0, self._size - 1)
+        rows = np.arange(first[0], last[0] + 1) * self._size[1]
+        index = np.concatenate([self._order[self._start[r + first[1]] : self._start[r + last[1] + 1]] for r in rows])
+        return index[(np.abs(self.xyz[index, :2] - place) <= radius).all(axis=1)]
 
 
 def _fit(xyz: F32, chain: Chain) -> Stem | None:

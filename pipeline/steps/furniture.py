@@ -43,8 +43,8 @@ def furniture(inputs: Inputs, params: FurnitureParams, out: Path, report: Report
 
     Files: `building` and `vegetation`, meshes of signs, poles and lamps, and of trunks, with a class code for every
     face; `taken`, .npz with `index` (N,) of the cloud's points that are theirs; `geojson` and `csv`: places in the
-    tile's CRS, kind, height above the ground, radius, and of plates the way that they face, clockwise from the
-    CRS's north.
+    tile's CRS, kind, height above the ground, radius, and of plates the way that they face (of lamps, that they
+    reach), clockwise from the CRS's north.
     """
     import numpy as np
 
@@ -108,10 +108,11 @@ def _held(xyz: F32, things: list[Thing]) -> npt.NDArray[np.int64]:
     """Indices of the points (N, 3) that are one of the things' own."""
     import numpy as np
 
-    from scan2sim.pipeline.standing import within
+    from scan2sim.pipeline.standing import Columns
 
-    places = np.array([thing.stem.middle for thing in things]).reshape(-1, 2)
-    own = [near[thing.held(xyz[near])] for near, thing in zip(within(xyz, places, 2.0), things, strict=True)]
+    columns = Columns(xyz)
+    near = [columns.near(thing.stem.middle, 4.0) for thing in things]
+    own = [index[thing.held(xyz[index])] for index, thing in zip(near, things, strict=True)]
     return np.unique(np.concatenate([np.zeros(0, np.int64), *own]))
 
 
@@ -135,6 +136,8 @@ def _row(thing: Thing, frame: Frame) -> dict[str, Any]:
     x, y, z = frame.to_crs(thing.foot[None])[0].tolist()
     row: dict[str, Any] = {"x": round(x, 3), "y": round(y, 3), "z": round(z, 3), "kind": thing.kind}
     row |= {"height_m": round(thing.height, 2), "radius_m": round(thing.stem.thickness, 3)}
+    if thing.arm is not None:
+        row["heading_deg"] = round(float(np.degrees(np.arctan2(*thing.arm.direction))) % 360, 1)
     if thing.plates:
         plate = max(thing.plates, key=lambda p: p.width * p.height)
         heading = float(np.degrees(np.arctan2(plate.normal[0], plate.normal[1]))) % 360

@@ -13,7 +13,7 @@ from scan2sim.data_samples.layout import FRAME, lay_out
 from scan2sim.pipeline import primitives
 from scan2sim.pipeline.classes import CODE
 from scan2sim.pipeline.plates import plates
-from scan2sim.pipeline.standing import stems
+from scan2sim.pipeline.standing import Columns, stems
 from scan2sim.pipeline.step import Done, silent
 from scan2sim.pipeline.steps.decimate import DECIMATE, DecimateParams
 from scan2sim.pipeline.steps.furniture import FURNITURE, FurnitureParams
@@ -121,7 +121,7 @@ def test_a_fence_a_wall_and_a_bush_are_no_poles() -> None:
     angle = rng.uniform(0, np.pi, 1500)
     pole = np.column_stack([9 + 0.04 * np.cos(angle), 3 + 0.04 * np.sin(angle), rng.uniform(0.2, 3, 1500)])
     xyz = np.concatenate([wall, bush, pickets, pole + rng.normal(0, 0.01, pole.shape)]).astype(np.float32)
-    (stem,) = stems(xyz, xyz[:, 2], 1.25)
+    (stem,) = stems(Columns(xyz), xyz[:, 2], 1.25)
     assert stem.middle == pytest.approx([9, 3], abs=0.01) and stem.thickness == pytest.approx(0.04, abs=0.01)
 
 
