@@ -48,8 +48,8 @@ SHARP = 0.6
 """Sharpness against that of the same camera's photos below which one counts as blurred."""
 FEW = 3
 """Photos of a camera from which its usual sharpness is known."""
-LOOSE = 0.3
-"""Metres by which a surface's outline may be off: three voxels of the mission's."""
+LOOSE = 0.5
+"""Metres by which a surface's outline may be off: five voxels of the mission's, as leaves are."""
 BURNT = 0.6
 """Share of overexposed pixels beyond which a photo is left out."""
 
@@ -161,7 +161,7 @@ def agreement(inputs: Inputs, params: AgreementParams, out: Path, report: Report
         rows[i] |= compared.figures
         own = photo.mask
         if params.sky:
-            own, rows[i]["sky_share"] = without_sky(photo.levels[0], own, depth(i))
+            own, rows[i]["sky_share"] = without_sky(views[i], photo.levels[0], own, depth(i))
         mask = combined(compared.ghosts if params.ghosts else None, own)
         if mask is not None:
             image.write(folder / f"mask_{i}.png", mask)
@@ -341,14 +341,15 @@ def ghost_mask(mine: F32, predicted: Prediction, white: npt.NDArray[np.bool_]) -
     return np.asarray(cv2.dilate(ghost.astype(np.uint8), np.ones((7, 7)))) > 0
 
 
-def without_sky(rgb: U8, mask: U8, depth: DepthMap) -> tuple[U8, float]:
-    """A photo's mask, (0, 0) for none, 0 also where it shows sky instead of a surface, and its share."""
+def without_sky(view: View, rgb: U8, mask: U8, depth: DepthMap) -> tuple[U8, float]:
+    """A photo's mask, (0, 0) for none, 0 also where it shows sky, and how large a share that is."""
     import numpy as np
 
-    from scan2sim.pipeline.cameras import pixel_angle
+    from scan2sim.pipeline.cameras import pixel_angle, pixel_rays
     from scan2sim.texturing.sky import sky
 
-    found = sky(rgb, depth.range, pixel_angle(depth.camera) * depth.camera.width / rgb.shape[1], LOOSE)
+    up = np.nan_to_num(pixel_rays(view.camera.scaled(1 / 8))) @ view.T_world_cam[2, :3].astype(np.float32)
+    found = sky(rgb, depth.range, up, pixel_angle(view.camera), LOOSE)
     if found is None:
         return mask, 0.0
     allowed = np.where(found, 0, 255).astype(np.uint8)

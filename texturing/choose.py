@@ -6,7 +6,7 @@ faces (`texturing.labels`), so that neighbours share a photo where it costs litt
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -81,6 +81,7 @@ def choose(inputs: Inputs, params: ChooseParams, out: Path, report: Report) -> D
     Inputs: `mesh`, `views`, `depth` (folder of depth maps), `agreement` (which views may be used, and where).
     File: `choice`, a `Choice`.
     """
+    from scan2sim.pipeline.cameras import pixel_angle
     from scan2sim.pipeline.io import views as views_io
     from scan2sim.pipeline.types import Mesh
     from scan2sim.pipeline.visibility import load_depth_map
@@ -95,7 +96,7 @@ def choose(inputs: Inputs, params: ChooseParams, out: Path, report: Report) -> D
 
     usable = [i for i in range(len(views)) if agreement.usable[i]]
     choice, seams = choose_views(mesh, views, usable, depth, agreement.mask, agreement.sharpness, params, report)
-    choice = with_whole_signs(choice, mesh)
+    choice = with_whole_signs(choice, mesh, [pixel_angle(view.camera) for view in views])
     choice.save(out / "choice.npz")
     seen = float((choice.label >= 0).mean()) if len(mesh) else 0.0
     return Done({"choice": out / "choice.npz"}, {"faces": len(mesh), "seen": round(seen, 4), "seam_share": seams})
@@ -131,10 +132,15 @@ def choose_views(
     return Choice(best.view, best.quality, chosen), round(share, 4)
 
 
-def with_whole_signs(choice: Choice, mesh: Mesh) -> Choice:
-    """The choice with one photo for each side of a sign's plate, if one sees all of it: the best of these, alone.
+def with_whole_signs(choice: Choice, mesh: Mesh, pixel: Sequence[float]) -> Choice:
+    """The choice with one photo for each side of a sign's plate, if one sees all of it: the finest of these, alone.
 
     Photos that are a pixel off would blur what is to be read.
+
+    Args:
+        choice: of all faces.
+        mesh: with their classes.
+        pixel: radians that a pixel of each view spans.
     """
     import numpy as np
 
@@ -150,7 +156,7 @@ def with_whole_signs(choice: Choice, mesh: Mesh) -> Choice:
         area = mesh.face_area[side][:, None]
         whole = [v for v in np.unique(shown[shown >= 0]) if (shown == v).any(axis=1).all()]
         if whole:
-            best = whole[int(np.argmax([(good * area)[shown == v].sum() for v in whole]))]
+            best = whole[int(np.argmax([(good * area)[shown == v].sum() / pixel[v] ** 2 for v in whole]))]
             own = (good * (shown == best)).max(axis=1)
             view[side], quality[side] = -1, 0
             view[side, 0], quality[side, 0], label[side] = best, own, best

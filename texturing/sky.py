@@ -35,12 +35,13 @@ MIXED = 3
 """Pixels across of what one pixel of sky mixes with."""
 
 
-def sky(rgb: U8, depth: F32, pixel: float, loose: float) -> Bools | None:
-    """(H, W) where a photo shows sky or a mixture with it though it should show a surface; None: nowhere.
+def sky(rgb: U8, depth: F32, up: F32, pixel: float, loose: float) -> Bools | None:
+    """(H, W) where a photo shows sky or a mixture with it; None: nowhere.
 
     Args:
         rgb: (H, W, 3) the photo.
         depth: (h, w) its depth map, metres, infinite where there is nothing.
+        up: (k, l) of any size, above 0 where the photo looks above the horizon.
         pixel: radians that a pixel of the photo spans.
         loose: metres by which a surface's outline may be off.
     """
@@ -48,7 +49,7 @@ def sky(rgb: U8, depth: F32, pixel: float, loose: float) -> Bools | None:
 
     size = (rgb.shape[1], rgb.shape[0])
     far = cv2.resize((~np.isfinite(depth)).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
-    colour, seeds = _colour(rgb, far)
+    colour, seeds = _colour(rgb, far & (cv2.resize(up, size) > 0))
     if colour is None or int(seeds.sum()) < LEAST:
         return None
     like = (np.abs(rgb.astype(np.float32) - colour).max(axis=2) < ALIKE).astype(np.uint8)
@@ -61,8 +62,7 @@ def sky(rgb: U8, depth: F32, pixel: float, loose: float) -> Bools | None:
     beside = np.bincount(part[aside < loose], minlength=count)
     bleeds = beside > MOSTLY * whole
     bleeds[0] = False
-    mixed = cv2.dilate(bleeds[part].astype(np.uint8), np.ones((MIXED, MIXED))) & (1 - far)
-    return np.asarray(mixed > 0) if mixed.any() else None
+    return np.asarray(cv2.dilate(open_ | bleeds[part].astype(np.uint8), np.ones((MIXED, MIXED))) > 0)
 
 
 def _touching(mask: U8, seeds: U8) -> U8:
