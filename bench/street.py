@@ -30,12 +30,13 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from bench import street_boxes, street_score, street_synthetic
 from bench.measure import measure
@@ -46,6 +47,8 @@ DATA = ROOT.parent / "shared" / "data"
 HELD_OUT = (4, 12, 20)
 NEAR, PER_PHOTO = 30.0, 0.05
 """Metres within which returns are to be covered, and seconds from the photo's time to those of its own sweep."""
+BESIDE = 3
+"""Pixels beside a return that the lidar has reached, too."""
 PARTS = ("odo04", "raw0009", "keep", "synthetic", "time")
 EDGES = "bench.edges"
 """Measures `edge_cm`."""
@@ -93,7 +96,7 @@ def made(street: Street, folder: Path, settings: tuple[str, ...] = (), *, run: b
     """Import the street and make its world; folders of tile and run. What is made already stays."""
     tile, out = folder / "tile", folder / "run"
     if not (tile / "tile.toml").is_file():
-        scan2sim("import", *street.importing, tile, "--link")
+        scan2sim("import", *street.importing, "--out", tile)
     if run:
         scan2sim("run", tile, "--out", out, "--hold-out", 8, *(x for s in settings for x in ("--set", s)))
     return tile, out
@@ -101,20 +104,29 @@ def made(street: Street, folder: Path, settings: tuple[str, ...] = (), *, run: b
 
 def scored(street: Street, tile: Path, run: Path, pictures: Path, *, keep: bool = False) -> dict[str, Any]:
     """All figures of a street's world."""
+    import laspy
+
     world = World(run / "world")
     views = photos(tile, run, world.origin)
-    rows, shifts, signs = {}, [], {}
+    rows, shifts, scanned, signs = {}, [], [], {}
+    cloud = laspy.read(tile / "cloud.laz")
+    returns = np.stack([cloud.x, cloud.y, cloud.z], axis=1) - world.origin
+    times_of = np.asarray(cloud.gps_time)
     for frame in HELD_OUT:
         photo, drawn = views[frame], street_score.truth()[street.name][str(frame)]
         seen = world.seen(photo)
         masked = np.zeros(photo.rgb.shape[:2], bool) if keep else _vehicles(street, frame, photo)
         counts = seen.hit & ~masked
+        own = np.abs(times_of - photo.time) < PER_PHOTO
         rows[frame] = street_score.likeness(photo.rgb, seen.rgb, counts)
-        rows[frame] |= {"counted": float(counts.mean()), "uncovered": _uncovered(tile, world, photo, seen, masked)}
+        rows[frame] |= {"counted": float(counts.mean()), "uncovered": _uncovered(returns[own], photo, seen, masked)}
+        reached = _reached(returns, photo)
         gained = np.round(street_score.gained(photo.rgb, seen.rgb, counts)).astype(np.uint8)
         for kind, lines in drawn["outlines"].items():
             for i, line in enumerate(lines):
-                shifts.append((f"{frame} {kind} {i}", street_score.displacements(photo.rgb, gained, line)))
+                shift, (column, row) = _shifts(photo.rgb, gained, line)
+                shifts.append((f"{frame} {kind} {i}", shift))
+                scanned.append(reached[row, column])
         for name, polygon in drawn["signs"].items():
             if np.ptp(np.array(polygon), axis=0).max() >= SIGN:
                 at = street_score.filled([polygon], photo.rgb.shape)
@@ -137,6 +149,7 @@ def scored(street: Street, tile: Path, run: Path, pictures: Path, *, keep: bool 
         "remains_m2": left,
         "outlines": {name: float(np.median(s)) for name, s in shifts if len(s)},
         "displacements_px": together.tolist(),
+        "displacements_scanned_px": together[np.concatenate(scanned)].tolist(),
         "signs_db": signs,
         "seen_share": json.loads((run / "report.json").read_text(encoding="utf-8"))["texture"]["coverage"],
     }
@@ -149,19 +162,38 @@ def _vehicles(street: Street, frame: int, photo: Photo) -> Bools:
     return masked | street_boxes.mask(street.labels, frame, photo.rgb.shape) if street.labels else masked
 
 
-def _uncovered(tile: Path, world: World, photo: Photo, seen: Seen, masked: Bools) -> float:
-    """Share of the returns of the photo's own sweep, on pixels that aren't masked, where the world shows nothing."""
-    import laspy
+def _shifts(
+    photo: U8, rendering: U8, line: Sequence[Sequence[float]]
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
+    shift, at = street_score.displacements(photo, rendering, line)
+    return shift, at.T
 
-    cloud = laspy.read(tile / "cloud.laz")
-    own = np.abs(np.asarray(cloud.gps_time) - photo.time) < PER_PHOTO
-    xyz = np.stack([cloud.x, cloud.y, cloud.z], axis=1)[own] - world.origin
-    local = (xyz - photo.T[:3, 3]) @ photo.T[:3, :3]
-    local = local[(local[:, 2] > 0.5) & (np.linalg.norm(local, axis=1) < NEAR)] @ photo.K.T
+
+def _reached(returns: npt.NDArray[np.float64], photo: Photo) -> Bools:
+    """(H, W) pixels beside which any sweep's return within 60 m falls: what of the photo the lidar reached."""
+    from scipy.ndimage import binary_dilation
+
+    column, row = _pixels(returns, photo, 2 * NEAR)
+    out = np.zeros(photo.rgb.shape[:2], bool)
+    out[row, column] = True
+    return np.asarray(binary_dilation(out, iterations=BESIDE))
+
+
+def _pixels(
+    returns: npt.NDArray[np.float64], photo: Photo, far: float
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Columns and rows of the places (N, 3) in front of a photo, nearer than `far` metres, that fall into it."""
+    local = (returns - photo.T[:3, 3]) @ photo.T[:3, :3]
+    local = local[(local[:, 2] > 0.5) & (np.linalg.norm(local, axis=1) < far)] @ photo.K.T
     column, row = np.round(local[:, :2] / local[:, 2:]).astype(np.int64).T
-    height, width = masked.shape
+    height, width = photo.rgb.shape[:2]
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    column, row = column[inside], row[inside]
+    return column[inside], row[inside]
+
+
+def _uncovered(own: npt.NDArray[np.float64], photo: Photo, seen: Seen, masked: Bools) -> float:
+    """Share of the returns of the photo's own sweep, on pixels that aren't masked, where the world shows nothing."""
+    column, row = _pixels(own, photo, NEAR)
     free = ~masked[row, column]
     return float((~seen.hit[row, column])[free].mean())
 
@@ -233,6 +265,9 @@ def table(figures: Mapping[str, Mapping[str, Any]]) -> None:
         if one["remains_m2"]:
             left = {track: round(area, 2) for track, area in one["remains_m2"].items()}
             print(f"  left of vehicles, m2 by track: {left}")
+        near = one["displacements_scanned_px"]
+        print(f"  outlines that the lidar reached: median {np.median(near):.2f} px, {len(near)} of", end="")
+        print(f" {len(one['displacements_px'])} places")
         print(f"  outlines, median px: { ({k: round(v, 2) for k, v in one['outlines'].items()}) }")
         if one["signs_db"]:
             print(f"  signs, dB: { ({k: round(v, 1) for k, v in one['signs_db'].items()}) }")

@@ -101,8 +101,13 @@ def _ssim(a: Grey, b: Grey, counts: Bools) -> float:
     return float(index[binary_erosion(counts, np.ones((11, 11)))].mean())
 
 
-def displacements(photo: U8, rgb: U8, line: Sequence[Sequence[float]]) -> npt.NDArray[np.float64]:
+def displacements(
+    photo: U8, rgb: U8, line: Sequence[Sequence[float]]
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
     """Pixels by which a rendering shows an outline beside where the photo does, every second pixel along it.
+
+    Returns:
+        (N,) pixels, and the places' (N, 2) columns and rows.
 
     The photo's brightness across the outline, five pixels to each side, is looked for in the rendering's, shifted by
     up to `FARTHEST`; where nothing there is alike (correlation below `ALIKE`), it counts as so far off.
@@ -117,7 +122,7 @@ def displacements(photo: U8, rgb: U8, line: Sequence[Sequence[float]]) -> npt.ND
     shown = [_grey(photo), _grey(rgb)]
     reach = np.arange(-PROFILE - FARTHEST, PROFILE + FARTHEST + STEP / 2, STEP)
     inner = slice(round(FARTHEST / STEP), len(reach) - round(FARTHEST / STEP))
-    out = []
+    out, at = [], []
     for place, way in zip(places, ways, strict=True):
         normal = np.array([-way[1], way[0]])
         strip = place + way * np.arange(-ALONG, ALONG + 1)[:, None, None] + normal * reach[:, None]
@@ -126,7 +131,8 @@ def displacements(photo: U8, rgb: U8, line: Sequence[Sequence[float]]) -> npt.ND
         across = [map_coordinates(g, strip[..., ::-1].reshape(-1, 2).T, order=1, mode="nearest") for g in shown]
         mine, other = (a.reshape(strip.shape[:2]).mean(axis=0) for a in across)
         out.append(_shift(mine[inner], other))
-    return np.array(out)
+        at.append(np.round(place).astype(np.int64))
+    return np.array(out), np.array(at, np.int64).reshape(-1, 2)
 
 
 def _along(line: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
