@@ -227,7 +227,8 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
         by_photo = {**choice, **seen} if settings.params(UNWRAP, group).backend == "photo" else {}
         add(UNWRAP, mesh | by_photo, group)
         unwrapped = {name: at(f"unwrap.{group}", name) for name in ("mesh", "pages")}
-        add(TEXTURE, {**unwrapped, **choice, **clouds, **own, **invented, **seen}, group)
+        stood = listed if group == "terrain" and not kept else {}
+        add(TEXTURE, {**unwrapped, **choice, **clouds, **own, **invented, **seen, **stood}, group)
     textured: dict[str, Path | Output] = {g: at(f"texture.{g}", "textured") for g in groups}
     for group in groups if met else ():
         others = {f"neighbour.{name}": at(f"texture.{group}", "textured", name) for name in met}

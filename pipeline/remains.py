@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scan2sim.pipeline.steps.geometry import spread
-from scan2sim.pipeline.types import F64, Mesh
+from scan2sim.pipeline.types import F64, Frame, Mesh
 
 SIDES = 0.1
 """Metres that a vehicle's box is taken smaller to each side: a wall that it touches is not its own."""
@@ -35,6 +35,22 @@ def left_of_vehicles(meshes: Sequence[Mesh], listed: Path) -> list[float]:
         ring = np.array(feature["geometry"]["coordinates"][0][:4], np.float64)
         corners = meshes[0].frame.to_local(np.column_stack([ring, np.full(4, about["ground_z"])])).astype(np.float64)
         out.append(sum(_within(mesh, corners, about["height_m"]) for mesh in meshes))
+    return out
+
+
+def outlines(listed: Path, frame: Frame) -> list[F64]:
+    """(4, 2) corners of the boxes of vehicles that stood still, local metres.
+
+    Args:
+        listed: as in `left_of_vehicles`.
+        frame: that the corners are brought to.
+    """
+    out = []
+    for feature in json.loads(listed.read_text(encoding="utf-8"))["features"]:
+        about = feature["properties"]
+        if about["kind"] != "person" and not about["moved"]:
+            ring = np.array(feature["geometry"]["coordinates"][0][:4], np.float64)
+            out.append(frame.to_local(np.column_stack([ring, np.zeros(4)]))[:, :2].astype(np.float64))
     return out
 
 

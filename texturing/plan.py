@@ -5,11 +5,13 @@ Import late: it loads numba.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import numpy.typing as npt
 
 from scan2sim.pipeline.heightfield import MOST
-from scan2sim.pipeline.types import F32, U8, Mesh
+from scan2sim.pipeline.types import F32, F64, U8, Mesh
 from scan2sim.texturing.continuation import FACTOR, continued
 from scan2sim.texturing.fill import FILLED, Page, texel_places
 
@@ -26,15 +28,31 @@ class Plan:
         mesh: the ground's.
         texel: metres.
         xyz, label: places (N, 3) and classes (N,) of its points: road isn't continued by grass.
+        stood: outlines (K, 2) of what stood there and was taken out: photos know but the black below.
     """
 
-    def __init__(self, mesh: Mesh, texel: float, xyz: F32, label: U8) -> None:
+    def __init__(self, mesh: Mesh, texel: float, xyz: F32, label: U8, stood: Sequence[F64] = ()) -> None:
         low, high = mesh.vertices[:, :2].min(axis=0), mesh.vertices[:, :2].max(axis=0)
         self.cell = max(CELL, texel, float(np.sqrt(np.prod(high - low + 1) / MOST)))
         self.low, self._xyz, self._label = low.astype(np.float64), xyz, label
         columns, rows = (np.ceil((high - low) / self.cell).astype(int) + 1).tolist()
         self._sum, self._count = np.zeros((rows, columns, 3), np.float32), np.zeros((rows, columns), np.float32)
         self._wanted = np.zeros((rows, columns), bool)
+        self._stood = _drawn([(ring - self.low) / self.cell for ring in stood], (rows, columns))
+
+    def stood(self, places: F32) -> Bools:
+        """(N,) at which places (N, 3) something stood that was taken out."""
+        return np.asarray(self._stood[self.at(places)], bool)
+
+    def clear(self, page: Page) -> None:
+        """Forget what photos saw below things that were taken out, in place."""
+        if not self._stood.any():
+            return
+        for first in range(0, len(page.owner), 1024):
+            row, column = np.nonzero(page.seen[first : first + 1024] == 255)
+            row += first
+            below = self.stood(texel_places(page.owner, page.flat, page.corners, row, column))
+            page.seen[row[below], column[below]] = 0
 
     def add(self, page: Page) -> None:
         """Take up what a page shows, and where it has been filled for want of something better."""
@@ -97,6 +115,16 @@ class Continued:
             y, x = self._plan.at(texel_places(page.owner, page.flat, page.corners, row, column))
             here = self._filled[y, x]
             page.rgb[row[here], column[here]] = self._picture[y[here], x[here]]
+
+
+def _drawn(rings: Sequence[F64], shape: tuple[int, int]) -> Bools:
+    """A mask of polygons (K, 2), x and y in cells."""
+    import cv2
+
+    mask = np.zeros(shape, np.uint8)
+    if rings:
+        cv2.fillPoly(mask, [np.round(ring).astype(np.int32) for ring in rings], 1)
+    return mask > 0
 
 
 def _whole(wanted: Bools, known: Bools) -> Bools:

@@ -80,7 +80,8 @@ def texture(inputs: Inputs, params: TextureParams, out: Path, report: Report) ->
 
     Inputs: `mesh` (with uv and page), `pages` (their sizes), `choice`, `views`, `depth` (folder of a depth map for
     every view), `exposures`, `agreement`, `cloud.*` (coloured points; that of the classes left out, `cloud.rest`,
-    lends no colours), `made.*` (points that were made up, if any).
+    lends no colours), `made.*` (points that were made up, if any), `things` (GeoJSON of those
+    that were taken out, if any).
     File: `textured`, a folder with `mesh.npz`, `page_<i>.png` and `page_<i>_seen.png` (255 seen by a photo,
     128 coloured from points, 64 filled from neighbours or by class, 0 no surface).
     """
@@ -105,9 +106,9 @@ def texture(inputs: Inputs, params: TextureParams, out: Path, report: Report) ->
         mesh, views, Choice.load(inputs["choice"]), lambda i: inputs["depth"] / f"{i}.npy",
         Exposures.load(inputs["exposures"]), Agreement.load(inputs["agreement"]), params,
     )  # fmt: skip
-    (colours, own), made = _colours_of(inputs), _made_colours(inputs)
-    texels = np.zeros((len(mesh), 4), np.int64)
     plan = _plan(mesh, sizes, inputs) if params.continued else None
+    (colours, own), made = _colours_of(inputs, plan), _made_colours(inputs)
+    texels = np.zeros((len(mesh), 4), np.int64)
     writer = Writer()
     for k, size in enumerate(sizes):
         faces = np.flatnonzero(mesh.page == k)
@@ -115,6 +116,8 @@ def texture(inputs: Inputs, params: TextureParams, out: Path, report: Report) ->
             faces, size["width"], size["height"],
             lambda f, m="", k=k: report((k + f) / len(sizes), f"page {k + 1} of {len(sizes)} {m}"),
         )  # fmt: skip
+        if plan is not None:
+            plan.clear(page)
         texels[faces] = _finish(page, faces, mesh, colours, None if own else made, params)
         if plan is not None:
             plan.add(page)
@@ -131,11 +134,13 @@ def texture(inputs: Inputs, params: TextureParams, out: Path, report: Report) ->
 
 def _plan(mesh: Mesh, sizes: Sequence[dict[str, int]], inputs: Inputs) -> Plan:
     """The picture from above of an unwrapped mesh, with the classes of the ground's points."""
+    from scan2sim.pipeline.remains import outlines
     from scan2sim.pipeline.types import PointCloud
     from scan2sim.texturing.plan import Plan
 
     cloud = PointCloud.load(inputs["cloud.terrain"])
-    return Plan(mesh, _texel(mesh, sizes), cloud.xyz, _labels(cloud))
+    stood = outlines(inputs["things"], mesh.frame) if "things" in inputs else []
+    return Plan(mesh, _texel(mesh, sizes), cloud.xyz, _labels(cloud), stood)
 
 
 def _texel(mesh: Mesh, sizes: Sequence[dict[str, int]]) -> float:
@@ -375,10 +380,11 @@ def shares(faces: I32, label: I32, vertices: int, views: int) -> Callable[[int],
     return share
 
 
-def _colours_of(inputs: Inputs) -> tuple[Colours | None, bool]:
+def _colours_of(inputs: Inputs, plan: Plan | None) -> tuple[Colours | None, bool]:
     """The points' colours, and whether they are their own (else their classes'); None where there are no points.
 
-    What is coloured by points that were made up (`made.*`) is marked as filled.
+    What is coloured by points that were made up (`made.*`) is marked as filled. Points lend none where something stood
+    on the `plan` that was taken out: theirs is of its shade.
     """
     import numpy as np
 
@@ -395,6 +401,8 @@ def _colours_of(inputs: Inputs) -> tuple[Colours | None, bool]:
         return Colours(cloud.xyz, shaded(_labels(cloud), cloud.normal), FILLED), False
     real = np.arange(len(cloud)) < len(cloud) - sum(len(PointCloud.load(inputs[name])) for name in made)
     known = cloud.coloured
+    if plan is not None:
+        known &= ~plan.stood(cloud.xyz)
     if not known.any():
         return None, False
     return Colours(

@@ -88,6 +88,7 @@ class Street:
     views: list[View] = field(default_factory=list)
     held_out: tuple[bool, ...] = ()
     clouds: dict[str, PointCloud] = field(default_factory=dict)
+    files: dict[str, Path] = field(default_factory=dict)
     texel: float = 0.02
     runs: int = 0
 
@@ -123,6 +124,7 @@ class Street:
         for name, cloud in self.clouds.items():
             cloud.save(out / f"{name}.npz")
             inputs[f"cloud.{name}"] = out / f"{name}.npz"
+        inputs |= self.files
         done = texture(inputs, TextureParams(**params), out, silent)
         return done.files["textured"], replace(done, warnings=warnings + done.warnings)
 

@@ -133,6 +133,27 @@ def test_the_ground_goes_on_where_no_photo_saw_it(street):
     assert (flat[seen == 255] == rgb[seen == 255]).all(axis=-1).mean() > 0.97  # but where lookups mix both
 
 
+def test_the_black_below_a_car_that_was_taken_out_is_painted_over(street):
+    camera, pose = CAMERAS["pinhole"], look_at((-4.5, 0, 3.0), (-1, 0, 0))
+    street.occluders = (GROUND,)
+    photo = photograph(camera, pose, meshes=(GROUND,))
+    corners = (GROUND.vertices * [0.2, 0.1, 1] - [1.5, 0, 0]).astype(np.float32)
+    below = photograph(camera, pose, meshes=(Mesh(Frame(), corners, GROUND.faces),))
+    photo[np.abs(below.astype(int) - [200, 214, 230]).sum(axis=-1) > 0] = 5  # the car's shade: 2 x 1 m
+    street.add(camera, pose, photo)
+    street.clouds["terrain"] = points()
+    black = lambda rgb: (rgb.max(axis=-1) < 30).sum()  # noqa: E731
+    before = black(from_above(street.run(continued=True, exposure={"solve": False})[0])[0])
+    ring = [[-2.6, -0.6], [-0.4, -0.6], [-0.4, 0.6], [-2.6, 0.6], [-2.6, -0.6]]
+    car = {"kind": "car", "moved": False}
+    feature = {"type": "Feature", "properties": car, "geometry": {"type": "Polygon", "coordinates": [ring]}}
+    street.files["things"] = street.folder / "things.geojson"
+    street.files["things"].write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
+    rgb, seen, _, x, y = from_above(street.run(continued=True, exposure={"solve": False})[0])
+    assert before > 500 and black(rgb) < 0.02 * before
+    assert not (seen[(abs(x + 1.5) < 1.0) & (abs(y) < 0.5)] == 255).any()
+
+
 def test_the_classes_left_out_lend_no_colours(street):
     street.clouds["terrain"], street.clouds["rest"] = points(rgb=(10, 200, 10)), points(rgb=(255, 0, 0))
     rgb, *_ = from_above(street.run()[0])
