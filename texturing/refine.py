@@ -89,7 +89,7 @@ def refine(inputs: Inputs, params: RefineParams, out: Path, report: Report) -> D
     index = [i for i, view in enumerate(views) if view.camera.model != "orthographic"]
     photos = [views[i] for i in index]
     names, camera = lenses(photos)
-    poses = np.stack([view.T_world_cam for view in photos])
+    poses = np.array([view.T_world_cam for view in photos], np.float64).reshape(-1, 4, 4)  # none where none can be read
     cameras = [small(view.camera) for view in photos]
     pictures = _pictures(photos, [k for k, i in enumerate(index) if not held[i]])
     surface, movable = _surface(inputs)
