@@ -18,6 +18,8 @@ from scan2sim.pipeline.types import F32, F64, I32
 
 Bools = npt.NDArray[np.bool_]
 
+LOOSE = 0.4
+"""Voxels by which a single point may miss its plane, at least: several make a thinned one."""
 CELLS = 2
 """Cells of a mask in a voxel."""
 BRIDGED = 2.5
@@ -43,8 +45,8 @@ SAME_WAY = float(np.cos(np.radians(15.0)))
 """Turn below which there is no corner."""
 SURE = 0.5
 """Share of a side behind which the same plane has to be."""
-LONG = 6.0
-"""Voxels of a side that a surface ends at: what is round has short ones."""
+LONG = 10.0
+"""Voxels of a side that a surface ends at: what is round, or small, has short ones."""
 AROUND = ((1.9, 1.5, 1.2), (1.9, 0.0, 1.2), (1.9, -1.5, 1.2), (1.9, -3.0, 1.2),
           (0.0, 2.2, 1.2), (0.0, -2.2, 1.2), (0.0, -4.0, 1.2))  # fmt: skip
 """Voxels out of a side, in front of its plane, and radius, of places that are empty where a surface ends: it neither
@@ -56,6 +58,8 @@ STEP_LEAST, STEP_MOST = 0.4, 4.0
 """Voxels between two parallel planes of which one ends before the other: reveals, ledges, parapets."""
 REACH = 3.5
 """Voxels beyond a side in which its surface is cut off: `trim` leaves two and a half."""
+RIM = 1.2
+"""Voxels of such a face behind whose front no plane is: rims of roofs, parapets, sills."""
 SPAN = 0.8
 """Voxels between the points that stand for a step's face."""
 
@@ -114,8 +118,9 @@ def members(xyz: F32, planes: Planes, thin: F32, which: I32, voxel: float, toler
         thin: (M, 3) one a voxel, in the order of `voxel_groups`.
         which: (M,) their planes.
         voxel: metres.
-        tolerance: metres by which a point may miss its plane.
+        tolerance: metres by which a thinned point may miss its plane; a single one may by `LOOSE` voxels.
     """
+    tolerance = max(tolerance, LOOSE * voxel)
     own = np.full(len(xyz), -1, np.int32)
     on = np.flatnonzero(which >= 0)
     if not len(on):
@@ -206,6 +211,7 @@ def steps(
         down = planes.beyond(places, back)
         ok &= (down > max(STEP_LEAST * voxel, 2 * tolerance)) & (down < STEP_MOST * voxel)
         behind[ok] = back[ok]
+    rim = _rims(places, of, found, normal, thin[which < 0], voxel)
     normals: list[F64] = []
     offsets: list[float] = []
     points: list[F64] = []
@@ -213,11 +219,14 @@ def steps(
     for side in range(len(found)):
         here = behind[of == side]
         back = int(np.bincount(here + 1, minlength=2)[1:].argmax())
-        if (here == back).mean() < SURE:
-            continue
         outward = found.outward[side]
         line = places[of == side]
-        depth = (line @ planes.normal[back] - planes.offset[back]).mean()
+        if (here == back).mean() >= SURE:
+            depth = float((line @ planes.normal[back] - planes.offset[back]).mean())
+        elif rim[of == side].mean() >= SURE:
+            depth = RIM * voxel
+        else:
+            continue
         rungs = (np.arange(max(1, round(depth / voxel / SPAN))) + 0.5) * depth / max(1, round(depth / voxel / SPAN))
         length = np.linalg.norm(found.end[side] - found.start[side])
         share = np.linspace(0, 1, max(2, int(length / (SPAN * voxel))))[:, None]
@@ -230,6 +239,19 @@ def steps(
     if not normals:
         return none
     return Planes(np.array(normals), np.array(offsets)), np.concatenate(points), np.concatenate(whose)
+
+
+def _rims(places: F64, of: I32, found: Sides, normal: F64, loose: F32, voxel: float) -> Bools:
+    """(N,) whether points that are on no plane lie straight behind places of sides: a face too narrow for a plane."""
+    if not len(loose):
+        return np.zeros(len(places), bool)
+    _, at = cKDTree(loose).query(places - 0.8 * RIM * voxel * normal[of], distance_upper_bound=0.8 * RIM * voxel)
+    near = np.flatnonzero(at < len(loose))
+    apart = loose[at[near]] - places[near]
+    out, down = (apart * found.outward[of[near]]).sum(axis=1), -(apart * normal[of[near]]).sum(axis=1)
+    rim = np.zeros(len(places), bool)
+    rim[near] = (np.abs(out) < 0.3 * voxel) & (down > 0.4 * voxel)
+    return rim
 
 
 def free(

@@ -50,20 +50,27 @@ class Sharpened:
     edge: npt.NDArray[np.bool_]
 
 
-def sharpen(mesh: Mesh, planes: Planes, own: I32, ends: int, voxel: float) -> Sharpened:
+def sharpen(
+    mesh: Mesh, planes: Planes, own: I32, beside: npt.NDArray[np.bool_], ends: int, voxel: float, tolerance: float
+) -> Sharpened:
     """The mesh on its planes.
 
     Args:
         mesh: to be sharpened.
         planes: that its vertices lie on; the last of them are the ends of others.
         own: (V,) which of them, -1 for none.
+        beside: (V,) bool, rounded beside an edge: laid on its plane from wherever it is. Others are the less moved, the
+            nearer to `tolerance` they lie, so that a relief as deep fades into its plane.
         ends: number of the first plane beyond which nothing is: the faces of its vertices go.
         voxel: metres.
+        tolerance: metres by which what lies on a plane may miss it.
     """
     vertices, faces = mesh.vertices.astype(np.float64), mesh.faces.astype(np.int64)
     moved = vertices.copy()
     on = np.flatnonzero((own >= 0) & (own < ends))
-    moved[on] -= planes.beyond(vertices[on], own[on])[:, None] * planes.normal[own[on]]
+    off = planes.beyond(vertices[on], own[on])
+    share = np.where(beside[on], 1.0, np.clip(2 - 2 * np.abs(off) / tolerance, 0, 1))
+    moved[on] -= (share * off)[:, None] * planes.normal[own[on]]
     pairs, edges = _edges(faces)
     a, b = own[pairs[:, 0]], own[pairs[:, 1]]
     middle = vertices[pairs].mean(axis=1)
@@ -90,23 +97,26 @@ def sharpen(mesh: Mesh, planes: Planes, own: I32, ends: int, voxel: float) -> Sh
     return Sharpened(small, which_of[used], edge)
 
 
-def plane_of(mesh: Mesh, planes: Planes, xyz: F32, which: I32, voxel: float, tolerance: float) -> I32:
-    """(V,) each vertex's plane, -1 for none.
+def plane_of(
+    mesh: Mesh, planes: Planes, xyz: F32, which: I32, voxel: float, tolerance: float
+) -> tuple[I32, npt.NDArray[np.bool_]]:
+    """(V,) each vertex's plane, -1 for none; and whether it lies beside an edge.
 
     A vertex's is the nearest point's, where it lies on it and looks as it does; beside an edge, which Poisson has
     rounded, the nearer of the two that meet there.
     """
     own = np.full(len(mesh.vertices), -1, np.int32)
+    beside = np.zeros(len(own), bool)
     if not len(xyz) or not len(mesh):
-        return own
+        return own, beside
     tree = cKDTree(xyz)
     _, at = tree.query(mesh.vertices, NEAR, distance_upper_bound=REACH * voxel, workers=-1)
     near = np.append(which, np.int32(-1))[at].astype(np.int32)
     normal = vertex_normals(mesh)
-    _assign(
-        mesh.vertices.astype(np.float64), normal, near, planes.normal, planes.offset, tolerance, ROUNDED * voxel, own
-    )
-    return own
+    axis, offset = np.ascontiguousarray(planes.normal), planes.offset
+    vertices = mesh.vertices.astype(np.float64)
+    _assign(vertices, normal, near, axis, offset, tolerance, ROUNDED * voxel, own, beside)
+    return own, beside
 
 
 def vertex_normals(mesh: Mesh) -> F64:
@@ -162,7 +172,7 @@ def border_of(mesh: Mesh) -> npt.NDArray[np.int64]:
 
 
 @njit(cache=True, parallel=True)
-def _assign(xyz, normal, near, axis, offset, tolerance, rounded, own):  # type: ignore[no-untyped-def]
+def _assign(xyz, normal, near, axis, offset, tolerance, rounded, own, beside):  # type: ignore[no-untyped-def]
     for i in prange(len(xyz)):
         seen = np.empty(4, np.int32)
         count = 0
@@ -191,6 +201,7 @@ def _assign(xyz, normal, near, axis, offset, tolerance, rounded, own):  # type: 
                     if far < best:
                         best = far
                         own[i] = seen[k] if abs(a) <= abs(b) else seen[m]
+                        beside[i] = True
         if own[i] >= 0:
             continue
         for k in range(count):

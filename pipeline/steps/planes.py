@@ -54,7 +54,7 @@ def planes(inputs: Inputs, params: PlanesParams, out: Path, report: Report) -> D
     )
     report(0.5, "vertices")
     on = which >= 0
-    laid = sharpen.plane_of(
+    near, beside = sharpen.plane_of(
         mesh,
         every := Planes.join([found, faces]),
         np.concatenate([cloud.xyz[on], between]).astype(np.float32),
@@ -62,9 +62,10 @@ def planes(inputs: Inputs, params: PlanesParams, out: Path, report: Report) -> D
         voxel,
         tolerance,
     )
-    laid = extents.ended(mesh.vertices.astype(np.float64), laid, every, sides, ends, of_side, cloud.xyz, voxel)
+    laid = extents.ended(mesh.vertices.astype(np.float64), near, every, sides, ends, of_side, cloud.xyz, voxel)
     report(0.7, "edges")
-    sharp = sharpen.sharpen(mesh, Planes.join([every, sides.planes]), laid, len(every), voxel)
+    beside |= laid != near
+    sharp = sharpen.sharpen(mesh, Planes.join([every, sides.planes]), laid, beside, len(every), voxel, tolerance)
     sharp.mesh.save(out / "mesh.npz")
     facts |= {
         "faces": len(sharp.mesh),
@@ -76,4 +77,4 @@ def planes(inputs: Inputs, params: PlanesParams, out: Path, report: Report) -> D
     return Done({"mesh": out / "mesh.npz"}, facts)
 
 
-PLANES = Step("planes", 1, planes, PlanesParams)
+PLANES = Step("planes", 2, planes, PlanesParams)
