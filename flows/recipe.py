@@ -166,14 +166,16 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
         (WALLS, "building", ("building", "terrain")),
     ):
         when = settings.params(step).when
-        if when == "always" or (when == "auto" and not path):
+        hidden = listed if step is GROUND and when == "auto" else {}
+        if when == "always" or (when == "auto" and not path) or hidden:
             seen_from_above = {part: at(f"voxel.{part}", "cloud") for part in parts}
             theirs = {f"{part}.{name}": at(f"voxel.{part}", "cloud", name) for part in parts for name in met}
             below: dict[str, Path | Output] = {}
             if step is WALLS:
                 below = {"ground": made["terrain"]["made"]} if "terrain" in made else {}
                 below |= {"footprints": tile.footprints} if tile.footprints else {}
-            add(step, seen_from_above | theirs | below, **around)
+            others = {f"{k}.{name}": at("things", k, name) for k in hidden for name in met}
+            add(step, seen_from_above | theirs | below | hidden | others, **around)
             made[group] = {"made": at(step.name, "made")}
     for group in groups:
         cloud, size = at(f"voxel.{group}", "cloud"), settings.params(VOXEL, group).size

@@ -108,6 +108,16 @@ def spacing(xyz: F32) -> float:
     return min(SIZES, key=lambda size: abs(np.log(size / max(found, 1e-6))))
 
 
+def drawn(rings: Sequence[npt.NDArray[np.floating]], shape: tuple[int, int]) -> Bools:
+    """A mask of polygons (K, 2), x and y in cells from the first cell's corner."""
+    import cv2
+
+    mask = np.zeros(shape, np.uint8)
+    if rings:
+        cv2.fillPoly(mask, [np.floor(ring).astype(np.int32) for ring in rings], 1)
+    return mask > 0
+
+
 def grown(mask: Bools, radius: float) -> Bools:
     """A mask with all cells within a radius, in cells."""
     from scipy import ndimage

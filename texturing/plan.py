@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from scan2sim.pipeline.heightfield import MOST
+from scan2sim.pipeline.heightfield import MOST, drawn
 from scan2sim.pipeline.types import F32, F64, U8, Mesh
 from scan2sim.texturing.continuation import FACTOR, continued
 from scan2sim.texturing.fill import FILLED, Page, texel_places
@@ -38,7 +38,7 @@ class Plan:
         columns, rows = (np.ceil((high - low) / self.cell).astype(int) + 1).tolist()
         self._sum, self._count = np.zeros((rows, columns, 3), np.float32), np.zeros((rows, columns), np.float32)
         self._wanted = np.zeros((rows, columns), bool)
-        self._stood = _drawn([(ring - self.low) / self.cell for ring in stood], (rows, columns))
+        self._stood = drawn([(ring - self.low) / self.cell for ring in stood], (rows, columns))
 
     def stood(self, places: F32) -> Bools:
         """(N,) at which places (N, 3) something stood that was taken out."""
@@ -115,16 +115,6 @@ class Continued:
             y, x = self._plan.at(texel_places(page.owner, page.flat, page.corners, row, column))
             here = self._filled[y, x]
             page.rgb[row[here], column[here]] = self._picture[y[here], x[here]]
-
-
-def _drawn(rings: Sequence[F64], shape: tuple[int, int]) -> Bools:
-    """A mask of polygons (K, 2), x and y in cells."""
-    import cv2
-
-    mask = np.zeros(shape, np.uint8)
-    if rings:
-        cv2.fillPoly(mask, [np.round(ring).astype(np.int32) for ring in rings], 1)
-    return mask > 0
 
 
 def _whole(wanted: Bools, known: Bools) -> Bools:

@@ -1,4 +1,4 @@
-"""Ground: closed under roofs and crowns, where an airborne scanner saw none of it."""
+"""Ground: closed under roofs and crowns, where an airborne scanner saw none; in streets where something hid it."""
 
 from __future__ import annotations
 
@@ -11,10 +11,18 @@ from scan2sim.pipeline.ranges import Place
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
-    from scan2sim.pipeline.types import PointCloud
+    import numpy as np
+    import numpy.typing as npt
+
+    from scan2sim.pipeline.heightfield import Raster
+    from scan2sim.pipeline.types import Frame, PointCloud
+
+    Bools = npt.NDArray[np.bool_]
 
 FLAT = 0.5  # |nz| from which on a surface is a roof's
 COVER = 3  # cells of the points' spacing: gaps between points of one roof or crown
+BESIDE = 0.5  # metres around a vehicle's box within which its shadow in the scan may reach
+HOLE = 25.0  # m2 up to which a hole with ground all around it is closed: a courtyard isn't
 
 
 class MadeUpParams(Params):
@@ -37,20 +45,25 @@ class MadeUpParams(Params):
 
 
 class GroundParams(MadeUpParams):
-    """Which holes are closed; the rest as of the walls.
+    """Which holes are closed; the rest as of the walls, but that "auto" closes those of streets as well.
 
     Attributes:
         reach: metres; gaps between ground, roofs and crowns that are less than twice as wide are closed as well.
+        gap: metres; with a scanner's path, gaps of the ground that are less than twice as wide are closed, holes with
+            ground all around them up to 25 m2, and where parked vehicles were taken out.
     """
 
     reach: float = Field(10.0, ge=0, le=50)
+    gap: float = Field(1.5, ge=0, le=50)
 
 
 def ground(inputs: Inputs, params: GroundParams, out: Path, report: Report) -> Done:
     """Make up points of the ground where `terrain` has a hole under `building`, `vegetation` or `rest`.
 
-    The holes' heights and colours hang from their rims like a membrane. Where the tile meets others, their clouds
-    (`terrain.NAME` and so on) are looked at as well: both tiles fill a hole on their border alike.
+    With `things` (GeoJSON of vehicles that were taken out) it is a street's ground: what hid it is gone or is a low
+    wall, and just its gaps are closed (`gap`). The holes' heights and colours hang from their rims like a membrane;
+    a street's made-up points have no colour, as the texture goes on by itself. Where the tile meets others, their
+    clouds (`terrain.NAME` and so on) are looked at as well: both tiles fill a hole on their border alike.
     File: `made`, a `PointCloud` with normals, as dense as the ground's own points are.
     """
     import numpy as np
@@ -58,22 +71,26 @@ def ground(inputs: Inputs, params: GroundParams, out: Path, report: Report) -> D
     from scan2sim.pipeline.border import on_grid
     from scan2sim.pipeline.classes import CODE
     from scan2sim.pipeline.heightfield import Raster, closed, grown, membrane, spacing
-    from scan2sim.pipeline.types import PointCloud
+    from scan2sim.pipeline.types import UNCOLOURED, PointCloud
 
     terrain = united(inputs, params, "terrain")
-    above = [united(inputs, params, part) for part in ("building", "vegetation", "rest")]
-    asked = params.when == "always" or from_above(above[0])
+    above = [united(inputs, params, part) for part in ("building", "vegetation", "rest") if part in inputs]
+    street = "things" in inputs
+    asked = street or params.when == "always" or from_above(above[0])
     made = PointCloud(terrain.frame, np.zeros((0, 3), np.float32), normal=np.zeros((0, 3), np.float32))
     area = 0.0
-    if asked and len(terrain) and any(map(len, above)):
+    if asked and len(terrain) and (street or any(map(len, above))):
         from scipy import ndimage
 
         raster = Raster.over(spacing(terrain.xyz), [terrain.xyz, *(cloud.xyz for cloud in above)])
-        cover = np.any([closed(raster.covered(cloud.xyz), COVER) for cloud in above], axis=0)
         columns = [terrain.xyz[:, 2:]] + ([] if terrain.rgb is None else [terrain.rgb])
         known = raster.mean(terrain.xyz, np.concatenate(columns, axis=1))
         has = np.isfinite(known[..., 0])
-        wanted = ndimage.binary_fill_holes(closed(has | cover, params.reach / raster.cell))
+        if street:
+            wanted = gaps(has, stood(inputs, raster, terrain.frame), raster.cell, params.gap)
+        else:
+            cover = np.any([closed(raster.covered(cloud.xyz), COVER) for cloud in above], axis=0)
+            wanted = ndimage.binary_fill_holes(closed(has | cover, params.reach / raster.cell))
         report(0.3, "membrane")
         field = membrane(known, np.asarray(wanted))
         new = np.isfinite(field[..., 0]) & ~grown(has, 1.5)
@@ -84,11 +101,49 @@ def ground(inputs: Inputs, params: GroundParams, out: Path, report: Report) -> D
         normal = np.column_stack([-slope[1][new], -slope[0][new], np.ones(len(xyz))])
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         rgb = None if terrain.rgb is None else np.rint(field[new][:, 1:]).clip(0, 255).astype(np.uint8)
+        if rgb is not None and street:
+            rgb[:] = UNCOLOURED
         label = np.full(len(xyz), CODE["terrain"], np.uint8)
         made = PointCloud(terrain.frame, xyz, rgb, normal.astype(np.float32), label)
         area = len(xyz) * raster.cell**2
     made.save(out / "made.npz")
     return Done({"made": out / "made.npz"}, {"from_above": asked, "points": len(made), "made_up_m2": round(area, 1)})
+
+
+def gaps(has: Bools, stood: Bools, cell: float, gap: float) -> Bools:
+    """What of a street's ground is to be there: what is, its gaps, its small holes, and where something stood.
+
+    Args:
+        has: (rows, columns) where there are points of it.
+        stood: (rows, columns) where things stood that were taken out.
+        cell: metres.
+        gap: metres; half the width that gaps may have.
+    """
+    import numpy as np
+    from scipy import ndimage
+
+    from scan2sim.pipeline.heightfield import closed
+
+    whole = closed(has, gap / cell) | stood
+    holes, count = ndimage.label(ndimage.binary_fill_holes(whole) & ~whole)
+    small = np.bincount(holes.ravel(), minlength=count + 1) * cell**2 <= HOLE
+    small[0] = False
+    return np.asarray(whole | small[holes], bool)
+
+
+def stood(inputs: Inputs, raster: Raster, frame: Frame) -> Bools:
+    """The cells of a raster on which vehicles stood that were taken out, and a little around them.
+
+    They are of `things`, and of the neighbours' `things.NAME`.
+    """
+    import numpy as np
+
+    from scan2sim.pipeline.heightfield import drawn, grown
+    from scan2sim.pipeline.remains import outlines
+
+    listed = [path for name, path in sorted(inputs.items()) if name.partition(".")[0] == "things"]
+    rings = [ring / raster.cell - raster.low for path in listed for ring in outlines(path, frame)]
+    return np.asarray(grown(drawn(rings, raster.shape), BESIDE / raster.cell), bool)
 
 
 def from_above(building: PointCloud) -> bool:
@@ -135,4 +190,4 @@ def united(inputs: Inputs, params: MadeUpParams, part: str) -> PointCloud:
     return PointCloud.join(parts)
 
 
-GROUND = Step("ground", 1, ground, GroundParams)
+GROUND = Step("ground", 2, ground, GroundParams)

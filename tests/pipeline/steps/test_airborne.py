@@ -231,7 +231,8 @@ def test_neighbours_fill_a_hole_on_their_border_alike(house: dict[str, Path], tm
 
 def test_only_clouds_from_the_air_get_what_is_made_up(tmp_path: Path) -> None:
     tile = read_tile(SAMPLE)
-    assert {"ground", "walls"}.isdisjoint(node.step.name for node in recipe(tile, Settings()))
+    nodes = {node.step.name: node for node in recipe(tile, Settings())}
+    assert "walls" not in nodes and "things" in nodes["ground"].inputs  # a street's: what vehicles hid
     from dataclasses import replace
 
     bare = replace(tile, views=(), trajectory=None)
