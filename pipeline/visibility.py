@@ -157,7 +157,10 @@ def _of_class(cloud: PointCloud, codes: tuple[int, ...]) -> npt.NDArray[np.bool_
 
 
 def _borne_out(meshes: Iterable[Mesh], cloud: PointCloud) -> list[Mesh]:
-    """The faces whose corners all have a point near by; how near, the points' usual spacing says."""
+    """The faces whose corners all have a point near by; how near, the points' usual spacing says.
+
+    Those with a class of their own are things' (`furniture`), fitted to points that are in no surface's cloud.
+    """
     from scipy.spatial import cKDTree
 
     tree = cKDTree(cloud.xyz)
@@ -167,7 +170,8 @@ def _borne_out(meshes: Iterable[Mesh], cloud: PointCloud) -> list[Mesh]:
     kept = []
     for mesh in meshes:
         distance, _ = tree.query(mesh.vertices, distance_upper_bound=reach, workers=-1)
-        kept.append(mesh.keep(np.isfinite(distance)[mesh.faces].all(axis=1)))
+        near = np.isfinite(distance)[mesh.faces].all(axis=1)
+        kept.append(mesh.keep(near if mesh.label is None else near | (mesh.label > 0)))
     return kept
 
 

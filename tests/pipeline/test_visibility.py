@@ -1,5 +1,7 @@
 """Range images against ray casting, and who sees what on a made-up street."""
 
+from dataclasses import replace
+
 import numpy as np
 import open3d as o3d
 import pytest
@@ -158,6 +160,17 @@ def test_a_bulge_that_no_point_bears_out_hides_nothing():
     depth = depth_map(CAMERAS["pinhole"], forward_pose(), scene([WALL, bulge], cloud_of(wall, sign)))
     behind = np.array([[8.0, 0.0, 1.6], [8.0, 1.6, 1.6]])  # the sign, and what is left of it
     assert visible(depth, behind, FACING).tolist() == [False, True]
+
+
+def test_things_of_their_own_hide_though_their_points_are_in_no_surfaces_cloud():
+    pole, ground = box((3, -0.2, 0), (3.1, 0.2, 4)), grid(40, 20, 0.5, (10, 0, 0))
+    cloud = PointCloud(Frame(), ground.vertices, normal=np.tile(np.float32([0, 0, 1]), (len(ground.vertices), 1)))
+    behind = [[6.0, 0.0, 1.0]]
+    for label, hidden in ((0, False), (64, True)):
+        mesh = replace(pole, label=np.full(len(pole), label, np.uint8))
+        hides = scene([ground, mesh], cloud)
+        depth = depth_map(CAMERAS["pinhole"], forward_pose(z=1.5), hides)
+        assert visible(depth, behind).tolist() == [not hidden]
 
 
 def test_what_is_out_of_the_image_is_not_seen(street):
