@@ -10,13 +10,16 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from scan2sim.pipeline.heightfield import MOST, drawn
+from scan2sim.pipeline.heightfield import MOST, drawn, grown
 from scan2sim.pipeline.types import F32, F64, U8, Mesh
 from scan2sim.texturing.continuation import FACTOR, continued
-from scan2sim.texturing.fill import FILLED, Page, texel_places
+from scan2sim.texturing.fill import FILLED, FROM_POINTS, Page, texel_places
 
 CELL = 0.03
 """Metres of the picture's cells: grain, joints and markings, for a fraction of the texels."""
+RIM = 1.0
+"""Metres around what is to be filled within which texels coloured from points are thought of as filled, too: so holes
+reach to what photos saw, and have its tone."""
 
 Bools = npt.NDArray[np.bool_]
 
@@ -37,7 +40,7 @@ class Plan:
         self.low, self._xyz, self._label = low.astype(np.float64), xyz, label
         columns, rows = (np.ceil((high - low) / self.cell).astype(int) + 1).tolist()
         self._sum, self._count = np.zeros((rows, columns, 3), np.float32), np.zeros((rows, columns), np.float32)
-        self._wanted = np.zeros((rows, columns), bool)
+        self._wanted, self._from_points = np.zeros((rows, columns), bool), np.zeros((rows, columns), bool)
         self._stood = drawn([(ring - self.low) / self.cell for ring in stood], (rows, columns))
 
     def stood(self, places: F32) -> Bools:
@@ -59,16 +62,16 @@ class Plan:
         height = len(page.owner)
         for first in range(0, height, 1024):  # places take many times a page's bytes
             rows = slice(first, min(height, first + 1024))
-            for mask, seen in ((page.seen[rows] == 255, True), (page.seen[rows] == FILLED, False)):
-                row, column = np.nonzero(mask)
+            for mark in (255, FROM_POINTS, FILLED):
+                row, column = np.nonzero(page.seen[rows] == mark)
                 y, x = self.at(texel_places(page.owner, page.flat, page.corners, row + first, column))
-                if seen:
+                if mark == 255:
                     flat = y * self._count.shape[1] + x
                     for k in range(3):
                         np.add.at(self._sum[..., k].reshape(-1), flat, page.rgb[row + first, column, k])
                     np.add.at(self._count.reshape(-1), flat, np.float32(1))
                 else:
-                    self._wanted[y, x] = True
+                    (self._wanted if mark == FILLED else self._from_points)[y, x] = True
 
     def go_on(self) -> Continued | None:
         """The ground as it goes on where no photo saw it; None where none is wanted, or nothing is known."""
@@ -77,8 +80,9 @@ class Plan:
         if not self._wanted.any() or not known.any():
             return None
         rgb = (self._sum / np.maximum(self._count, 1)[..., None]).astype(np.float32)
-        picture, filled = continued(rgb, known, _whole(self._wanted, known), self._kind())
-        return Continued(self, picture.astype(np.uint8), filled & self._wanted)
+        rim = self._from_points & ~known & grown(self._wanted, RIM / self.cell)
+        picture, filled = continued(rgb, known, _whole(self._wanted | rim, known), self._kind())
+        return Continued(self, picture.astype(np.uint8), filled)
 
     def _kind(self) -> npt.NDArray[np.int32]:
         """Class of the nearest point for every coarse cell; -1 far from all."""
