@@ -187,7 +187,7 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
         if group == "building" and (when == "always" or (when == "auto" and path)):
             others = {f"other.{part}": at(f"voxel.{part}", "cloud") for part in parted if part != group}
             points = {"cloud": cloud, "points": at("split", group)}
-            add(PLANES, {"mesh": surface, **points, **others}, voxel=size)
+            add(PLANES, {"mesh": surface, **points, **others}, voxel=size, **cell)
             surface = at("planes", "mesh")
         add(ISLANDS, {"mesh": surface}, group)
         surface = at(f"islands.{group}", "mesh")

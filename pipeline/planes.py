@@ -20,7 +20,7 @@ REACH = 2.6
 FLAT_SHARE = 30
 """Percentile of the points' residuals that is the noise of flat surfaces: so much of what was built is flat."""
 SIGMAS = 3.0
-LEAST, MOST = 0.15, 0.5
+LEAST, MOST = 0.15, 0.8
 """Voxels that the tolerance is held to, whatever the noise."""
 TURN = float(np.cos(np.radians(20.0)))
 """By which normals of one plane may differ: their neighbourhoods reach around corners."""

@@ -25,6 +25,10 @@ ROUNDED = 1.5
 """Voxels from an edge within which Poisson rounds it: its kernel reaches over three cells of half a voxel."""
 FACING = float(np.cos(np.radians(40.0)))
 """Turn by which a vertex that lies on a plane may look away from it."""
+AMID = 0.75
+"""Share of the points around that are one plane's, from which on a vertex amid them may look anywhere: it is noise."""
+FADES = 1.5
+"""Tolerances from a plane up to which vertices are laid onto it in part; up to one they are wholly."""
 CREASE = float(np.cos(np.radians(20.0)))
 """Planes that turn by less have no edge."""
 GRAIN = 0.0005
@@ -51,7 +55,14 @@ class Sharpened:
 
 
 def sharpen(
-    mesh: Mesh, planes: Planes, own: I32, beside: npt.NDArray[np.bool_], ends: int, voxel: float, tolerance: float
+    mesh: Mesh,
+    planes: Planes,
+    own: I32,
+    beside: npt.NDArray[np.bool_],
+    share: F64,
+    ends: int,
+    voxel: float,
+    tolerance: float,
 ) -> Sharpened:
     """The mesh on its planes.
 
@@ -61,6 +72,7 @@ def sharpen(
         own: (V,) which of them, -1 for none.
         beside: (V,) bool, rounded beside an edge: laid on its plane from wherever it is. Others are the less moved, the
             nearer to `tolerance` they lie, so that a relief as deep fades into its plane.
+        share: (V,) of the way onto their planes that vertices go.
         ends: number of the first plane beyond which nothing is: the faces of its vertices go.
         voxel: metres.
         tolerance: metres by which what lies on a plane may miss it.
@@ -69,8 +81,8 @@ def sharpen(
     moved = vertices.copy()
     on = np.flatnonzero((own >= 0) & (own < ends))
     off = planes.beyond(vertices[on], own[on])
-    share = np.where(beside[on], 1.0, np.clip(2 - 2 * np.abs(off) / tolerance, 0, 1))
-    moved[on] -= (share * off)[:, None] * planes.normal[own[on]]
+    part = share[on] * np.where(beside[on], 1.0, np.clip((FADES - np.abs(off) / tolerance) / (FADES - 1), 0, 1))
+    moved[on] -= (part * off)[:, None] * planes.normal[own[on]]
     pairs, edges = _edges(faces)
     a, b = own[pairs[:, 0]], own[pairs[:, 1]]
     middle = vertices[pairs].mean(axis=1)
@@ -205,7 +217,13 @@ def _assign(xyz, normal, near, axis, offset, tolerance, rounded, own, beside):  
         if own[i] >= 0:
             continue
         for k in range(count):
-            if abs(away[k]) <= tolerance:
+            if abs(away[k]) <= FADES * tolerance:
+                most = 0
+                for p in near[i]:
+                    most += p == seen[k]
+                if abs(away[k]) <= tolerance and most >= AMID * len(near[i]):
+                    own[i] = seen[k]
+                    break
                 facing = 0.0
                 for q in range(3):
                     facing += axis[seen[k], q] * normal[i, q]

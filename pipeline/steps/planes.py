@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from scan2sim.pipeline.ranges import Voxel
+from pydantic import Field
+
+from scan2sim.pipeline.ranges import Place, Voxel
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
+
+if TYPE_CHECKING:
+    from scan2sim.pipeline.types import F64, Mesh
+
+KEPT, FADED = 2.5, 5.0  # voxels from a border up to which Poisson's surface stays, and up to which it partly does
 
 
 class PlanesParams(Params):
@@ -17,10 +24,15 @@ class PlanesParams(Params):
     Attributes:
         when: "auto" where a scanner drove by (there is a path), "always", or "never".
         voxel: size that the cloud was thinned to; set by the recipe.
+        seed: the tile's (x, y), world metres, where it meets others: at its borders the surface stays as it was, which
+            is the same in both tiles; set by the recipe.
+        neighbours: names of tiles whose cells touch to their seeds, world metres; set by the recipe.
     """
 
     when: Literal["auto", "always", "never"] = "auto"
     voxel: Voxel = 0.10
+    seed: Place | None = None
+    neighbours: dict[str, Place] = Field(default_factory=dict)
 
 
 def planes(inputs: Inputs, params: PlanesParams, out: Path, report: Report) -> Done:
@@ -65,7 +77,9 @@ def planes(inputs: Inputs, params: PlanesParams, out: Path, report: Report) -> D
     laid = extents.ended(mesh.vertices.astype(np.float64), near, every, sides, ends, of_side, cloud.xyz, voxel)
     report(0.7, "edges")
     beside |= laid != near
-    sharp = sharpen.sharpen(mesh, Planes.join([every, sides.planes]), laid, beside, len(every), voxel, tolerance)
+    share = inland(mesh, params)
+    laid[share == 0] = -1
+    sharp = sharpen.sharpen(mesh, Planes.join([every, sides.planes]), laid, beside, share, len(every), voxel, tolerance)
     sharp.mesh.save(out / "mesh.npz")
     facts |= {
         "faces": len(sharp.mesh),
@@ -77,4 +91,21 @@ def planes(inputs: Inputs, params: PlanesParams, out: Path, report: Report) -> D
     return Done({"mesh": out / "mesh.npz"}, facts)
 
 
-PLANES = Step("planes", 2, planes, PlanesParams)
+def inland(mesh: Mesh, params: PlanesParams) -> F64:
+    """(V,) by how much vertices may be moved: 0 beside a border with another tile, 1 away from it.
+
+    Beyond a tile's buffer its planes' points are missing, so its planes aren't quite the neighbour's.
+    """
+    import numpy as np
+
+    from scan2sim.pipeline.border import world
+    from scan2sim.pipeline.cells import Cell
+
+    share = np.ones(len(mesh.vertices))
+    if params.seed is not None and params.neighbours:
+        away = np.abs(Cell(params.seed, params.neighbours).outside(world(mesh)[:, :2])) / params.voxel
+        share = np.clip((away - KEPT) / (FADED - KEPT), 0, 1)
+    return share
+
+
+PLANES = Step("planes", 3, planes, PlanesParams)

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from scan2sim.pipeline.step import Done, Step, silent
 from scan2sim.pipeline.steps.islands import ISLANDS
@@ -25,9 +26,11 @@ def go(step: Step, folder: Path, inputs: dict[str, Path], **given: Any) -> Done:
     return step.run(inputs, step.params(**given), out, silent)
 
 
-def laid(xyz: F64, folder: Path, *, others: F64 | None = None) -> tuple[Mesh, Mesh, dict[str, Any]]:
+def laid(
+    xyz: F64, folder: Path, *, others: F64 | None = None, noise: float = NOISE, **given: Any
+) -> tuple[Mesh, Mesh, dict[str, Any]]:
     """The mesh of points, what the step makes of it, and its facts."""
-    noisy = (xyz + np.random.default_rng(1).normal(0, NOISE, xyz.shape)).astype(np.float32)
+    noisy = (xyz + np.random.default_rng(1).normal(0, noise, xyz.shape)).astype(np.float32)
     points, path, other = (folder / f"{name}.npz" for name in ("points", "path", "other"))
     PointCloud(Frame(), noisy).save(points)
     PATH.save(path)
@@ -35,7 +38,7 @@ def laid(xyz: F64, folder: Path, *, others: F64 | None = None) -> tuple[Mesh, Me
     cloud = go(VOXEL, folder, {"cloud": points, "path": path}).files["cloud"]
     rough = go(POISSON, folder, {"cloud": cloud}).files["mesh"]
     mesh = go(TRIM, folder, {"mesh": rough, "cloud": cloud}).files["mesh"]
-    done = go(PLANES, folder, {"mesh": mesh, "cloud": cloud, "points": points, "other.terrain": other})
+    done = go(PLANES, folder, {"mesh": mesh, "cloud": cloud, "points": points, "other.terrain": other}, **given)
     pieces = go(ISLANDS, folder, {"mesh": done.files["mesh"]}).files["mesh"]
     return Mesh.load(mesh), Mesh.load(pieces), done.facts
 
@@ -72,6 +75,35 @@ def test_a_wall_ends_where_its_points_end_but_goes_on_into_the_ground(tmp_path: 
     assert np.abs(reach(after, (-1, 0, 0), 0.5, 2.5)).max() < 0.02
     assert after.vertices[:, 2].min() < -0.05
     assert np.quantile(np.abs(after.vertices[:, 1]), 0.99) < 0.005
+
+
+def test_a_wall_with_noise_and_boards_is_flat(tmp_path: Path) -> None:
+    """As a lidar on a car sees it: 3 cm of noise, boards of 30 cm by turns 3 cm before and behind."""
+    boards = wall((0, 0), (5, 0), density=400)
+    boards[:, 1] += np.where(boards[:, 0] % 0.6 < 0.3, 0.015, -0.015)
+    before, after, facts = laid(boards, tmp_path, noise=0.03)
+
+    def tilted(mesh: Mesh) -> float:
+        """Share of the wall's area that looks away from its front by more than 20 degrees."""
+        middle = mesh.vertices[mesh.faces].mean(axis=1)
+        inside = (np.abs(middle[:, 0] - 2.5) < 2.0) & (np.abs(middle[:, 2] - 1.5) < 1.0)
+        away = np.abs(mesh.face_normal[:, 1]) < np.cos(np.radians(20))
+        return float(mesh.face_area[inside & away].sum() / mesh.face_area[inside].sum())
+
+    assert facts["planes"] == 1
+    assert tilted(before) > 0.2 and tilted(after) < 0.02
+
+
+def test_a_border_with_another_tile_stays_as_it_was(tmp_path: Path) -> None:
+    """The neighbour's planes aren't the same, what both made of the points is."""
+    corner = np.concatenate([wall((0, 0), (0, 4)), wall((0, 0), (4, 0))])
+    cell = {"seed": (-1.0, 1.0), "neighbours": {"east": (5.0, 1.0)}}
+    before, after, _ = laid(corner, tmp_path, **cell)
+    was, now = (mesh.vertices[np.abs(mesh.vertices[:, 0] - 2) < 0.25] for mesh in (before, after))
+    assert len(was) == len(now) > 100
+    assert cKDTree(now).query(was)[0].max() < 0.003  # noise for decimation
+    inner = np.abs(after.vertices[:, 0] - 1) < 0.3
+    assert np.quantile(np.abs(after.vertices[inner, 1]), 0.99) < 0.005
 
 
 def test_a_window_has_reveals(tmp_path: Path) -> None:
