@@ -26,7 +26,8 @@ ROUNDED = 1.5
 FACING = float(np.cos(np.radians(40.0)))
 """Turn by which a vertex that lies on a plane may look away from it."""
 AMID = 0.75
-"""Share of the points around that are one plane's, from which on a vertex amid them may look anywhere: it is noise."""
+"""Share of the points around that are one plane's, from which on a vertex amid them is turned by noise, so far:"""
+TURNED = float(np.cos(np.radians(75.0)))
 FADES = 1.5
 """Tolerances from a plane up to which vertices are laid onto it in part; up to one they are wholly."""
 CREASE = float(np.cos(np.radians(20.0)))
@@ -221,13 +222,11 @@ def _assign(xyz, normal, near, axis, offset, tolerance, rounded, own, beside):  
                 most = 0
                 for p in near[i]:
                     most += p == seen[k]
-                if abs(away[k]) <= tolerance and most >= AMID * len(near[i]):
-                    own[i] = seen[k]
-                    break
+                amid = abs(away[k]) <= tolerance and most >= AMID * len(near[i])
                 facing = 0.0
                 for q in range(3):
                     facing += axis[seen[k], q] * normal[i, q]
-                if facing > FACING:
+                if facing > (TURNED if amid else FACING):
                     own[i] = seen[k]
                     break
 
