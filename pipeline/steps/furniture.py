@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from scan2sim.pipeline.types import F32, Frame, Mesh
 
 CELL = 0.5  # metres, of the ground's heights
+BORDER = 4.0  # metres to either side of a border of tiles: what stands there stays with the surfaces, alike in both
 LOW, HIGH = 0.2, 14.0  # metres above the ground where things are looked for
 COLUMNS = ("x", "y", "z", "kind", "height_m", "radius_m", "heading_deg", "shape", "plate_width_m", "plate_height_m")
 
@@ -28,8 +29,8 @@ class FurnitureParams(Params):
     Attributes:
         when: "auto": where the tile has a scanner's path, or photos from the ground; "never": signs, poles and trunks
             stay with the surfaces around them.
-        seed: the tile's (x, y), world metres, where it meets others: what stands beyond its cell is theirs; set by
-            the recipe.
+        seed: the tile's (x, y), world metres, where it meets others: what stands beyond its cell is theirs, and what
+            stands within 4 m of a border stays with the surfaces in both; set by the recipe.
         neighbours: names of tiles whose cells touch to their seeds, world metres; set by the recipe.
     """
 
@@ -67,16 +68,21 @@ def furniture(inputs: Inputs, params: FurnitureParams, out: Path, report: Report
         part = cloud.take(some)
         report(0.3, "stems")
         things = find(part, height, path)
-        taken = some[_held(part.xyz, things)]
     if params.seed is not None and things:
         feet = np.array([thing.foot[:2] for thing in things]) + np.asarray(cloud.frame.origin[:2])
-        own = Cell(params.seed, params.neighbours).outside(feet) <= 0
-        things = [thing for thing, mine in zip(things, own, strict=True) if mine]
+        outside = Cell(params.seed, params.neighbours).outside(feet)
+        free = [thing for thing, s in zip(things, outside, strict=True) if abs(s) > BORDER]
+        shown = [thing for thing, s in zip(things, outside, strict=True) if s < -BORDER]
+        things = [thing for thing, s in zip(things, outside, strict=True) if s <= 0]
+    else:
+        free = shown = things
+    if free:
+        taken = some[_held(part.xyz, free)]
     np.savez(out / "taken.npz", index=taken)
     files = {"taken": out / "taken.npz"}
     faces = 0
     for group, trunks in (("building", False), ("vegetation", True)):
-        mesh = _mesh(cloud.frame, [thing for thing in things if (thing.kind == "trunk") == trunks])
+        mesh = _mesh(cloud.frame, [thing for thing in shown if (thing.kind == "trunk") == trunks])
         mesh.save(out / f"{group}.npz")
         files[group] = out / f"{group}.npz"
         faces += len(mesh)
@@ -146,4 +152,4 @@ def _row(thing: Thing, frame: Frame) -> dict[str, Any]:
     return row
 
 
-FURNITURE = Step("furniture", 1, furniture, FurnitureParams)
+FURNITURE = Step("furniture", 2, furniture, FurnitureParams)
