@@ -25,7 +25,8 @@ def survey(small_street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
     """The small street in two tiles, with photos of its own."""
     folder = tmp_path_factory.mktemp("survey")
     shutil.copytree(small_street, folder / "corridor")
-    cut_survey(folder / "corridor", folder / "tiles", Options(length=6.0, buffer=2.0))
+    context = 3.0  # metres: what crowns and planes near a border are told from
+    cut_survey(folder / "corridor", folder / "tiles", Options(length=6.0, buffer=context))
     return folder / "tiles"
 
 

@@ -97,7 +97,7 @@ def texels(mesh, width, height):
     corners = blend.texels(mesh.uv, width, height)
     owner = blend.owners(corners, width, height)
     rows, columns = np.nonzero(owner >= 0)
-    places = fill._texel_places(owner, corners, mesh.corners, rows, columns)
+    places = fill.texel_places(owner, corners, mesh.corners, rows, columns)
     return owner, rows, columns, places + np.asarray(mesh.frame.origin)
 
 
