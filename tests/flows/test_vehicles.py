@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from scan2sim.data_samples.layout import lay_out
+from scan2sim.data_samples.layout import FRAME, lay_out
 from scan2sim.data_samples.scene import build
 from scan2sim.data_samples.street import generate
 from scan2sim.flows.cli import app
@@ -89,4 +89,5 @@ def test_a_world_with_its_parked_cars(tmp_path: Path) -> None:
     assert report["texture"]["coverage_by_class"]["vehicle"] > 0.3
     made = Mesh.load(next((tmp_path / "keep" / "steps" / "decimate.vehicle").rglob("mesh.npz")))
     low, high = parked.vertices.min(axis=0)[:2] - 0.5, parked.vertices.max(axis=0)[:2] + 0.5
-    assert ((made.vertices[:, :2] > low) & (made.vertices[:, :2] < high)).all(), "the moving car is in no world"
+    places = made.moved_to(FRAME).vertices[:, :2]
+    assert ((places > low) & (places < high)).all(), "the moving car is in no world"
