@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from scan2sim.pipeline.io.files import pass_on
 from scan2sim.pipeline.ranges import Share, Voxel
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
@@ -58,10 +57,7 @@ def segment(inputs: Inputs, params: SegmentParams, out: Path, report: Report) ->
     own = classified(cloud.label)
     told: dict[str, Any] = {}
     if cloud.label is not None and own >= params.min_classified and not params.overwrite:
-        try:
-            os.link(inputs["cloud"], file)
-        except OSError:  # another disk, or a file system without links
-            shutil.copyfile(inputs["cloud"], file)
+        pass_on(inputs["cloud"], file)
         label, source = cloud.label, "cloud"
         kinds, sure = np.full(len(cloud), OWN, np.uint8), np.full(len(cloud), 255, np.uint8)
     else:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from scan2sim.pipeline.io.files import pass_on
 from scan2sim.pipeline.ranges import Voxel
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
@@ -61,7 +60,7 @@ def things(inputs: Inputs, params: ThingsParams, out: Path, report: Report) -> D
     if cloud is not None and label is not None:
         found, label = decide(cloud, inputs, params, report)
     if cloud is None or cloud.label is None or label is None or np.array_equal(label, cloud.label):
-        _pass_on(inputs["cloud"], file)
+        pass_on(inputs["cloud"], file)
         added = back = 0
     else:
         report(0.9, "writing")
@@ -215,13 +214,6 @@ def _movable() -> tuple[int, int]:
     from scan2sim.pipeline.classes import CODE
 
     return CODE["vehicle"], CODE["person"]
-
-
-def _pass_on(cloud: Path, file: Path) -> None:
-    try:
-        os.link(cloud, file)
-    except OSError:  # another disk, or a file system without links
-        shutil.copyfile(cloud, file)
 
 
 THINGS = Step("things", 2, things, ThingsParams)

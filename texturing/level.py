@@ -11,14 +11,13 @@ inwards as weighted means: Farbman et al. 2009.
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
 
+from scan2sim.pipeline.io.files import pass_on
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
@@ -139,10 +138,7 @@ def _link_others(source: Path, folder: Path) -> None:
         place = folder / path.name
         if place.exists():
             continue
-        try:
-            os.link(path, place)
-        except OSError:
-            shutil.copyfile(path, place)
+        pass_on(path, place)
 
 
 LEVEL = Step("level", 1, level, LevelParams)

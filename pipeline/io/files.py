@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 from pathlib import Path
 
 from scan2sim.pipeline.errors import InputError
@@ -39,3 +41,11 @@ def lines(path: Path, remedy: str = PUT_THERE) -> list[str]:
         InputError: it is no file.
     """
     return check(path, remedy).read_text(encoding="utf-8-sig", errors="replace").splitlines()
+
+
+def pass_on(source: Path, target: Path) -> None:
+    """`target` as a hard link of `source`, which neither may change any more; a copy where links can't be made."""
+    try:
+        os.link(source, target)
+    except OSError:  # another disk, or a file system without links
+        shutil.copyfile(source, target)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
+from scan2sim.pipeline.io.files import pass_on
 from scan2sim.pipeline.ranges import Coordinate
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
@@ -132,10 +131,7 @@ def _untouched(cloud: Path, out: Path, why: str, facts: dict[str, object] | None
     from scan2sim.pipeline.types import Frame, PointCloud
 
     file, moving = out / "cloud.npz", out / "moving.npz"
-    try:
-        os.link(cloud, file)
-    except OSError:  # another disk, or a file system without links
-        shutil.copyfile(cloud, file)
+    pass_on(cloud, file)
     none = np.zeros((0, 3), np.float32)
     PointCloud(Frame(), none, none.astype(np.uint8), none, np.zeros(0, np.uint8), np.zeros(0)).save(moving)
     np.save(out / "dropped.npy", np.zeros(0, np.uint8))

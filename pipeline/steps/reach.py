@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field
 
+from scan2sim.pipeline.io.files import pass_on
 from scan2sim.pipeline.ranges import Voxel
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
@@ -62,7 +61,7 @@ def reach(inputs: Inputs, params: ReachParams, out: Path, report: Report) -> Don
 
     file = out / "cloud.npz"
     if "path" not in inputs or (params.limit == "auto" and "views" not in inputs):
-        _pass_on(inputs["cloud"], file)
+        pass_on(inputs["cloud"], file)
         return Done({"cloud": file}, {"left_out": 0})
     report(0.0, "reading")
     cloud, path = PointCloud.load(inputs["cloud"]), Trajectory.load(inputs["path"])
@@ -83,7 +82,7 @@ def reach(inputs: Inputs, params: ReachParams, out: Path, report: Report) -> Don
         kept = _worth(thin, shown, path, size, report)
     report(0.9, "writing")
     if kept.all():
-        _pass_on(inputs["cloud"], file)
+        pass_on(inputs["cloud"], file)
     else:
         voxel = np.empty(len(cloud), np.int64)
         voxel[order] = np.repeat(np.arange(len(starts)), np.diff(np.append(starts, len(order))))
@@ -97,13 +96,6 @@ def reach(inputs: Inputs, params: ReachParams, out: Path, report: Report) -> Don
         "far_m": round(_farthest(thin, kept, path.positions), 1),
     }
     return Done({"cloud": file}, facts)
-
-
-def _pass_on(cloud: Path, file: Path) -> None:
-    try:
-        os.link(cloud, file)
-    except OSError:  # another disk, or a file system without links
-        shutil.copyfile(cloud, file)
 
 
 def _worth(thin: PointCloud, views: Sequence[View], path: Trajectory, size: float, report: Report) -> Bools:
