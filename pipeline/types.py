@@ -31,13 +31,20 @@ class Frame:
 
     Attributes:
         crs: WKT or authority code of the CRS; "local" where there is none.
-        origin: (3,) metres, float64, subtracted from world coordinates.
+        origin: (3,) metres, subtracted from world coordinates.
         unit: metres per unit of the CRS's axes (0.3048 for international feet).
+
+    Numbers of NumPy become Python's, which are written and compared alike everywhere.
     """
 
     crs: str = "local"
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     unit: float = 1.0
+
+    def __post_init__(self) -> None:
+        x, y, z = (float(value) for value in self.origin)
+        object.__setattr__(self, "origin", (x, y, z))
+        object.__setattr__(self, "unit", float(self.unit))
 
     def to_local(self, xyz: npt.ArrayLike) -> F64:
         """CRS coordinates (..., 3) to local metres, float64."""

@@ -61,7 +61,7 @@ def save(path: Path, views: Sequence[View], held_out: Sequence[bool] = ()) -> No
     """Write views, and which of them are held out of texturing (none by default)."""
     held = list(held_out) or [False] * len(views)
     rows = [to_json(view) | {"hold_out": bool(out)} for view, out in zip(views, held, strict=True)]
-    path.write_text(json.dumps(rows, indent=1), encoding="utf-8")
+    path.write_text(json.dumps(rows, indent=1, default=np.generic.item), encoding="utf-8")
 
 
 def load(path: Path) -> tuple[View, ...]:

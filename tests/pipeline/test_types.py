@@ -5,8 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 
-from scan2sim.pipeline.types import Camera, Frame, Mesh, PointCloud, Trajectory
+from scan2sim.pipeline.border import Clipped
+from scan2sim.pipeline.io import views
+from scan2sim.pipeline.types import Camera, Frame, Mesh, PointCloud, Trajectory, View
 
 FRAME = Frame("EPSG:2154", (770500.0, 6277550.0, 20.0))
 
@@ -30,6 +33,26 @@ def test_what_is_saved_comes_back(tmp_path: Path) -> None:
     path = Trajectory(np.arange(3.0), random.random((3, 3)))
     path.save(tmp_path / "t.npz")
     assert np.allclose(Trajectory.load(tmp_path / "t.npz").at(np.array([0.5])), path.positions[:2].mean(axis=0))
+
+
+@pytest.mark.parametrize("kind", [np.float64, np.float32, np.int64])
+def test_numbers_of_numpy_are_saved_and_loaded(tmp_path: Path, kind: type) -> None:
+    x, y, z = np.array([770500, 6277550, 20]).astype(kind)
+    frame = Frame("EPSG:2154", (x, y, z), kind(1))
+    assert frame == FRAME
+    points, faces = np.zeros((3, 3), np.float32), np.array([[0, 1, 2]], np.int32)
+    PointCloud(frame, points).save(tmp_path / "cloud.npz")
+    Mesh(frame, points, faces).save(tmp_path / "mesh.npz")
+    Clipped(Mesh(frame, points, faces), {"next": np.ones(3, bool)}).save(tmp_path / "clipped.npz", tmp_path / "on.npz")
+    assert PointCloud.load(tmp_path / "cloud.npz").frame == FRAME
+    assert Mesh.load(tmp_path / "mesh.npz").frame == FRAME
+    assert Clipped.load(tmp_path / "clipped.npz", tmp_path / "on.npz").mesh.frame == FRAME
+    Trajectory(np.arange(2).astype(kind), points[:2].astype(kind)).save(tmp_path / "path.npz")
+    assert Trajectory.load(tmp_path / "path.npz").positions.tolist() == [[0, 0, 0]] * 2
+    camera = Camera("opencv", kind(8), kind(6), kind(9), kind(9), kind(4), kind(3), (kind(0), kind(0)))
+    view = View("a", camera, np.eye(4).astype(kind), tmp_path / "a.png", time=kind(5))
+    views.save(tmp_path / "views.json", [view])
+    assert views.load(tmp_path / "views.json")[0].camera == camera
 
 
 def test_join_fills_what_some_clouds_lack() -> None:
