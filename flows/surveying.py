@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from scan2sim.flows import workers
 from scan2sim.flows.display import console, progress, warn
 from scan2sim.flows.execute import Executor, limit_cores, locked, versions
 from scan2sim.flows.finish import TILES, Made, finish, is_finished
@@ -51,6 +52,7 @@ def run_source(
     jobs, gigabytes = jobs or default_jobs(), parse(memory)
     if runner != "processes":
         need(f"--runner {runner}", "prefect")
+        workers.check(runner)
         from scan2sim.flows.survey import meet_server, survey
 
         meet_server()

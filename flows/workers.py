@@ -30,15 +30,24 @@ def workers(name: str, count: int, address: str | None = None) -> AbstractContex
         address: of a Dask scheduler or a Ray cluster, whose workers are taken instead.
 
     Raises:
-        SettingError: there is no such kind.
-        UnavailableError: its package isn't installed, or, once entered, nothing answers at the address.
+        UnavailableError: once entered, nothing answers at the address.
+        ScanError: as `check`.
     """
-    kinds = {"threads": _threads, "dask": _dask, "ray": _ray}
-    if name not in kinds:
+    check(name)
+    return {"threads": _threads, "dask": _dask, "ray": _ray}[name](count, address)
+
+
+def check(name: str) -> None:
+    """See that there is such a kind of workers here.
+
+    Raises:
+        SettingError: there is no such kind.
+        UnavailableError: its package isn't installed.
+    """
+    packages: dict[str, list[str]] = {"threads": [], "dask": ["distributed"], "ray": ["ray"]}
+    if name not in packages:
         raise SettingError("runner", f"there is no `{name}`", "Choose threads, dask or ray")
-    if name != "threads":
-        need(f"--runner {name}", {"dask": "distributed"}.get(name, name))
-    return kinds[name](count, address)
+    need(f"--runner {name}", *packages[name])
 
 
 @contextmanager

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import importlib.util
 import re
+import sys
 import tomllib
 from pathlib import Path
 from typing import Any
 
 import pytest
+from typer.testing import CliRunner
 
+from scan2sim.flows.cli import app
 from scan2sim.flows.run import run_tile, show_plan
 from scan2sim.flows.settings import Settings
 from scan2sim.flows.surveying import run_source
-from scan2sim.pipeline.errors import InputError, SettingError, UnavailableError
+from scan2sim.pipeline.errors import InputError, SettingError, UnavailableError, exit_code
 from scan2sim.pipeline.extras import EXTRA_OF
 from tests.conftest import ROOT
 
@@ -65,6 +68,57 @@ def test_weights_that_are_not_there_are_told_before_anything_runs(tmp_path: Path
     with pytest.raises(InputError, match=r"mine\.onnx"):
         run_tile(TILE, tmp_path / "out", Settings.read(None, [f"label.weights={tmp_path}/mine.onnx"]))
     assert not any((tmp_path / "out" / "steps").glob("*/*"))
+
+
+USES = {
+    "torch": [
+        "run TILE --set texture.device=cuda", "run TILE --set label.network=segformer", "segment train .",
+        "slam FRAMES --backend adam", "slam FRAMES --features superpoint", "slam FRAMES --features aliked",
+        "slam FRAMES --features orb --matcher superglue", "slam FRAMES --features orb --matcher lightglue",
+        "slam study FRAMES --truth truth.csv --backend adam",
+    ],
+    "safetensors": ["segment train .", "slam FRAMES --features superpoint", "run TILE --set label.network=segformer"],
+    "transformers": ["run TILE --set label.network=segformer", "segment tile TILE --set label.network=segformer"],
+    "onnx": ["segment train ."],
+    "av": ["slam video.mp4", "slam FRAMES --view", "slam FRAMES --gps video.mp4"],
+    "matplotlib": ["slam evaluate truth.csv truth.csv", "slam study FRAMES --truth truth.csv"],
+    "pycolmap": ["slam FRAMES --adjust"],
+    "pye57": ["import clouds cloud.e57"],
+    "zstandard": ["import clouds ept.json"],
+    "prefect": ["survey TILE --runner threads"],
+    "distributed": ["survey TILE --runner dask"],
+    "ray": ["survey TILE --runner ray"],
+    "s3fs": ["survey s3://bucket/survey"],
+    "rasterio": ["run TILE --set export.rasters=0.1"],
+}  # fmt: skip
+"""Commands by a package that they can't do without."""
+
+
+@pytest.mark.parametrize(("package", "command"), [(name, command) for name in USES for command in USES[name]])
+def test_a_package_that_is_missing_ends_all_commands_alike(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, package: str, command: str
+) -> None:
+    import cv2
+    import numpy as np
+
+    (tmp_path / "frames").mkdir()
+    for number in range(2):
+        cv2.imwrite(str(tmp_path / "frames" / f"{number}.png"), np.zeros((8, 16), np.uint8))
+    (tmp_path / "truth.csv").write_text("time,x,y,z\n0,0,0,0\n1,1,0,0\n2,2,1,0\n3,3,1,0\n")
+    (tmp_path / "ept.json").write_text('{"dataType": "zstandard"}')
+    for name in ("video.mp4", "cloud.e57"):
+        (tmp_path / name).touch()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, package, None)
+    words = command.replace("TILE", str(TILE)).replace("FRAMES", "frames").split()
+    out = "weights.onnx" if "train" in words else "plot.png" if "evaluate" in words else "out"
+    error = CliRunner().invoke(app, [*words, "--out", out]).exception
+    assert isinstance(error, UnavailableError) and exit_code(error) == 7
+    assert package in error.cause and f"pip install 'scan2sim[{EXTRA_OF[package]}" in error.remedy
+
+
+def test_every_package_that_is_optional_is_missed_by_a_command() -> None:
+    assert USES.keys() == EXTRA_OF.keys()
 
 
 def test_the_demo_needs_nothing_but_the_core(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
