@@ -7,6 +7,7 @@ import importlib.metadata
 import multiprocessing
 import os
 import platform
+import re
 import shutil
 import signal
 import sys
@@ -15,7 +16,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from multiprocessing import forkserver
 from multiprocessing.connection import Connection, wait
@@ -32,6 +33,8 @@ from scan2sim.pipeline.errors import BusyError, DamagedError, ScanError, StepErr
 from scan2sim.pipeline.step import Report, silent
 from scan2sim.pipeline.store import Manifest, Store
 
+APART = ("flows", "ray", "s3", "dev")
+"""Extras that hand work out, bring files or try the project: no result depends on their packages."""
 TRACKER = "ignore:resource_tracker"
 """A filter of warnings for Python's own process that clears up after killed ones, and says so."""
 SAID = 10_000
@@ -171,7 +174,7 @@ def check_version(item: Planned, wanted: Mapping[str, str]) -> None:
     """Refuse to run a node with other code than the flow's that planned it.
 
     Args:
-        wanted: the flow's `versions()`.
+        wanted: the flow's `versions()`; what isn't installed here is left to the steps, which say what they lack.
 
     Raises:
         UnavailableError: this machine has another version of the project, of the step, or of what computes it.
@@ -179,7 +182,7 @@ def check_version(item: Planned, wanted: Mapping[str, str]) -> None:
     from scan2sim.flows.recipe import STEPS
 
     mine, name = versions(), item.node.step.name
-    others = [f"{k} {mine.get(k, 'none')} instead of {v}" for k, v in wanted.items() if mine.get(k) != v]
+    others = [f"{k} {mine[k]} instead of {v}" for k, v in wanted.items() if mine.get(k, v) != v]
     local = next((step.version for step in STEPS if step.name == name), item.node.step.version)
     if local != item.node.step.version:
         others.append(f"version {local} of step {name} instead of {item.node.step.version}")
@@ -300,14 +303,15 @@ def locked(folder: Path) -> Iterator[None]:
 
 @cache
 def versions() -> Mapping[str, str]:
-    """Versions of Python, the project and what it computes with, for the report."""
-    names = ("numpy", "open3d-cpu", "open3d", "xatlas", "pyfqmr", "laspy", "opencv-python-headless", "onnxruntime")
+    """Versions of Python, the project and what it computes with, as far as that is installed."""
     found = {"python": sys.version.split()[0], "scan2sim": __version__}
-    for name in names:
-        try:
-            found[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            continue
+    with suppress(importlib.metadata.PackageNotFoundError):
+        for line in importlib.metadata.requires("scan2sim") or ():
+            extra = re.search(r"extra == ['\"]([\w-]+)", line)
+            if extra is None or extra[1] not in APART:
+                name = re.split(r"[^\w.-]", line)[0]
+                with suppress(importlib.metadata.PackageNotFoundError):
+                    found[name] = importlib.metadata.version(name)
     return found
 
 

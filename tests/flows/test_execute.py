@@ -10,15 +10,17 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 import scan2sim
-from scan2sim.flows.execute import execute, locked, versions
+from scan2sim.flows.execute import check_version, execute, locked, versions
 from scan2sim.flows.planning import plan
-from scan2sim.pipeline.errors import BusyError, DataError, StepError
+from scan2sim.pipeline.errors import BusyError, DataError, StepError, UnavailableError
+from scan2sim.pipeline.extras import EXTRA_OF
 from scan2sim.pipeline.store import Digests, Manifest, Store, _seal, digest
 from tests.conftest import ROOT
 from tests.flows.toy import chain
@@ -293,9 +295,28 @@ def test_kill_9_leaves_nothing_half_made_and_no_process_behind(tmp_path: Path, s
     assert not Path(f"/proc/{hanging}").exists()
 
 
+def test_versions_are_told_of_all_that_computes(monkeypatch: pytest.MonkeyPatch) -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    lines = [*project["dependencies"], *(f'{one}; extra == "{name}"' for name in extras for one in extras[name])]
+    monkeypatch.setattr(importlib.metadata, "requires", lambda name: lines)
+    monkeypatch.setattr(importlib.metadata, "version", lambda name: f"1 of {name}")
+    found = versions.__wrapped__()
+    computing = {"numpy", "numba", "scipy", "pyproj", "torch", "onnxruntime", "pycolmap", "opencv-python-headless"}
+    assert computing | set(EXTRA_OF) - {"prefect", "distributed", "ray", "s3fs"} <= found.keys()
+    assert found["scan2sim"] == scan2sim.__version__ and not {"prefect", "ray", "s3fs", "pytest"} & found.keys()
+
+
+def test_a_worker_with_another_numba_is_refused_but_not_one_without_plots(tmp_path: Path, source: Path) -> None:
+    node = plan(chain(source, tmp_path / "log"), Store(tmp_path / "store"))[0]
+    check_version(node, dict(versions()) | {"a-package-of-an-extra": "1"})
+    with pytest.raises(UnavailableError, match=r"numba .* instead of 0\.1"):
+        check_version(node, dict(versions()) | {"numba": "0.1"})
+
+
 def test_versions_are_told_without_metadata(monkeypatch: pytest.MonkeyPatch) -> None:
     def none(name: str) -> str:
         raise importlib.metadata.PackageNotFoundError(name)
 
-    monkeypatch.setattr(importlib.metadata, "version", none)
+    monkeypatch.setattr(importlib.metadata, "requires", none)
     assert versions.__wrapped__() == {"python": sys.version.split()[0], "scan2sim": scan2sim.__version__}
