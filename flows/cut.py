@@ -30,6 +30,8 @@ from scan2sim.pipeline.step import Report, silent
 from scan2sim.pipeline.steps.ingest import MIN_POINTS
 from scan2sim.pipeline.types import F64, Tile, Trajectory
 
+VERSION = 1
+"""Raised whenever the same corridor comes to other tiles with the same options."""
 CHUNK = 500_000
 """Points that are read at a time."""
 SAMPLE = 20_000

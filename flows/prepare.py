@@ -5,7 +5,7 @@ A drive is what a vehicle brought home, in a `drive.toml`:
 ```toml
 [slam]                      # where GPS is poor: the camera's path from its video
 video = "drive.mp4"
-gps = "gps.csv"             # optional, like all but the video: mask, camera, focal, centre, offset
+gps = "gps.csv"             # optional, like all but the video: gps_offset, mask, camera, focal, centre, fps
 [sweeps]                    # the scanner's sweeps, placed by that path (or by `poses`, a trajectory file)
 folder = "velodyne"
 extrinsics = "calib.txt"
@@ -160,10 +160,11 @@ class _Once:
     def __init__(self, digests: Digests) -> None:
         self._digests = digests
 
-    def __call__(self, folder: Path, sources: list[Path], options: Any, make: Callable[[], None]) -> None:
-        """Make `folder`, unless it was made of the same sources with the same options."""
+    def __call__(self, folder: Path, version: int, sources: list[Path], options: Any, make: Callable[[], None]) -> None:
+        """Make `folder`, unless code of the same version made it of the same sources with the same options."""
         contents = {str(path): self._digests(path) for path in sources}
-        key = hashlib.sha256(json.dumps([contents, options], sort_keys=True, default=str).encode()).hexdigest()
+        asked = json.dumps([version, contents, options], sort_keys=True, default=str)
+        key = hashlib.sha256(asked.encode()).hexdigest()
         stamp = folder.with_name(f"{folder.name}.made")
         if folder.is_dir() and stamp.is_file() and stamp.read_text() == key:
             return
@@ -190,6 +191,7 @@ def _corridor(drive: Drive, source: Path, out: Path, once: _Once, say: Say, repo
 def _slam(entry: SlamEntry, here: Path, out: Path, once: _Once) -> Path:
     from scan2sim.flows.settings import Settings
     from scan2sim.flows.slam import Options, slam_video
+    from scan2sim.slam.track import VERSION
 
     options = Options(
         gps=entry.gps and here / entry.gps, gps_offset=entry.gps_offset, mask=entry.mask and here / entry.mask,
@@ -200,7 +202,7 @@ def _slam(entry: SlamEntry, here: Path, out: Path, once: _Once) -> Path:
     def make() -> None:
         slam_video(sources[0], out, options, Settings())
 
-    once(out, sources, entry.model_dump(), make)
+    once(out, VERSION, sources, entry.model_dump(), make)
     return out / "trajectory.csv"
 
 
@@ -211,16 +213,16 @@ def _sweeps(
 
     place = poses or here / (entry.poses or "")
     files = sorted((here / entry.folder).glob("*")) + sorted((here / entry.photos).glob("*") if entry.photos else [])
-    rest = [here / path for path in (entry.extrinsics, entry.times, entry.photo_times) if path is not None]
+    camera = Path(entry.camera) if entry.camera.endswith(".toml") else None
+    rest = [here / path for path in (entry.extrinsics, entry.times, entry.photo_times, camera) if path is not None]
 
     def make() -> None:
         pictures = None
         if entry.photos is not None:
-            file = here / entry.camera if entry.camera.endswith(".toml") else None
-            model = "auto" if file else entry.camera
             shape = io.camera_of_photos(
-                here / entry.photos, model=model, focal=entry.focal, centre=entry.centre, file=file
-            )
+                here / entry.photos, model="auto" if camera else entry.camera, focal=entry.focal, centre=entry.centre,
+                file=camera and here / camera,
+            )  # fmt: skip
             beside = io.photo_extrinsics(here / entry.extrinsics, here / entry.photos) if entry.extrinsics else None
             times = entry.photo_times and here / entry.photo_times
             pictures = io.Pictures(here / entry.photos, shape, times, extrinsics=beside)
@@ -231,16 +233,16 @@ def _sweeps(
             report=report,
         )  # fmt: skip
 
-    once(out, [place, *files, *rest], entry.model_dump(), make)
+    once(out, io.VERSION, [place, *files, *rest], entry.model_dump(), make)
     return out / "tile.toml"
 
 
 def _cut(corridor: Path, out: Path, entry: TilesEntry, once: _Once, say: Say, report: Report) -> Path:
-    from scan2sim.flows.cut import Options, cut_survey
+    from scan2sim.flows.cut import VERSION, Options, cut_survey
     from scan2sim.pipeline.io.tile import sources_of
 
     def make() -> None:
         cut_survey(corridor, out, Options(entry.length, entry.buffer), overwrite=True, report=report, warn=say)
 
-    once(out, sources_of(corridor), entry.model_dump(), make)
+    once(out, VERSION, sources_of(corridor), entry.model_dump(), make)
     return out / "survey.toml"

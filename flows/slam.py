@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 from functools import partial
 from pathlib import Path
 from typing import TypeVar, get_args
@@ -20,6 +20,7 @@ from scan2sim.pipeline.extras import need
 from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.io.image import read_rgb
 from scan2sim.pipeline.io.tile import read_tile
+from scan2sim.pipeline.store import contents
 from scan2sim.pipeline.types import Camera, Trajectory
 from scan2sim.slam import output
 from scan2sim.slam.adjust import adjust
@@ -30,7 +31,7 @@ from scan2sim.slam.loops import Places
 from scan2sim.slam.loops import close as close_loops
 from scan2sim.slam.odometry import Odometry, OdometryParams
 from scan2sim.slam.sparse import sparse_map
-from scan2sim.slam.track import Tracked, camera_of, track
+from scan2sim.slam.track import VERSION, Tracked, camera_of, track
 from scan2sim.slam.tracking import Tracker
 from scan2sim.slam.video import Video, open_video
 
@@ -98,7 +99,7 @@ def slam_video(path: Path, out: Path, options: Options, settings: Settings) -> T
     video = open_video(path, fps=options.fps, times=options.times)
     camera, gps, mask = _camera(video, options), _gps(video, options), _mask(video, options)
     with locked(out), progress("slam") as report:
-        state = out / f"state-{_mark(path, options, params)}.npz"
+        state = out / f"state-{_mark(path, camera, options, params)}.npz"
         watch = None
         if options.view:
             from scan2sim.slam.view import Recorder
@@ -150,13 +151,12 @@ def _need(options: Options) -> None:
         need("--view", "av")
 
 
-def _mark(path: Path, options: Options, params: OdometryParams) -> str:
-    """Of all that a run depends on; of files, their size and time."""
-    given = (path, options.gps, options.mask, options.tile, options.times, options.weights, options.matcher_weights)
-    files = [file for one in given if one for file in (sorted(one.iterdir()) if one.is_dir() else [one])]
-    stats = [(str(file.resolve()), file.stat().st_size, file.stat().st_mtime_ns) for file in files if file.exists()]
-    asked = json.dumps([str(path.resolve()), stats, str(options), params.model_dump()], default=str)
-    return hashlib.sha256(asked.encode()).hexdigest()[:12]
+def _mark(path: Path, camera: Camera, options: Options, params: OdometryParams) -> str:
+    """Of all that a run depends on: the code's version, the contents of files, options and parameters."""
+    given = {f.name: getattr(options, f.name) for f in fields(options) if f.name != "tile"}  # which gave the camera
+    asked = {name: contents(value) if isinstance(value, Path) else value for name, value in given.items()}
+    whole = [VERSION, contents(path), asdict(camera), asked, params.model_dump(mode="json")]
+    return hashlib.sha256(json.dumps(whole).encode()).hexdigest()[:12]
 
 
 def odometry_params(settings: Settings) -> OdometryParams:

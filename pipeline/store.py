@@ -124,6 +124,11 @@ def content_of(digests: Mapping[str, str]) -> str:
     return together.hexdigest()
 
 
+def contents(path: Path) -> str:
+    """One digest of a file, or of all files of a folder by their names."""
+    return content_of({file.name: digest(file) for file in path.iterdir()}) if path.is_dir() else digest(path)
+
+
 def _seal(body: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(body, sort_keys=True).encode()).hexdigest()
 

@@ -30,10 +30,12 @@ from scan2sim.pipeline.extras import need
 from scan2sim.pipeline.io.trajectory import replacing
 from scan2sim.pipeline.io.video import Encoder
 from scan2sim.pipeline.step import Report, silent
+from scan2sim.pipeline.store import contents
 from scan2sim.pipeline.types import U8, Camera, Trajectory
 from scan2sim.slam.evaluate import SEGMENT, evaluate, way
 from scan2sim.slam.gps import GpsTrack, smooth
 from scan2sim.slam.odometry import Odometry, OdometryParams
+from scan2sim.slam.track import VERSION as TRACK_VERSION
 from scan2sim.slam.track import camera_of, track
 from scan2sim.slam.video import Video, _files, open_video
 
@@ -162,7 +164,7 @@ def study(
                 rest.unlink()
     except OSError as error:
         raise from_os_error(error, folder) from error
-    same = _identity(source, shared)
+    same = _identity(shared)
     results = {cell: found for cell in cells if (found := _kept(folder, cell, same)) is not None}
     for cell in cells:
         refused = _refused(cell, video)
@@ -225,18 +227,15 @@ def _refused(cell: Cell, video: Video) -> str | None:
 # --- what an earlier run has finished
 
 
-def _identity(source: Path, shared: Source) -> dict[str, Any]:
+def _identity(shared: Source) -> dict[str, Any]:
     """What must be the same for a result to hold, JSON-able."""
-    path = shared.video.path
-    about = sorted(path.iterdir()) if path.is_dir() else [path]
-    parts = [(p.name, p.stat().st_size, p.stat().st_mtime_ns) for p in about]
 
     def mark(value: Any) -> str:
         return hashlib.sha256(repr(value).encode()).hexdigest()[:16]
 
     return {
-        "version": VERSION,
-        "source": mark(parts),
+        "version": [VERSION, TRACK_VERSION],
+        "source": contents(shared.video.path),
         "truth": mark(_plain(shared.truth)),
         "gps": mark(_plain(shared.gps)),
         "mask": mark(_plain(shared.mask)),

@@ -24,6 +24,9 @@ from scan2sim.slam.state import WrongState, load, save
 from scan2sim.slam.tracking import Tracks
 from scan2sim.slam.video import Video
 
+VERSION = 1
+"""Raised whenever the same video comes to another trajectory with the same options: what older code left, a state of an
+interrupted run or a trajectory that is kept, is begun anew then."""
 KEEP_EVERY = 60.0
 """Seconds between states kept."""
 VALUES = (Found, Keyframe, Landmarks, Placed, Remembered, Seen, SeenInChart, Tracks)

@@ -35,6 +35,8 @@ from scan2sim.pipeline.types import F32, F64, U8, Camera, Frame, PointCloud, Tra
 
 Bools = npt.NDArray[np.bool_]
 
+VERSION = 1
+"""Raised whenever the same sweeps come to another tile with the same options."""
 SWEEPS = (".bin", ".pcd", ".ply", ".las", ".laz")
 PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
 GAP = 1.0

@@ -46,6 +46,54 @@ def test_a_drive_says_how_it_is_cut_unless_it_is_said_otherwise(corridor: Path, 
     assert len(read_survey(Path(survey_of(tmp_path, tmp_path / "out", length=4.0))).tiles) > 2
 
 
+def test_newer_code_cuts_again(corridor: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    survey = Path(survey_of(corridor, tmp_path / "out", length=6.0, buffer=2.0))
+    before = survey.stat().st_ino
+    monkeypatch.setattr("scan2sim.flows.cut.VERSION", 1000)
+    survey_of(corridor, tmp_path / "out", length=6.0, buffer=2.0)
+    assert survey.stat().st_ino != before
+
+
+def test_a_path_and_a_corridor_are_made_again_by_newer_code_and_of_other_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[str] = []
+    for name in ("video.mp4", "camera.toml", "velodyne/0.bin", "image/0.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(name)
+    text = '[slam]\nvideo = "video.mp4"\n[sweeps]\nfolder = "velodyne"\nphotos = "image"\ncamera = "camera.toml"\n'
+    place = drive(tmp_path, text)
+
+    def slam(path: Path, out: Path, *_: object) -> None:
+        made.append("slam")
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "trajectory.csv").write_text("path")
+
+    def sweeps(folder: Path, poses: Path, out: Path, **_: object) -> None:
+        made.append("sweeps")
+        out.mkdir(exist_ok=True)
+
+    monkeypatch.setattr("scan2sim.flows.slam.slam_video", slam)
+    monkeypatch.setattr("scan2sim.pipeline.io.sweeps.import_sweeps", sweeps)
+    monkeypatch.setattr("scan2sim.pipeline.io.sweeps.camera_of_photos", lambda *_, **__: None)
+    monkeypatch.setattr("scan2sim.flows.prepare._cut", lambda corridor, *_: corridor)
+
+    def again() -> list[str]:
+        made.clear()
+        survey_of(place, tmp_path / "out")
+        return list(made)
+
+    assert again() == ["slam", "sweeps"] and again() == []
+    monkeypatch.setattr("scan2sim.slam.track.VERSION", 1000)
+    assert again() == ["slam"] and again() == []
+    monkeypatch.setattr("scan2sim.pipeline.io.sweeps.VERSION", 1000)
+    assert again() == ["sweeps"] and again() == []
+    (tmp_path / "camera.toml").write_text("another")
+    assert again() == ["sweeps"]
+    (tmp_path / "video.mp4").write_text("another")
+    assert again() == ["slam"]
+
+
 def test_a_survey_is_itself(corridor: Path, tmp_path: Path) -> None:
     survey = survey_of(corridor, tmp_path / "out", length=6.0, buffer=2.0)
     assert survey_of(survey, tmp_path / "other") == survey

@@ -5,6 +5,7 @@ import json
 import os
 import pickle
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,10 +16,13 @@ from scan2sim.flows.cli import app
 from scan2sim.flows.slam import Options, _mark, _tracker
 from scan2sim.pipeline.errors import InputError, ScanError
 from scan2sim.pipeline.io import trajectory as trajectory_io
+from scan2sim.pipeline.types import Camera
 from scan2sim.slam.loops import Places
 from scan2sim.slam.odometry import Odometry, OdometryParams
-from scan2sim.slam.track import track
+from scan2sim.slam.track import VERSION, track
 from scan2sim.slam.video import open_video
+
+CAMERA = Camera("equirectangular", 256, 128)
 
 
 def command(*arguments):
@@ -129,12 +133,25 @@ def test_a_state_that_is_damaged_or_foreign_is_not_run_and_the_run_begins_anew(c
         assert again.names == whole.names and not (tmp_path / "trap").exists(), name
 
 
-def test_a_video_that_was_replaced_is_begun_anew(corridor, tmp_path):
-    shutil.copy(corridor.folder / "video.mp4", tmp_path / "video.mp4")
-    before = _mark(tmp_path / "video.mp4", Options(), OdometryParams())
-    assert _mark(tmp_path / "video.mp4", Options(), OdometryParams()) == before
-    (tmp_path / "video.mp4").write_bytes(b"another")
-    assert _mark(tmp_path / "video.mp4", Options(), OdometryParams()) != before
+def test_an_interrupted_run_goes_on_only_from_what_the_same_code_made_of_the_same_contents(tmp_path, monkeypatch):
+    video, mask = tmp_path / "video.mp4", tmp_path / "mask.png"
+
+    def mark(**changes):
+        given = {"mask": mask} | changes
+        return _mark(video, CAMERA, Options(**given), OdometryParams())
+
+    video.write_bytes(b"one"), mask.write_bytes(b"mask")
+    before, times = mark(), video.stat()
+    assert mark() == before
+    (tmp_path / "moved").mkdir()
+    assert mark(mask=Path(shutil.copy(mask, tmp_path / "moved"))) == before
+    video.write_bytes(b"two")
+    os.utime(video, ns=(times.st_atime_ns, times.st_mtime_ns))  # a copy that keeps times, of the same length
+    assert mark() != before
+    video.write_bytes(b"one")
+    assert mark() == before != mark(every=2)
+    monkeypatch.setattr("scan2sim.flows.slam.VERSION", VERSION + 1)
+    assert mark() != before
 
 
 @pytest.mark.parametrize(

@@ -64,16 +64,12 @@ def test_cells_are_measured_kept_and_not_run_again(corridor: Drive, tmp_path: Pa
     before = {c: c.stat().st_mtime_ns for c in cells}
     study(corridor.folder, corridor.truth, out, **asked)  # nothing is left to run
     assert {c: c.stat().st_mtime_ns for c in cells} == before and (out / "table.md").read_text() == text
-    video, same = open_video(corridor.folder / "video.mp4"), good["of"]
+    same = good["of"]
     assert study_module._kept(out / "cells", Cell(128, 1.0, 10.0), same) == Result(figures, None)
     cells[1].write_text(cells[1].read_text()[:100])  # killed while writing: but files appear whole
     assert study_module._kept(out / "cells", Cell(128, 1.0, 10.0), same) is None
     other = source_of(corridor, gps=gps, params=OdometryParams.model_validate({"features": 300}))
-    assert (
-        study_module._identity(video.path, other)
-        != same
-        == study_module._identity(video.path, source_of(corridor, gps=gps))
-    )
+    assert study_module._identity(other) != same == study_module._identity(source_of(corridor, gps=gps))
 
 
 def test_a_cell_that_sees_nothing_is_na_with_its_reason(corridor: Drive, tmp_path: Path) -> None:
