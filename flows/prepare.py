@@ -1,21 +1,7 @@
 """What comes before a survey's tiles: SLAM where it is asked for, import, and the cut; each redone if it must be.
 
-A drive is what a vehicle brought home, in a `drive.toml`:
-
-```toml
-[slam]                      # where GPS is poor: the camera's path from its video
-video = "drive.mp4"
-gps = "gps.csv"             # optional, like all but the video: gps_offset, mask, camera, focal, centre, fps
-[sweeps]                    # the scanner's sweeps, placed by that path (or by `poses`, a trajectory file)
-folder = "velodyne"
-extrinsics = "calib.txt"
-photos = "image_02"
-crs = "EPSG:32633"
-[tiles]
-length = 100.0
-buffer = 5.0
-```
-With `corridor = "tile.toml"` instead of sweeps, what is there already is cut.
+A drive is what a vehicle brought home, in a `drive.toml` (docs/scale.md shows one): a video for SLAM where GPS is poor,
+the scanner's sweeps, which its path places, and how to cut; or, instead of sweeps, a corridor that is there already.
 """
 
 from __future__ import annotations
