@@ -29,10 +29,8 @@ ROOMS = ("pipeline", "segmentation", "texturing", "slam", "flows", "services", "
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/*.md")), ROOT / "data_samples/README.md"]
 MODULES = sorted(path for room in ROOMS for path in (ROOT / room).rglob("*.py"))
 PARAMS: dict[str, type[BaseModel]] = {step.name: step.params for step in STEPS} | {"slam": OdometryParams}
-OTHERS = re.compile(
-    r"\b(prefect|docker|dask|ray|gz|pip|aws|kubectl)\b|--job-variable|--levels|--nworkers|--limit|--num-cpus"
-)
-"""Other programs; and options of theirs that stand alone."""
+OTHERS = re.compile(r"\b(prefect|docker|dask|ray|gz|pip|aws)\b")
+"""Other programs, whose options a page may name once it has shown them in a command."""
 SUFFIXES = {"py", "json", "geojson", "csv", "obj", "laz", "png", "npz", "toml", "sdf", "dae", "mtl", "glb", "jpg"}
 
 
@@ -43,7 +41,8 @@ def about(page: Path) -> str:
 
 
 def named(pages: list[Path]) -> list[Any]:
-    return [pytest.param(page, id=page.relative_to(ROOT).as_posix()) for page in pages if about(page)]
+    some = [page for page in pages if page.suffix == ".md" or re.search(r"`|--|\.(py|md)", about(page))]
+    return [pytest.param(page, id=page.relative_to(ROOT).as_posix()) for page in some]
 
 
 def commands(group: Any, name: tuple[str, ...] = ("scan2sim",)) -> Iterator[tuple[tuple[str, ...], set[str]]]:
@@ -82,27 +81,24 @@ def taken(line: str) -> tuple[str, set[str]]:
 
 @pytest.mark.parametrize("page", named(PAGES + MODULES))
 def test_options_are_those_of_the_commands(page: Path) -> None:
-    text = about(page)
-    modules = [module for module in re.findall(r"python -m ([\w.]+)", text) if module.split(".")[0] != "venv"]
-    elsewhere = "".join(source(name) for name in modules if (ROOT / name.split(".")[-1]).exists() or "." in name)
+    text, option = about(page), re.compile(r"(?<![\w-])--[a-z][\w-]*")
+    modules = "".join(source(module) for module in re.findall(r"python -m (\w+\.[\w.]+)", text))
+    others = {found for line in lines(text) if OTHERS.search(line) for found in option.findall(line)}
     for line in lines(text):
-        options = set(re.findall(r"(?<![\w-])--[a-z][\w-]*", line))
+        options = set(option.findall(line))
         if line.startswith("scan2sim ") and "..." not in line.split()[:2]:
             command, known = taken(line)
-            foreign = options - known
-            assert not foreign, f"{command} has no {foreign}"
-        elif not OTHERS.search(line):
-            unknown = {option for option in options - ALL if f'"{option}"' not in elsewhere}
+            assert options <= known, f"{command} has no {options - known}"
+        else:
+            unknown = {name for name in options - ALL - others if f'"{name}"' not in modules}
             assert not unknown, f"no command has {unknown}: {line}"
 
 
 @pytest.mark.parametrize("page", named(PAGES + MODULES))
 def test_settings_are_parameters_or_figures(page: Path) -> None:
     names = "|".join(PARAMS)
-    found = re.findall(
-        rf"(?<![\w/.-])({names})\.(?:({'|'.join(SURFACES)})\.)?([a-z_0-9]+)", " ".join(lines(about(page)))
-    )
-    for step, _, name in found:
+    setting = re.compile(rf"(?<![\w/.-])({names})\.(?:(?:{'|'.join(SURFACES)})\.)?([a-z_0-9]+)")
+    for step, name in setting.findall(" ".join(lines(about(page)))):
         known = {*PARAMS[step].model_fields, *SURFACES, *SUFFIXES, "rest"}
         module = (ROOT / step / f"{name}.py").exists() or (ROOT / step / name).is_dir()
         assert name in known or module or name in figures(), f"there is no {step}.{name}"
