@@ -26,7 +26,6 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -84,9 +83,9 @@ STREETS = {
 
 def scan2sim(*arguments: object, code: Path | None = None) -> float:
     """Run the command, of another checkout if given; seconds."""
-    environment = dict(os.environ) | ({"PYTHONPATH": str(code)} if code else {})
+    at = code or ROOT  # the folder it runs from comes before all others on Python's path
     command = [sys.executable, "-m", "scan2sim.flows.cli", *map(str, arguments)]
-    measured = measure(["env", f"PYTHONPATH={environment.get('PYTHONPATH', '')}", *command])
+    measured = measure(["env", f"--chdir={at}", f"PYTHONPATH={at}", *command])
     if measured.status:
         sys.exit(f"scan2sim {arguments[0]} failed with exit status {measured.status}")
     return measured.seconds
@@ -233,6 +232,7 @@ def times(folder: Path, old: Path | None) -> dict[str, Any]:
     if old is None or not (old / "pyproject.toml").is_file():
         print("time_ratio: null, no older checkout was given (--old)")
         return {"time_ratio": None}
+    old = old.resolve()
     tile = folder / "street_9m"
     if not (tile / "tile.toml").is_file():
         scan2sim("sample", "--length=100", "--points=9e6", "--photos=40", "--seed=0", tile)
@@ -307,7 +307,7 @@ def main() -> None:
     parser.add_argument("--old", type=Path, help="an older checkout, for `time`")
     parser.add_argument("--score-only", action="store_true", help="score the worlds that are there already")
     arguments = parser.parse_args()
-    out: Path = arguments.out
+    out: Path = arguments.out.resolve()
     for part in arguments.parts:
         folder = out / part
         folder.mkdir(parents=True, exist_ok=True)
