@@ -1,18 +1,21 @@
-"""Tidy: what no neighbourhood mends: floating specks of vegetation, feet of walls, low vegetation that is high."""
+"""Tidy: what no neighbourhood mends: specks of plants and of road in the air, feet of walls, plants' heights."""
 
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 from scan2sim.pipeline.types import F32, I32, U8
 from scan2sim.segmentation.labels import CLASSES, GROUND
 
+Bools = npt.NDArray[np.bool_]
+
 FLOATING, LINK = 0.35, 0.35
-"""Vegetation whose lowest is so many metres above ground floats; its points are linked within so many."""
+"""What has its lowest so many metres above ground floats; its points are linked within so many."""
 SPECK = 400
-"""Voxels: smaller floating pieces of vegetation are none."""
+"""Voxels: smaller floating pieces of vegetation or ground are none."""
 PIECE, HUG, MOSTLY = 3000, 0.5, 0.6
-"""Nor are larger ones of which so much lies within so many metres of a wall."""
+"""Nor is larger vegetation of which so much lies within so many metres of a wall."""
 UPRIGHT = 0.7
 """Normals that rise less are a wall's."""
 HIGH, LOW = 2.6, 1.2
@@ -20,33 +23,58 @@ HIGH, LOW = 2.6, 1.2
 
 
 def without_specks(best: U8, height: F32, xyz: F32, near: I32) -> U8:
-    """Small vegetation that touches no ground is what stands around it, bay windows and balconies: (N,) indices."""
+    """Small vegetation that touches no ground is what stands around it, bay windows and balconies; so is ground in
+    the air, as photos take the inside of a car for that is seen through its window: (N,) indices."""
+    plants = np.isin(best, [CLASSES.index("low_vegetation"), CLASSES.index("high_vegetation")])
+    ground = np.isin(best, [CLASSES.index(name) for name in GROUND])
+    hugs = _close(xyz, np.isin(best, [CLASSES.index("building"), CLASSES.index("wall_or_fence")]), HUG)
+    plant_speck = _specks(plants, height, xyz, near, hugs)
+    ground_speck = _specks(ground, height, xyz, near)
+    out = best.copy()
+    for speck, stands in ((plant_speck, ~plant_speck), (ground_speck, ~ground & ~plant_speck)):
+        want, have = np.flatnonzero(speck), np.flatnonzero(stands)
+        if len(want) and len(have):
+            out[want] = _most_around(best[have], xyz[have], xyz[want])
+    return out
+
+
+def _specks(member: Bools, height: F32, xyz: F32, near: I32, hugs: Bools | None = None) -> Bools:
+    """(N,) which members are of small pieces that touch no ground; of larger ones if most of them `hugs` a wall."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
+
+    rows = np.flatnonzero(member)
+    if not len(rows):
+        return member
+    close = member[near[rows]] & (np.linalg.norm(xyz[near[rows]] - xyz[rows, None], axis=2) < LINK)
+    a, b = np.repeat(rows, near.shape[1])[close.ravel()], near[rows][close]
+    n = len(member)
+    _, part = connected_components(coo_matrix((np.ones(len(a), np.int8), (a, b)), shape=(n, n)), False)
+    size, lowest = np.bincount(part[rows], minlength=n), np.full(n, np.inf)
+    np.minimum.at(lowest, part[rows], height[rows])
+    small = size < SPECK
+    if hugs is not None:
+        hugging = np.bincount(part[rows], hugs[rows], minlength=n) / np.maximum(size, 1)
+        small |= (size < PIECE) & (hugging > MOSTLY)
+    return np.asarray(member & ((lowest > FLOATING) & small)[part])
+
+
+def _close(xyz: F32, to: Bools, distance: float) -> Bools:
+    """(N,) which points are within a distance of those `to`."""
     from scipy.spatial import cKDTree
 
-    plants = np.isin(best, [CLASSES.index("low_vegetation"), CLASSES.index("high_vegetation")])
-    rows = np.flatnonzero(plants)
-    if not len(rows):
-        return best
-    close = plants[near[rows]] & (np.linalg.norm(xyz[near[rows]] - xyz[rows, None], axis=2) < LINK)
-    a, b = np.repeat(rows, near.shape[1])[close.ravel()], near[rows][close]
-    _, part = connected_components(coo_matrix((np.ones(len(a), np.int8), (a, b)), shape=(len(best),) * 2), False)
-    size, lowest = np.bincount(part[rows], minlength=len(best)), np.full(len(best), np.inf)
-    np.minimum.at(lowest, part[rows], height[rows])
-    walls = np.flatnonzero(np.isin(best, [CLASSES.index("building"), CLASSES.index("wall_or_fence")]))
-    hugs = np.isfinite(cKDTree(xyz[walls]).query(xyz[rows], distance_upper_bound=HUG, workers=-1)[0])
-    hugging = np.bincount(part[rows], hugs, minlength=len(best)) / np.maximum(size, 1)
-    floats = plants & (lowest[part] > FLOATING)
-    speck = floats & (size[part] < SPECK) | floats & (size[part] < PIECE) & (hugging[part] > MOSTLY)
-    want, have = np.flatnonzero(speck), np.flatnonzero(~speck)
-    if not len(want) or not len(have):
-        return best
-    k = min(15, len(have))
-    around = best[have][cKDTree(xyz[have]).query(xyz[want], k=[*range(1, k + 1)], workers=-1)[1]]
-    out = best.copy()
-    out[want] = np.stack([(around == c).sum(axis=1) for c in range(len(CLASSES))], axis=1).argmax(axis=1)
-    return out
+    return np.isfinite(cKDTree(xyz[to]).query(xyz, distance_upper_bound=distance, workers=-1)[0])
+
+
+def _most_around(best: U8, xyz: F32, places: F32) -> U8:
+    """(M,) the class that most of the 15 points nearest to each place have."""
+    from scipy.spatial import cKDTree
+
+    k = min(15, len(best))
+    around = best[cKDTree(xyz).query(places, k=[*range(1, k + 1)], workers=-1)[1]]
+    return np.asarray(
+        np.stack([(around == c).sum(axis=1) for c in range(len(CLASSES))], axis=1).argmax(axis=1), np.uint8
+    )
 
 
 def with_feet(best: U8, normal: F32, near: I32) -> U8:

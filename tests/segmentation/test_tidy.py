@@ -7,7 +7,9 @@ from scipy.spatial import cKDTree
 from scan2sim.segmentation.labels import CLASSES
 from scan2sim.segmentation.tidy import by_height, with_feet, without_specks
 
-BUILDING, HIGH, LOW, ROAD = (CLASSES.index(n) for n in ("building", "high_vegetation", "low_vegetation", "road"))
+BUILDING, HIGH, LOW, ROAD, VEHICLE = (
+    CLASSES.index(n) for n in ("building", "high_vegetation", "low_vegetation", "road", "vehicle")
+)
 
 
 def sheet(width: float, low: float, high: float, y: float = 0.0) -> np.ndarray:
@@ -41,6 +43,16 @@ def test_nothing_but_vegetation_stays():
     xyz = sheet(2, 1, 2)
     best = np.full(len(xyz), HIGH, np.uint8)
     assert (without_specks(best, xyz[:, 2], xyz, neighbours(xyz)) == best).all()
+
+
+def test_road_in_the_air_is_what_stands_around_it_and_a_ramp_is_road():
+    road, seat, car, ramp = (sheet(4, *z)[:, [0, 2, 1]] for z in ((0, 4), (1, 1.5), (1.5, 2.5), (5, 9)))
+    seat[:, 2], car[:, 2], ramp[:, 2] = 1.0, 1.0, 0.3 * (ramp[:, 1] - 5)
+    xyz = np.concatenate([road, seat, car, ramp])
+    best = np.repeat([ROAD, ROAD, VEHICLE, ROAD], [len(road), len(seat), len(car), len(ramp)]).astype(np.uint8)
+    found = without_specks(best, xyz[:, 2], xyz, neighbours(xyz))
+    assert (found[len(road) :][: len(seat)] == VEHICLE).all()
+    assert (found[: len(road)] == ROAD).all() and (found[-len(ramp) :] == ROAD).all()
 
 
 def test_the_foot_of_a_wall_is_the_walls_and_a_kerb_is_not():
