@@ -64,12 +64,13 @@ def continued(rgb: F32, known: Bools, wanted: Bools, kind: I32 | None = None) ->
     wanted = np.pad(wanted, pad) & ~known
     if kind is None:
         kind = np.full((known.shape[0] // FACTOR, known.shape[1] // FACTOR), -1, np.int32)
+    shifts = np.zeros((0, 2), np.int32)
     for _ in range(ROUNDS):
         coarse, whole, hole = _coarse(rgb, known, wanted)
         hole = _nearest(hole, whole, MOST)
         if not hole.any() or not whole.any():
             break
-        shifts = offsets(coarse, whole, hole)
+        shifts = shifts if len(shifts) else offsets(coarse, whole, hole)
         if not len(shifts):
             break
         shift = choose(coarse, whole, hole, kind, shifts)

@@ -5,13 +5,16 @@ Import late: it loads numba.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
+from numba import njit
 
 from scan2sim.pipeline.heightfield import MOST, drawn, grown
 from scan2sim.pipeline.types import F32, F64, U8, Mesh
+from scan2sim.texturing.blend import frame
 from scan2sim.texturing.continuation import FACTOR, continued
 from scan2sim.texturing.fill import FILLED, FROM_POINTS, Page, texel_places
 
@@ -20,6 +23,9 @@ CELL = 0.03
 RIM = 1.0
 """Metres around what is to be filled within which texels coloured from points are thought of as filled, too: so holes
 reach to what photos saw, and have its tone."""
+
+SEEN = 255
+"""Mark of texels that a photo saw."""
 
 Bools = npt.NDArray[np.bool_]
 
@@ -49,29 +55,15 @@ class Plan:
 
     def clear(self, page: Page) -> None:
         """Forget what photos saw below things that were taken out, in place."""
-        if not self._stood.any():
-            return
-        for first in range(0, len(page.owner), 1024):
-            row, column = np.nonzero(page.seen[first : first + 1024] == 255)
-            row += first
-            below = self.stood(texel_places(page.owner, page.flat, page.corners, row, column))
-            page.seen[row[below], column[below]] = 0
+        if self._stood.any():
+            _clear(page.seen, page.owner, page.flat, page.corners, self.low, self.cell, self._stood)
 
     def add(self, page: Page) -> None:
         """Take up what a page shows, and where it has been filled for want of something better."""
-        height = len(page.owner)
-        for first in range(0, height, 1024):  # places take many times a page's bytes
-            rows = slice(first, min(height, first + 1024))
-            for mark in (255, FROM_POINTS, FILLED):
-                row, column = np.nonzero(page.seen[rows] == mark)
-                y, x = self.at(texel_places(page.owner, page.flat, page.corners, row + first, column))
-                if mark == 255:
-                    flat = y * self._count.shape[1] + x
-                    for k in range(3):
-                        np.add.at(self._sum[..., k].reshape(-1), flat, page.rgb[row + first, column, k])
-                    np.add.at(self._count.reshape(-1), flat, np.float32(1))
-                else:
-                    (self._wanted if mark == FILLED else self._from_points)[y, x] = True
+        _add(
+            page.rgb, page.seen, page.owner, page.flat, page.corners, self.low, self.cell,
+            self._sum, self._count, self._wanted, self._from_points,
+        )  # fmt: skip
 
     def go_on(self) -> Continued | None:
         """The ground as it goes on where no photo saw it; None where none is wanted, or nothing is known."""
@@ -119,6 +111,49 @@ class Continued:
             y, x = self._plan.at(texel_places(page.owner, page.flat, page.corners, row, column))
             here = self._filled[y, x]
             page.rgb[row[here], column[here]] = self._picture[y[here], x[here]]
+
+
+@njit(cache=True, inline="always")
+def _cell_of(origin, per_x, per_y, x, y, low, cell, shape):  # type: ignore[no-untyped-def]
+    """Row and column of a texel in the picture; `origin`, `per_x`, `per_y` are its face's (`blend.frame`)."""
+    row = math.floor((origin[1] + x * per_x[1] + y * per_y[1] - low[1]) / cell)
+    column = math.floor((origin[0] + x * per_x[0] + y * per_y[0] - low[0]) / cell)
+    return min(max(row, 0), shape[0] - 1), min(max(column, 0), shape[1] - 1)
+
+
+@njit(cache=True)
+def _clear(seen, owner, flat, corners, low, cell, stood):  # type: ignore[no-untyped-def]
+    last = -1
+    for y in range(seen.shape[0]):
+        for x in range(seen.shape[1]):
+            if seen[y, x] != SEEN:
+                continue
+            if owner[y, x] != last:
+                last = owner[y, x]
+                origin, per_x, per_y, _ = frame(flat, corners, last)
+            if stood[_cell_of(origin, per_x, per_y, x, y, low, cell, stood.shape)]:
+                seen[y, x] = 0
+
+
+@njit(cache=True)
+def _add(rgb, seen, owner, flat, corners, low, cell, total, count, wanted, from_points):  # type: ignore[no-untyped-def]
+    last = -1
+    for y in range(seen.shape[0]):
+        for x in range(seen.shape[1]):
+            if seen[y, x] == 0:
+                continue
+            if owner[y, x] != last:
+                last = owner[y, x]
+                origin, per_x, per_y, _ = frame(flat, corners, last)
+            at = _cell_of(origin, per_x, per_y, x, y, low, cell, count.shape)
+            if seen[y, x] == SEEN:
+                count[at] += 1
+                for k in range(3):
+                    total[at[0], at[1], k] += rgb[y, x, k]
+            elif seen[y, x] == FROM_POINTS:
+                from_points[at] = True
+            else:
+                wanted[at] = True
 
 
 def _whole(wanted: Bools, known: Bools) -> Bools:
