@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from scan2sim.data_samples.paints import RGB, linear
-from scan2sim.data_samples.shapes import Field, waves
+from scan2sim.data_samples.paints import RGB, Paint, linear
+from scan2sim.data_samples.shapes import Field, Part, waves
 from scan2sim.pipeline.types import F64, Frame
 
 Span = tuple[float, float]
@@ -30,6 +31,8 @@ class Style:
     curve_radius: Span = (260.0, 900.0)
     slope: Span = (-0.018, 0.018)
     lane_width: Span = (3.1, 3.5)
+    pavement: float = 2.3
+    kerb: float = 0.12
     house_width: Span = (8.5, 13.5)
     storeys: tuple[int, ...] = (2, 2, 2, 3, 3)
     front_garden: Span = (0.6, 4.2)
@@ -160,6 +163,32 @@ class ParkedCar:
 
 
 @dataclass(frozen=True)
+class Walk:
+    """A strip of other ground than slabs beside the road, from `near` to `far` metres off the axis."""
+
+    side: Side
+    near: float
+    far: float
+    paint: Paint
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A thing of another kind at chainage s and offset t, its mesh made when the street is built.
+
+    Attributes:
+        turn: radians, of its x axis from the road's direction.
+        loose: it is no part of a world: a vehicle, a person.
+    """
+
+    s: float
+    t: float
+    turn: float
+    make: Callable[[], Part]
+    loose: bool = False
+
+
+@dataclass(frozen=True)
 class Layout:
     """The whole street.
 
@@ -168,6 +197,8 @@ class Layout:
         parking: side of the parking bays.
         sun: (3,) unit vector towards the sun.
         road: parameters that the asphalt's pattern needs: half width, chainage of the zebra, of a dash.
+        bays, walks: other ground than setts and slabs; more: what else stands there (`variety`).
+        pavement, step: width of the pavement, height of the kerb, metres.
     """
 
     axis: Axis
@@ -190,10 +221,13 @@ class Layout:
     seed: int
     hills: Field = field(repr=False)
     bumps: Field = field(repr=False)
+    bays: Paint | None = None
+    walks: tuple[Walk, ...] = ()
+    more: tuple[Placed, ...] = ()
+    pavement: float = 2.3
+    step: float = 0.12
 
-    KERB = 0.12
     BAY = 2.15
-    PAVEMENT = 2.3
 
     def kerb(self, side: int) -> float:
         """Distance of the kerb from the axis."""
@@ -201,7 +235,7 @@ class Layout:
 
     def garden(self, side: int) -> float:
         """Distance from the axis where the pavement ends."""
-        return self.kerb(side) + self.PAVEMENT
+        return self.kerb(side) + self.pavement
 
     def height(self, s: npt.ArrayLike, t: npt.ArrayLike, *, below_kerb: bool = False) -> F64:
         """Height of the ground; on the kerb's line itself the upper edge, or the lower one if `below_kerb`."""
@@ -214,8 +248,8 @@ class Layout:
             camber = np.interp(
                 u, [0, self.lane, k + step, k + step + 1e-6, g, HALF_WIDTH],
                 [0, -0.024 * self.lane, -0.024 * self.lane - 0.02 * (k - self.lane),
-                 -0.024 * self.lane - 0.02 * (k - self.lane) + self.KERB,
-                 -0.024 * self.lane + self.KERB + 0.02, 0.45],
+                 -0.024 * self.lane - 0.02 * (k - self.lane) + self.step,
+                 -0.024 * self.lane + self.step + 0.02, 0.45],
             )  # fmt: skip
             z = np.where(u >= 0, camber, z)
             wild = u > g
@@ -237,7 +271,7 @@ def lay_out(length: float, seed: int, style: Style | None = None) -> Layout:
     sun = _sun(rng, axis, style)
     zebra = length * rng.uniform(0.52, 0.7) if length >= 18 else -100.0
     kerb = {side: lane + (Layout.BAY if side == parking else 0.0) for side in (1, -1)}
-    garden = {side: k + Layout.PAVEMENT for side, k in kerb.items()}
+    garden = {side: k + style.pavement for side, k in kerb.items()}
     houses = [h for side in (1, -1) for h in _houses(rng, style, length, side, garden[side])]  # type: ignore[arg-type]
     trees = _trees(rng, style, length, kerb, garden, houses, zebra)
     return Layout(
@@ -261,6 +295,8 @@ def lay_out(length: float, seed: int, style: Style | None = None) -> Layout:
         seed=seed,
         hills=waves(rng, 7.0, dimensions=2),
         bumps=waves(rng, 1.3, dimensions=2),
+        pavement=style.pavement,
+        step=style.kerb,
     )
 
 

@@ -28,6 +28,7 @@ WOOD, CAR_BODY, CAR_GLASS, CAR_END, WHEEL, SIGN = (
     int(m)
     for m in (Material.WOOD, Material.CAR_BODY, Material.CAR_GLASS, Material.CAR_END, Material.WHEEL, Material.SIGN)
 )
+GRIT, PANELS = int(Material.GRIT), int(Material.PANELS)
 
 
 @njit(cache=True, inline="always")
@@ -361,6 +362,26 @@ def _colour(
     if m == SIGN:
         p = pictures[k]
         return _sample(p, u, v, 0), _sample(p, u, v, 1), _sample(p, u, v, 2)
+    if m == GRIT:
+        size, deep = 0.03 * 20 ** _hash(k, 1, 9), 0.15 + 0.55 * _hash(k, 2, 9)
+        f = 1 + deep * (noise(u, v, size, w, k) + 0.5 * noise(u, v, 3 * size, w, k + 1))
+        f *= 1 + 0.25 * noise(u, v, 1.7, w, k + 2) + 0.3 * _hash(k, 3, 9) * noise(u, v, 6.0, w, k + 3)
+        other = _clamp(3 * noise(u, v, 2.5 * size, w, k + 4) - 3 * _hash(k, 4, 9))  # a second colour among it
+        x, y, z = _hash(k, 5, 9), _hash(k, 6, 9), _hash(k, 7, 9)
+        f = max(f, 0.1)
+        return (
+            r * f * (1 - other) + (0.5 * r + 0.3 * x) * other, g * f * (1 - other) + (0.5 * g + 0.27 * x * y) * other,
+            b * f * (1 - other) + (0.5 * b + 0.24 * x * z) * other,
+        )  # fmt: skip
+    if m == PANELS:
+        if _hash(k, 1, 9) < 0.5:
+            u, v = v, u
+        wide, long = 0.08 * 20 ** _hash(k, 2, 9), 1.0 + 6.0 * _hash(k, 3, 9)
+        j, tone = _bond(u, v, long, wide, 0.02 + 0.03 * _hash(k, 4, 9), w, k)
+        round_ = 0.4 * _hash(k, 5, 9) * (v / wide - math.floor(v / wide) - 0.5) * _clamp(2 - 2 * w / wide)
+        f = (1 + round_) * (1 + 0.5 * _hash(k, 6, 9) * (tone - 0.5)) * (1 - (0.3 + 0.6 * _hash(k, 7, 9)) * j)
+        f *= 1 + 0.08 * noise(u, v, 0.05, w, k + 2) + 0.12 * noise(u, v, 1.5, w, k + 3)
+        return r * f, g * f, b * f
     f = 1 + 0.05 * noise(u, v, 0.03, w, k) + 0.06 * noise(u, v, 0.6, w, k + 1)
     return r * f, g * f, b * f
 

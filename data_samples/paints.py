@@ -34,6 +34,8 @@ class Material(IntEnum):
     CAR_END = 18  # uv: across the car, and height; size[0]: +1 front, -1 rear
     WHEEL = 19  # uv from the hub
     SIGN = 20  # uv in [0, 1] on the picture that the seed names
+    GRIT = 21  # gravel, litter, rubble, render: sizes and contrast by the seed
+    PANELS = 22  # boards, sheets, slats: sizes and direction by the seed
 
 
 class Paint(NamedTuple):
@@ -61,4 +63,5 @@ BUILDING = CODE["building"]
 SIGN = CODE["road_sign"]
 POLE = CODE["pole"]
 VEHICLE = CODE["vehicle"]
+PERSON = CODE["person"]
 WALL = CODE["wall_or_fence"]

@@ -23,7 +23,7 @@ def _unit_clump(shape: int, rounds: int) -> Part:
     return blob((0, 0, 0), 1.0, rng, leaf, bump=0.22, wavelength=0.8, rounds=rounds, shade=(0.2, 0.85))
 
 
-def _clump(
+def clump(
     centre: npt.ArrayLike, radius: float, paint: Paint, rng: np.random.Generator, rounds: int, flat: float = 1.0
 ) -> Part:
     """A bumpy ball of leaves, `flat` times as high as wide."""
@@ -50,8 +50,8 @@ def leafy_tree(plan: Tree, rounds: int = 2) -> Part:
         out, size = plan.radius * rng.uniform(0.3, 0.6, 2) * (1.0, 1.1)
         z = rng.uniform(clear + 0.22 * plan.height, plan.height * 0.82)
         centre = (lean[0] + out * np.cos(angle), lean[1] + out * np.sin(angle), z)
-        parts.append(_clump(centre, max(size, 0.45 * plan.radius), leaf, rng, rounds, rng.uniform(0.8, 1.1)))
-    parts.append(_clump((*lean, plan.height - 0.6 * plan.radius), 0.7 * plan.radius, leaf, rng, rounds))
+        parts.append(clump(centre, max(size, 0.45 * plan.radius), leaf, rng, rounds, rng.uniform(0.8, 1.1)))
+    parts.append(clump((*lean, plan.height - 0.6 * plan.radius), 0.7 * plan.radius, leaf, rng, rounds))
     return join(parts)
 
 
@@ -61,7 +61,7 @@ def shrub(radius: float, colour: RGB, seed: int) -> Part:
     leaf = Paint(Material.FOLIAGE, colour, paints.BUSH, seed)
     beside = (0.8 * radius, 0.3 * radius, 0.4 * radius)
     return join(
-        [_clump((0, 0, 0.6 * radius), radius, leaf, rng, 2), _clump(beside, 0.7 * radius, leaf, rng, 1, flat=0.9)]
+        [clump((0, 0, 0.6 * radius), radius, leaf, rng, 2), clump(beside, 0.7 * radius, leaf, rng, 1, flat=0.9)]
     )
 
 

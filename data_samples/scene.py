@@ -51,6 +51,10 @@ def build(layout: Layout) -> tuple[Part, Part, Part]:
         xy, heading = layout.axis.place(c.s, c.t)
         turn = float(heading) + (0.0 if c.towards == 1 else np.pi)
         parked.append(objects.car(c.colour).moved(turn, (*xy, float(layout.height(c.s, c.t)) + 0.01)))
+    for other in layout.more:
+        xy, heading = layout.axis.place(other.s, other.t)
+        mesh = other.make().moved(float(heading) + other.turn, (*xy, float(layout.height(other.s, other.t))))
+        (parked if other.loose else still).append(mesh)
     moving = objects.car(layout.moving)
     empty = _slice(moving, np.zeros(len(moving.faces), bool))
     fixed = join(still)
@@ -74,12 +78,12 @@ def _slice(mesh: Part, keep: npt.NDArray[np.bool_]) -> Part:
 
 def _ground(layout: Layout) -> list[Part]:
     """Carriageway, bays, kerbs, pavements and terrain, as strips along the axis; none inside houses."""
-    rows = max(2, round(layout.axis.length / GROUND_STEP) + 1)
+    rows, step = max(2, round(layout.axis.length / GROUND_STEP) + 1), layout.step
     s = np.linspace(0, layout.axis.length, rows)
     grass = Paint(Material.GRASS, linear("#5d7434"), paints.TERRAIN, layout.seed % 1000)
     slabs = Paint(Material.SLABS, linear("#b5b0a6"), paints.SIDEWALK, layout.seed % 1000)
     stone = Paint(Material.KERB, linear("#a8a6a0"), paints.SIDEWALK, 3)
-    setts = Paint(Material.SETTS, linear("#7d7873"), paints.ROAD, 5)
+    setts = layout.bays or Paint(Material.SETTS, linear("#7d7873"), paints.ROAD, 5)
     asphalt = Paint(Material.ASPHALT, layout.asphalt, paints.ROAD, 100 + layout.seed % 1000)
 
     def strip(t0: float, t1: float, paint: Paint, *, below: bool = False) -> Part:
@@ -95,11 +99,11 @@ def _ground(layout: Layout) -> list[Part]:
     parts = [strip(-layout.lane, layout.lane, asphalt, below=True)]
     for side in (1, -1):
         k, g = layout.kerb(side), layout.garden(side)
+        walks = [(w.near, w.far, w.paint, False) for w in layout.walks if w.side == side]
         for near, far, paint, below in (
             (layout.lane, k, setts, True),
             (k, k + 0.15, stone, False),
-            (k + 0.15, g, slabs, False),
-            (g, HALF_WIDTH, grass, False),
+            *(walks or [(k + 0.15, g, slabs, False), (g, HALF_WIDTH, grass, False)]),
         ):
             if far > near:
                 parts.append(strip(min(side * near, side * far), max(side * near, side * far), paint, below=below))
@@ -107,7 +111,7 @@ def _ground(layout: Layout) -> list[Part]:
         foot = np.column_stack([xy, layout.height(s, side * k, below_kerb=True)])
         top = np.column_stack([xy, layout.height(s, side * k)])
         face = np.stack([foot, top] if side == 1 else [top, foot])
-        uv = np.stack([np.column_stack([s, v + 0 * s]) for v in ((0, 0.12) if side == 1 else (0.12, 0))])
+        uv = np.stack([np.column_stack([s, v + 0 * s]) for v in ((0, step) if side == 1 else (step, 0))])
         parts.append(sheet(face[::-1], uv[::-1], stone))
     return [_slice(p, ~_inside_houses(layout, p)) if p.label[0] == paints.TERRAIN else p for p in parts]
 

@@ -1,8 +1,9 @@
 """Labelled photos of many synthetic streets, no two alike, for a segmentation network to learn from.
 
-`python -m scan2sim.data_samples.training OUT [--images 1200] [--seed 1000]`: OUT/images/*.jpg and OUT/labels/*.png (LAS
-class codes a pixel, 0 sky, 255 not to be learnt). Streets, light, weather, camera and place are drawn anew, far
-beyond what the streets of tests and benchmarks look like; seeds from 1000 on are kept for training, below for
+`python -m scan2sim.data_samples.training OUT [--images 1200] [--seed 1000]`: OUT/images/*.jpg, OUT/labels/*.png (LAS
+class codes a pixel, 0 sky, 255 not to be learnt) and OUT/channels/*.png (what a perfect scan would tell, as
+`pipeline.channels` codes it, at a quarter of the size). Streets, light, weather, camera and place are drawn anew,
+far beyond what the streets of tests and benchmarks look like; seeds from 1000 on are kept for training, below for
 everything else.
 """
 
@@ -17,14 +18,19 @@ from pathlib import Path
 
 import numpy as np
 
-from scan2sim.data_samples.layout import RGB, Style, lay_out
+from scan2sim.data_samples import paints
+from scan2sim.data_samples.layout import RGB, Layout, Style, lay_out
 from scan2sim.data_samples.photos import Effects, Rendering, develop, directions, render
 from scan2sim.data_samples.scanner import Drive, plan_drive
 from scan2sim.data_samples.scene import Scene
+from scan2sim.data_samples.variety import varied
+from scan2sim.pipeline.channels import FRACTION, Level, coded, level
 from scan2sim.pipeline.types import F64, U8, Camera
 
 PER_STREET = 20
-LENGTH = 60.0
+LENGTH = 80.0
+CLEARANCE = 1.2
+"""Metres that most of what a camera sees is away from it: none stands inside a van."""
 HILLS = 0.11
 """Sine of the elevation above which what is beyond the street is surely sky."""
 FIRST_SEED = 1000
@@ -89,20 +95,43 @@ def any_style(rng: np.random.Generator) -> Style:
     )
 
 
-def any_camera(rng: np.random.Generator) -> Camera:
-    """A lens of 45 to 85 degrees, or a panorama."""
+def any_street(seed: int) -> Layout:
+    """A street of any style, with all that streets may have, but for a fifth of them."""
+    rng = np.random.default_rng([seed, 77])
+    style = any_style(rng)
     if rng.random() < 0.2:
+        return lay_out(LENGTH, seed, style)
+    dark = rng.random() < 0.4  # shadows as photos have them
+    style = replace(
+        style,
+        pavement=float(rng.uniform(1.6, 4.5)),
+        kerb=float(rng.choice([0.02, 0.05, 0.09, 0.12, 0.15])),
+        sky_strength=(0.08, 0.25) if dark else style.sky_strength,
+    )
+    return varied(lay_out(LENGTH, seed, style), LENGTH)
+
+
+def any_camera(rng: np.random.Generator) -> Camera:
+    """A lens of 45 to 85 degrees, a wide strip such as cars' cameras take, or a panorama."""
+    kind = rng.random()
+    if kind < 0.15:
         return Camera("equirectangular", 1024, 512)
+    if kind < 0.5:
+        f = float(rng.uniform(360, 620))
+        return Camera("pinhole", 768, 256, f, f, 383.5, float(rng.uniform(100, 155)))
     f = float(rng.uniform(300, 620))
     return Camera("pinhole", 512, 384, f, f, 255.5, 191.5)
 
 
 def any_pose(rng: np.random.Generator, scene: Scene, drive: Drive, camera: Camera) -> tuple[F64, float]:
     """Somewhere on the vehicle's way, or beside it, looking anywhere but rather along the road; and the time."""
-    s = float(rng.uniform(2, scene.layout.axis.length - 2))
+    length = scene.layout.axis.length
+    s = float(rng.uniform(2, length - 2))
+    yaw = rng.choice([rng.normal(0, 0.3), rng.normal(np.pi, 0.3), rng.uniform(-np.pi, np.pi)], p=[0.45, 0.15, 0.4])
+    if np.cos(yaw) * (s - length / 2) > 0.15 * length:  # not out of the street
+        s = length - s
     time = float(drive.time_at(s))
     ground, heading = drive.ground(np.array([time]))
-    yaw = rng.choice([rng.normal(0, 0.3), rng.normal(np.pi, 0.3), rng.uniform(-np.pi, np.pi)], p=[0.35, 0.15, 0.5])
     pitch, roll = rng.normal(0, 0.12), rng.normal(0, 0.04)
     a = heading[0] + yaw
     forward = np.array([np.cos(a) * np.cos(pitch), np.sin(a) * np.cos(pitch), np.sin(pitch)])
@@ -114,7 +143,7 @@ def any_pose(rng: np.random.Generator, scene: Scene, drive: Drive, camera: Camer
     pose[:3, :3] = np.stack([right, down, forward], axis=1)
     aside = rng.normal(0, 0.7)
     left = np.array([-np.sin(heading[0]), np.cos(heading[0]), 0])
-    pose[:3, 3] = ground[0] + aside * left + [0, 0, rng.uniform(1.5, 3.0)]
+    pose[:3, 3] = ground[0] + aside * left + [0, 0, rng.uniform(1.4, 3.0)]
     return pose, time
 
 
@@ -133,9 +162,8 @@ def street(out: Path, seed: int, images: int) -> int:
     """Write `images` labelled photos of the street of `seed`; returns the seed."""
     import cv2
 
-    rng = np.random.default_rng([seed, 77])
-    scene = Scene(lay_out(LENGTH, seed, any_style(rng)))
-    drive = plan_drive(scene.layout, 1e6)
+    scene = Scene(any_street(seed))
+    drive, ground = plan_drive(scene.layout, 1e6), _ground(scene)
     for i in range(images):
         name = f"{seed:05d}_{i:02d}"
         if (out / "labels" / f"{name}.png").is_file():
@@ -143,14 +171,50 @@ def street(out: Path, seed: int, images: int) -> int:
         rng = np.random.default_rng([seed, 78, i])
         camera = any_camera(rng)
         pose, time = any_pose(rng, scene, drive, camera)
+        while _blocked(scene, camera, pose):
+            pose, time = any_pose(rng, scene, drive, camera)
         seen = in_weather(render(scene, drive, camera, pose, time), rng)
         ev = float(rng.uniform(-0.8, 0.8))
         image = develop(
             seen, ev, Effects(noise=float(rng.uniform(0, 0.01)), vignetting=float(rng.uniform(0, 0.3))), rng
         )
         cv2.imwrite(str(out / "images" / f"{name}.jpg"), image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])
+        cv2.imwrite(str(out / "channels" / f"{name}.png"), scanned(scene, drive, ground, camera, pose, time, rng))
         cv2.imwrite(str(out / "labels" / f"{name}.png"), told(seen, camera, pose))
     return seed
+
+
+def _blocked(scene: Scene, camera: Camera, pose: F64) -> bool:
+    """Whether a quarter of the picture is right before the lens."""
+    v, u = np.mgrid[: camera.height : 16, : camera.width : 16]
+    rays = (directions(camera, np.stack([u, v], axis=-1)).reshape(-1, 3) @ pose[:3, :3].T).astype(np.float32)
+    origins = np.broadcast_to(pose[:3, 3].astype(np.float32), rays.shape)
+    return bool((scene.cast(origins, rays).distance < CLEARANCE).mean() > 0.25)
+
+
+def _ground(scene: Scene) -> Level:
+    """The level of the street's ground."""
+    part = scene.surface
+    on = np.isin(part.label, (paints.ROAD, paints.SIDEWALK, paints.TERRAIN))
+    return level(part.vertices[np.unique(part.faces[on])])
+
+
+def scanned(
+    scene: Scene, drive: Drive, ground: Level, camera: Camera, pose: F64, time: float, rng: np.random.Generator
+) -> U8:
+    """(h, w, 4) channels of what a perfect scan has in a photo's place, mostly without what drove past."""
+    small = camera.scaled(1 / FRACTION)
+    v, u = np.mgrid[: small.height, : small.width]
+    rays = directions(small, np.stack([u, v], axis=-1)).reshape(-1, 3) @ pose[:3, :3].T
+    origins = np.broadcast_to(pose[:3, 3].astype(np.float32), rays.shape)
+    car = drive.car(scene, np.array([time])).repeated(len(rays)) if rng.random() < 0.3 else None
+    hits = scene.cast(origins, rays.astype(np.float32), car)
+    corners = scene.surface.vertices[scene.surface.faces[hits.face]]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    up = np.abs(normal[:, 2]) / np.maximum(np.linalg.norm(normal, axis=1), 1e-9)
+    met = np.where(hits.hit, hits.distance, 0)[:, None] * rays + origins
+    codes = coded(ground.above(met.astype(np.float32)), hits.distance, up.astype(np.float32))
+    return codes.reshape(small.height, small.width, -1)
 
 
 def told(seen: Rendering, camera: Camera, pose: F64) -> U8:
@@ -162,7 +226,7 @@ def told(seen: Rendering, camera: Camera, pose: F64) -> U8:
 
 def write(out: Path, images: int, seed: int = FIRST_SEED, processes: int | None = None) -> Iterator[float]:
     """Write a training set, going on from what is there; yields the share that is done."""
-    for folder in ("images", "labels"):
+    for folder in ("images", "labels", "channels"):
         (out / folder).mkdir(parents=True, exist_ok=True)
     streets = -(-images // PER_STREET)
     with ProcessPoolExecutor(processes or os.cpu_count()) as pool:

@@ -1,0 +1,67 @@
+"""Labelled photos to learn from: every class, and channels that fit them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from scan2sim.data_samples.layout import lay_out
+from scan2sim.data_samples.scene import Scene
+from scan2sim.data_samples.training import street
+from scan2sim.data_samples.variety import varied
+from scan2sim.pipeline.channels import FRACTION
+from scan2sim.pipeline.classes import CODE
+from scan2sim.segmentation.labelled import pairs, read_channels
+from scan2sim.segmentation.labels import CLASSES
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("set")
+    for folder in ("images", "labels", "channels"):
+        (out / folder).mkdir()
+    street(out, 1004, 2)
+    return out
+
+
+def test_streets_of_training_have_every_class_and_no_two_are_alike() -> None:
+    labels = []
+    for seed in (3, 4):
+        layout = lay_out(30.0, seed)
+        some = varied(layout, 30.0)
+        assert not layout.more and not layout.walks
+        scene = Scene(some)
+        labels.append(np.bincount(scene.surface.label, minlength=256))
+        world = scene.truth_mesh().label
+        assert world is not None and CODE["person"] not in world, "people are no part of a world"
+    found = {name for name in CLASSES if name != "sky" and sum(labels)[CODE[name]] > 0}
+    assert found == set(CLASSES) - {"sky"}
+    assert (labels[0] != labels[1]).any()
+
+
+def test_a_street_is_the_same_each_time_its_things_are_made() -> None:
+    layout = varied(lay_out(20.0, 5), 20.0)
+    again = varied(lay_out(20.0, 5), 20.0)
+    for a, b in zip(layout.more, again.more, strict=True):
+        assert replace(a, make=b.make) == b
+        np.testing.assert_array_equal(a.make().vertices, a.make().vertices)
+        np.testing.assert_array_equal(a.make().seed, b.make().seed)
+
+
+def test_channels_show_what_the_labels_show(made: Path) -> None:
+    for image, label in pairs(made):
+        codes = cv2.imread(str(label), cv2.IMREAD_GRAYSCALE)
+        channels = read_channels(image, codes.shape)
+        assert channels.shape == (codes.shape[0] // FRACTION, codes.shape[1] // FRACTION, 4)
+        coarse = codes[FRACTION // 2 :: FRACTION, FRACTION // 2 :: FRACTION]
+        there = channels[..., 3] == 255
+        assert (channels[~there] == 0).all()
+        assert there[coarse == 0].mean() < 0.1, "the sky is nowhere"
+        ground = there & np.isin(coarse, [CODE[name] for name in ("road", "sidewalk")])
+        if ground.sum() > 50:
+            assert np.median(channels[ground][:, 2]) > 240, "level"
+            assert abs(np.median(channels[ground][:, 0].astype(float)) - 128) < 25, "within 17 cm of the level"
