@@ -9,8 +9,10 @@
 - network: the project's own on one photo of 1536 x 1024, by onnxruntime and by torch, turn by turn on the same cores:
   network_ratio is the first's time by the second's, network_same the share of pixels with the same class.
 - mesh: distance of the truth to the meshes made by true classes and by those told (the first street).
-- semkitti: shape alone on a labelled sweep (one; no photo). kitti: pixels against polygons drawn on ten photos of two
-  streets; kitti_miou is the mean over the classes that were drawn.
+- semkitti: shape alone on a labelled sweep (one; no photo).
+- kitti: pixels against polygons drawn on ten photos of two streets, means over the classes that were drawn: kitti_miou
+  with what the scan tells, kitti_photo_miou of the photos alone, kitti_carried_miou where the points' classes are
+  carried back into the photos (`segmentation_kitti.py`).
 
 Ends with `RESULT {json}`; null where a part was left out.
 """
@@ -28,12 +30,13 @@ from typing import Any
 import numpy as np
 
 from bench.measure import measure
+from bench.segmentation_kitti import kitti, mean
+from bench.street import STREETS as STREETS_OF_KITTI
 from scan2sim.pipeline.classes import CODE
 from scan2sim.segmentation.score import MEAN_OF, Confusion, confusion
 
 ROOT = Path(__file__).resolve().parent.parent
 DATA = ROOT.parent / "shared" / "data"
-POLYGONS = ROOT / "tests" / "segmentation" / "kitti_polygons.json"
 STREETS = (901, 902, 903)
 SEMKITTI = {
     40: "road", 44: "road", 60: "road", 48: "sidewalk", 49: "sidewalk", 72: "terrain", 50: "building",
@@ -41,12 +44,11 @@ SEMKITTI = {
     10: "vehicle", 11: "vehicle", 13: "vehicle", 15: "vehicle", 18: "vehicle", 20: "vehicle", 252: "vehicle",
     30: "person", 254: "person",
 }  # fmt: skip
-KITTI = {
-    "kitti_raw0009_f00-24": ("image_02/data", (721.5, 609.6, 172.9)),
-    "kitti_odo04_f00-24": ("image_2", (707.1, 601.9, 183.1)),
-}
-"""Real streets: where their photos are, and the camera's focal length and centre, pixels."""
 PARTS = ("streets", "time", "network", "kitti", "semkitti", "mesh")
+FIGURES = (
+    "point_miou", "sign_iou", "geometry_miou", "minutes_9m", "network_ratio", "network_same", "kitti_miou",
+    "kitti_photo_miou", "kitti_carried_miou",
+)  # fmt: skip
 
 
 def scan2sim(*arguments: object) -> float:
@@ -176,48 +178,6 @@ def semkitti() -> Confusion:
     return found
 
 
-def kitti(pictures: Path) -> Confusion:
-    """The shipped network's pixels on ten photos, against polygons; overlays of every fifth photo in `pictures`."""
-    import cv2
-
-    from scan2sim.pipeline.classes import colour_of
-    from scan2sim.pipeline.io import image
-    from scan2sim.pipeline.types import Camera
-    from scan2sim.segmentation.backends import load
-    from scan2sim.segmentation.labels import CLASSES, code_of_index
-    from scan2sim.segmentation.photos import Labeller, labels_of
-
-    labeller = Labeller(load("street", None), "street")
-    truth = json.loads(POLYGONS.read_text(encoding="utf-8"))["photos"]
-    known, found = [], []
-    pictures.mkdir(parents=True, exist_ok=True)
-    colours = colour_of()
-    colours[0] = (135, 190, 230)
-    photos = [(path, of) for street, (part, of) in KITTI.items() for path in sorted((DATA / street).rglob(f"{part}/*"))]
-    for i, (path, (focal, cx, cy)) in enumerate(photos):
-        if path.name not in truth and i % 5:
-            continue
-        rgb = image.read_rgb(path)
-        assert rgb is not None
-        h, w = rgb.shape[:2]
-        camera = Camera("pinhole", w, h, focal, focal, cx, cy)
-        best, _ = labels_of(labeller.probabilities(rgb, camera), (h, w))
-        image.write(pictures / f"{path.stem}.png", (0.5 * rgb + 0.5 * colours[code_of_index()[best]]).astype(np.uint8))
-        if path.name in truth:
-            drawn = np.full((h, w), 255, np.uint8)
-            for polygon in truth[path.name]["polygons"]:
-                points = np.array(polygon["points"], np.float64).round().astype(np.int32)
-                cv2.fillPoly(drawn, [points], CLASSES.index(polygon["class"]))
-            some = drawn != 255
-            known.append(drawn[some])
-            found.append(best[some])
-    codes = code_of_index()
-    codes[CLASSES.index("sky")] = 200
-    result = confusion(codes[np.concatenate(known)], codes[np.concatenate(found)])
-    print(f"\nKITTI pixels (200 is sky): mIoU {np.mean(list(result.iou.values())):.3f}\n{result.table()}", flush=True)
-    return result
-
-
 def there(name: str) -> bool:
     """Whether there is such data; says so where there is none."""
     found = (DATA / name).is_dir()
@@ -234,8 +194,7 @@ def main() -> None:
     arguments = parser.parse_args()
     out: Path = arguments.out
     out.mkdir(parents=True, exist_ok=True)
-    figures = ("point_miou", "sign_iou", "geometry_miou", "minutes_9m", "network_ratio", "network_same", "kitti_miou")
-    result: dict[str, Any] = dict.fromkeys(figures)
+    result: dict[str, Any] = dict.fromkeys(FIGURES)
     print(f"mean over {', '.join(MEAN_OF)}")
     if "streets" in arguments.parts:
         result |= streets(out)
@@ -247,8 +206,9 @@ def main() -> None:
         mesh(out)
     if "semkitti" in arguments.parts and there("semkitti"):
         semkitti()
-    if "kitti" in arguments.parts and all(there(street) for street in KITTI):
-        result["kitti_miou"] = float(np.mean(list(kitti(out / "overlays").iou.values())))
+    if "kitti" in arguments.parts and all(there(street.data.name) for street in STREETS_OF_KITTI.values()):
+        found = {way: mean(one) for way, one in kitti(out / "kitti").items()}
+        result |= {f"kitti_{way}_miou": found[way] for way in ("photo", "carried")} | {"kitti_miou": found["scan"]}
     print("RESULT " + json.dumps({k: None if v is None else round(v, 3) for k, v in result.items()}))
 
 

@@ -261,11 +261,12 @@ def segment_train(
     minutes: Annotated[float, typer.Option(help="At most; 0: no limit.")] = 0,
     steps: Annotated[int, typer.Option(help="Of the optimiser.")] = 3000,
     seed: Annotated[int, typer.Option(help="Of weights, crops and looks.")] = 0,
+    start: Annotated[Path | None, typer.Option(help="Weights (safetensors) to go on from.")] = None,
 ) -> None:
     """Train the project's own network on labelled photos."""
     from scan2sim.flows.segment import train_network
 
-    train_network(folder, out, minutes=minutes, steps=steps, seed=seed)
+    train_network(folder, out, minutes=minutes, steps=steps, seed=seed, start=start)
 
 
 @segments.command("evaluate")

@@ -129,11 +129,12 @@ def _write_pictures(views: Path, labels: Path, out: Path) -> None:
             image.write(out / "masks" / name, np.where(away[best], 0, 255).astype(np.uint8))
 
 
-def train_network(folder: Path, weights: Path, *, minutes: float, steps: int, seed: int) -> None:
+def train_network(folder: Path, weights: Path, *, minutes: float, steps: int, seed: int, start: Path | None) -> None:
     """Train the project's own network on a folder of labelled photos, and write its weights.
 
     Args:
         weights: an ONNX file; what torch reads lies beside it then.
+        start: weights (safetensors) to go on from.
 
     Raises:
         SettingError: the file's name ends otherwise.
@@ -145,7 +146,7 @@ def train_network(folder: Path, weights: Path, *, minutes: float, steps: int, se
     from scan2sim.segmentation.backends.street import save
     from scan2sim.segmentation.train import Recipe, train
 
-    recipe_ = Recipe(steps=steps, minutes=minutes, seed=seed)
+    recipe_ = Recipe(steps=steps, minutes=minutes, seed=seed, start=start)
     with progress("training") as report:
         trained = train(folder, recipe_, report)
     save(trained.network, weights, {"recipe": str(recipe_), "iou": trained.iou})
@@ -162,11 +163,11 @@ def evaluate(path: Path, out: Path, settings: Settings) -> None:
 
 
 def _pixels(folder: Path, settings: Settings) -> dict[str, float]:
-    """Intersection over union of a network's pixels, by class; photos taken as they are."""
+    """Intersection over union of a network's pixels, by class; photos taken as they are, with channels if there are."""
     from scan2sim.pipeline.types import Camera
     from scan2sim.segmentation.backends import load
     from scan2sim.segmentation.label import LABEL
-    from scan2sim.segmentation.labelled import pairs, read
+    from scan2sim.segmentation.labelled import pairs, read, read_channels
     from scan2sim.segmentation.labels import CLASSES, IGNORED, code_of_index
     from scan2sim.segmentation.photos import Labeller, labels_of
 
@@ -175,10 +176,11 @@ def _pixels(folder: Path, settings: Settings) -> dict[str, float]:
     labeller = Labeller(network, str(given.weights or network.facts.name))
     resolution = network.facts.pixels_a_radian or 1.0
     known, told = [], []
-    for rgb, truth in (read(*pair) for pair in pairs(folder)):
+    for pair in pairs(folder):
+        rgb, truth = read(*pair)
         h, w = truth.shape
         camera = Camera("pinhole", w, h, resolution, resolution, (w - 1) / 2, (h - 1) / 2)
-        best, _ = labels_of(labeller.probabilities(rgb, camera), (h, w))
+        best, _ = labels_of(labeller.probabilities(rgb, camera, read_channels(pair[0], (h, w))), (h, w))
         some = truth != IGNORED
         known.append(truth[some])
         told.append(best[some])

@@ -25,12 +25,17 @@ def oriented_normals(cloud: PointCloud, neighbours: int, path: Trajectory | None
     """
     if len(cloud) < 3:
         return replace(cloud, normal=np.tile(np.array([0, 0, 1], np.float32), (len(cloud), 1)))
-    points = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.xyz.astype(np.float64)))
-    points.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(min(neighbours, len(cloud))))
-    normal = np.asarray(points.normals).astype(np.float32)
+    normal = normals(cloud.xyz, neighbours)
     toward = _away_from_mass(cloud.xyz, normal) if path is None else _scanner(cloud, path) - cloud.xyz
     normal[np.einsum("ij,ij->i", normal, toward) < 0] *= -1
     return replace(cloud, normal=normal)
+
+
+def normals(xyz: F32, neighbours: int) -> F32:
+    """Unit normals (N, 3) of points (N, 3), three at least, of either sign."""
+    points = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(xyz.astype(np.float64)))
+    points.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(min(neighbours, len(xyz))))
+    return np.asarray(points.normals).astype(np.float32)
 
 
 def _scanner(cloud: PointCloud, path: Trajectory) -> F64:

@@ -5,11 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from scan2sim.pipeline.ranges import Device, File, Name, Share
+from scan2sim.pipeline.ranges import Device, File, Name, Share, Voxel
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
-    from scan2sim.pipeline.types import U8
+    from scan2sim.pipeline.types import U8, PointCloud
+    from scan2sim.segmentation.drawn import Drawn
+
+FEW = 30
+"""Points, fewer tell nothing."""
 
 
 class LabelParams(Params):
@@ -19,6 +23,7 @@ class LabelParams(Params):
         network: "street", the project's own; "segformer" or "onnx", with the user's weights.
         weights: file or folder of the weights; default: those that come with the project (of "street").
         device: "cpu", or "cuda" by torch or onnxruntime; "auto": a GPU where they have one.
+        size: metres of the voxels that the cloud is drawn into photos by, for networks that ask for it.
         overwrite, min_classified, photos: as of `segment`, set by the recipe: photos are not looked at where the
             cloud keeps its own classes, or where they aren't asked.
     """
@@ -26,13 +31,14 @@ class LabelParams(Params):
     network: Name = "street"
     weights: File | None = None
     device: Device = "auto"
+    size: Voxel = 0.1
     overwrite: bool = False
     min_classified: Share = 0.2
     photos: bool = True
 
 
 def label(inputs: Inputs, params: LabelParams, out: Path, report: Report) -> Done:
-    """Look at every photo of `views`, unless `cloud` has classes that are kept.
+    """Look at every photo of `views`, with `cloud` beside it, unless that has classes that are kept.
 
     Folder: `labels`, with `<view index>.npy`: (h, w, C) uint8 probabilities by class of `segmentation.labels`, and
     `network.json`: what is known of the network.
@@ -50,21 +56,24 @@ def label(inputs: Inputs, params: LabelParams, out: Path, report: Report) -> Don
     folder = out / "labels"
     folder.mkdir()
     views = views_io.load(inputs["views"])
-    kept = not params.overwrite and classified(PointCloud.load(inputs["cloud"]).label) >= params.min_classified
+    cloud = PointCloud.load(inputs["cloud"])
+    kept = not params.overwrite and classified(cloud.label) >= params.min_classified
     if kept or not views or not params.photos:
         return Done({"labels": folder}, {"photos": 0, "why": "the cloud has classes" if kept else "none is asked"})
     network = load(params.network, params.weights, params.device)
     labeller = Labeller(network, str(params.weights or network.facts.name))
+    scan = scanned(cloud, params.size, report) if labeller.takes_channels else None
     warnings = []
     for i, view in enumerate(views):
-        report(i / len(views), view.name)
+        report(0.2 + 0.8 * i / len(views), view.name)
         if view.camera.model == "orthographic":  # networks know streets from the street
             continue
         rgb = image.read_rgb(view.photo)
         if rgb is None or rgb.shape[:2] != (view.camera.height, view.camera.width):
             warnings.append(f"{view.photo} can't be read or is not of its camera's size: it tells no classes")
             continue
-        np.save(folder / f"{i}.npy", labeller.probabilities(rgb, view.camera))
+        channels = scan.into(view, labeller.size(view.camera)) if scan else None
+        np.save(folder / f"{i}.npy", labeller.probabilities(rgb, view.camera, channels))
     facts = network.facts
     told = {"network": facts.name, "sha256": facts.sha256, "licence": facts.licence, "tells": labeller.tells}
     (folder / "network.json").write_text(json.dumps(told, indent=1), encoding="utf-8")
@@ -73,6 +82,16 @@ def label(inputs: Inputs, params: LabelParams, out: Path, report: Report) -> Don
         {"photos": len(views) - len(warnings), **told},
         warnings,
     )
+
+
+def scanned(cloud: PointCloud, size: float, report: Report) -> Drawn | None:
+    """The cloud, to be drawn into photos; None if it has hardly any points."""
+    from scan2sim.pipeline.steps.voxel import sample
+    from scan2sim.segmentation.drawn import Drawn
+
+    report(0.0, "thinning")
+    thin = sample(cloud, size)
+    return Drawn(thin, size) if len(thin) >= FEW else None
 
 
 def classified(label: U8 | None) -> float:
@@ -96,4 +115,4 @@ def can_label(params: LabelParams) -> None:
         check(params.network, params.weights)
 
 
-LABEL = Step("label", 3, label, LabelParams, check=can_label)
+LABEL = Step("label", 4, label, LabelParams, check=can_label)

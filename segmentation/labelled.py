@@ -1,6 +1,7 @@
 """Labelled photos, to learn from and to check with: `images/*.jpg` (or png) and `labels/*.png` of the same names.
 
-Labels are LAS class codes a pixel (0 sky, 255 not to be learnt), as `data_samples.training` writes them.
+Labels are LAS class codes a pixel (0 sky, 255 not to be learnt), as `data_samples.training` writes them. What a scan
+tells of the same pixels may lie in `channels/*.png`, as `pipeline.channels` codes it.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from scan2sim.pipeline.channels import COUNT, FRACTION
 from scan2sim.pipeline.errors import DataError
 from scan2sim.pipeline.types import U8
 from scan2sim.segmentation.labels import index_of_code
@@ -53,3 +55,21 @@ def read(image: Path, label: Path) -> tuple[U8, U8]:
     if bgr is None or codes is None or bgr.shape[:2] != codes.shape:
         raise DataError(label, "and its image can't be read, or differ in size", "Make them again")
     return np.asarray(bgr[..., ::-1], np.uint8), index_of_code()[codes]
+
+
+def read_channels(image: Path, size: tuple[int, int]) -> U8:
+    """(h, w, 4) channels beside a photo of `size` (H, W) pixels; nothing in them where it has none.
+
+    Raises:
+        DataError: they can't be read, or aren't a `FRACTION`-th of the photo's size.
+    """
+    import cv2
+
+    small = round(size[0] / FRACTION), round(size[1] / FRACTION)
+    path = image.parent.parent / "channels" / f"{image.stem}.png"
+    if not path.is_file():
+        return np.zeros((*small, COUNT), np.uint8)
+    codes = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if codes is None or codes.shape != (*small, COUNT):
+        raise DataError(path, f"is no picture of {COUNT} channels, {small[1]} x {small[0]} pixels", "Make it again")
+    return np.asarray(codes, np.uint8)

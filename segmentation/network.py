@@ -11,9 +11,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from scan2sim.pipeline.channels import COUNT
+
 PIXELS_A_RADIAN = 500.0
 """Angular resolution at which photos are looked at."""
 MEAN, SPREAD = (0.42, 0.43, 0.42), (0.25, 0.25, 0.26)
+CODE_MEAN, CODE_SPREAD = 0.55, 0.15
+"""Of the codes of `pipeline.channels`, 1 for 255."""
 
 
 class _Convolution(nn.Sequential):
@@ -54,7 +58,7 @@ class _Merge(nn.Module):
 
 
 class StreetNet(nn.Module):
-    """(B, 3, H, W) colours in [0, 1] to (B, classes, H / 4, W / 4) logits.
+    """(B, 3 + 4, H, W) colours and `pipeline.channels` in [0, 1] to (B, classes, H / 4, W / 4) logits.
 
     Args:
         classes: number of them.
@@ -68,7 +72,7 @@ class StreetNet(nn.Module):
         self.spread: Tensor
         self.register_buffer("mean", torch.tensor(MEAN)[:, None, None], persistent=False)
         self.register_buffer("spread", torch.tensor(SPREAD)[:, None, None], persistent=False)
-        self.stem = _Convolution(3, widths[0], 3, 2)
+        self.stem = _Convolution(3 + COUNT, widths[0], 3, 2)
         self.stages = nn.ModuleList(
             nn.Sequential(_Residual(i, o, 2, 3), *(_Residual(o, o, 1, kernel) for _ in range(depth)))
             for i, o, depth, kernel in zip(widths[:-1], widths[1:], (0, 2, 4, 3), (3, 3, 5, 5), strict=True)
@@ -78,8 +82,10 @@ class StreetNet(nn.Module):
         self.merges = nn.ModuleList(_Merge(w, pyramid) for w in widths[-2:0:-1])
         self.head = nn.Sequential(nn.Dropout2d(0.1), nn.Conv2d(pyramid, classes, 1))
 
-    def forward(self, rgb: Tensor) -> Tensor:
-        x = self.stem((rgb - self.mean) / self.spread)
+    def forward(self, seen: Tensor) -> Tensor:
+        rgb, codes, there = seen[:, :3], seen[:, 3:-1], seen[:, -1:]
+        codes = (codes - CODE_MEAN) / CODE_SPREAD * there
+        x = self.stem(torch.cat([(rgb - self.mean) / self.spread, codes, there], dim=1))
         levels = []
         for stage in self.stages:
             x = stage(x)

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from scan2sim.pipeline.channels import COUNT
 from scan2sim.pipeline.types import F32, U8, Camera
 from scan2sim.segmentation.backends import Network
 from scan2sim.segmentation.labels import CLASSES, IGNORED, mapped
@@ -30,6 +31,7 @@ class Labeller:
         where: its weights' file, for messages.
 
     Attributes:
+        takes_channels: whether it asks for what a scan tells of a photo's pixels, too.
         tile: pixels of a tile's side; made smaller when a device runs out of memory.
     """
 
@@ -39,21 +41,26 @@ class Labeller:
         self._merge = np.zeros((len(CLASSES), len(to)), np.float32)
         self._merge[to[to != IGNORED], np.flatnonzero(to != IGNORED)] = 1
         self.tells = tuple(name for name, row in zip(CLASSES, self._merge, strict=True) if row.any())
+        self.takes_channels = network.facts.channels
         self.tile = TILE
 
-    def probabilities(self, rgb: U8, camera: Camera) -> U8:
+    def probabilities(self, rgb: U8, camera: Camera, channels: U8 | None = None) -> U8:
         """(h, w, C) uint8, 255 for 1, by class of `CLASSES`, at about a `STRIDE`-th of the pixels looked at.
 
         Args:
             rgb: (H, W, 3) of the whole photo.
             camera: its intrinsics.
+            channels: (h, w, 4) of the same photo, as `pipeline.channels`; None where there is no scan.
         """
         import cv2
 
         wide = camera.model == "equirectangular"
-        factor = self._factor(camera)
-        size = (max(32, round(camera.width * factor)), max(32, round(camera.height * factor)))
-        image = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA if factor < 1 else cv2.INTER_LINEAR)
+        size = self.size(camera)
+        image = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA if size[0] < camera.width else cv2.INTER_LINEAR)
+        if self.takes_channels:
+            if channels is None:
+                channels = np.zeros((1, 1, COUNT), np.uint8)
+            image = np.concatenate([image, cv2.resize(channels, size, interpolation=cv2.INTER_NEAREST)], axis=2)
         margin = OVERLAP if wide else 0
         if wide:  # the seam is no special place
             image = np.concatenate([image[:, -margin:], image, image[:, :margin]], axis=1)
@@ -61,13 +68,13 @@ class Labeller:
         cut = margin // STRIDE
         return whole[:, cut : whole.shape[1] - cut] if wide else whole
 
-    def _factor(self, camera: Camera) -> float:
-        """By which a photo is resized."""
-        wanted = self._network.facts.pixels_a_radian
-        if wanted is None:
-            return 1.0
-        has = camera.width / (2 * math.pi) if camera.model == "equirectangular" else min(camera.fx, camera.fy)
-        return min(wanted / has, ENLARGED)
+    def size(self, camera: Camera) -> tuple[int, int]:
+        """Width and height in which a photo is looked at."""
+        wanted, factor = self._network.facts.pixels_a_radian, 1.0
+        if wanted is not None:
+            has = camera.width / (2 * math.pi) if camera.model == "equirectangular" else min(camera.fx, camera.fy)
+            factor = min(wanted / has, ENLARGED)
+        return max(32, round(camera.width * factor)), max(32, round(camera.height * factor))
 
     def _in_tiles(self, image: U8) -> U8:
         height, width = image.shape[:2]

@@ -17,9 +17,11 @@ import numpy.typing as npt
 import torch
 import torch.nn.functional as F
 
+from scan2sim.pipeline.channels import COUNT
 from scan2sim.pipeline.step import Report, silent
-from scan2sim.pipeline.types import F32, U8
-from scan2sim.segmentation.labelled import pairs, read, split
+from scan2sim.pipeline.types import F32
+from scan2sim.segmentation.augment import seen_anew
+from scan2sim.segmentation.labelled import pairs, read, read_channels, split
 from scan2sim.segmentation.labels import CLASSES, IGNORED, index_of_code
 from scan2sim.segmentation.network import StreetNet
 
@@ -40,15 +42,17 @@ class Recipe:
         held_out: share of the streets (the names' first part) that figures are told from.
         minutes: at most; the cycle is shortened to fit, 0: no limit.
         seed: of weights, crops and looks.
+        start: weights (safetensors) to go on from; None: from nothing.
     """
 
     steps: int = 3000
     batch: int = 8
-    crop: tuple[int, int] = (288, 384)
+    crop: tuple[int, int] = (256, 416)
     rate: float = 3e-3
     held_out: float = 0.05
     minutes: float = 0
     seed: int = 0
+    start: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -65,6 +69,8 @@ def train(folder: Path, recipe: Recipe, report: Report = silent) -> Trained:
     rng = np.random.default_rng(recipe.seed)
     learn, check = split(pairs(folder), recipe.held_out)
     network = StreetNet(len(CLASSES))
+    if recipe.start is not None:
+        network.load_state_dict(_widened(recipe.start), strict=False)
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     weight = class_weights([label for _, label in learn])
     optimiser = torch.optim.AdamW(network.parameters(), recipe.rate, weight_decay=1e-2)
@@ -78,10 +84,10 @@ def train(folder: Path, recipe: Recipe, report: Report = silent) -> Trained:
         for group in optimiser.param_groups:
             group["lr"] = recipe.rate * _one_cycle(done)
         some = [learn[i] for i in rng.integers(0, len(learn), recipe.batch)]
-        views = [seen_anew(*read(*pair), recipe.crop, rng) for pair in some]
-        rgb = torch.from_numpy(np.stack([image for image, _ in views])).permute(0, 3, 1, 2)
+        views = [_seen(pair, recipe.crop, rng) for pair in some]
+        seen = torch.from_numpy(np.stack([image for image, _ in views])).permute(0, 3, 1, 2)
         truth = torch.from_numpy(np.stack([label for _, label in views]))
-        logits = network(rgb.contiguous(memory_format=torch.channels_last))
+        logits = network(seen.contiguous(memory_format=torch.channels_last))
         loss = F.cross_entropy(
             F.interpolate(logits, scale_factor=2, mode="bilinear"), truth[:, 1::2, 1::2], weight, ignore_index=IGNORED
         )
@@ -96,6 +102,22 @@ def train(folder: Path, recipe: Recipe, report: Report = silent) -> Trained:
     assert isinstance(best, StreetNet)
     best.eval()
     return Trained(best, evaluate(best, check) if check else {})
+
+
+def _seen(pair: tuple[Path, Path], crop: tuple[int, int], rng: np.random.Generator) -> tuple[F32, Ints]:
+    rgb, label = read(*pair)
+    return seen_anew(rgb, label, read_channels(pair[0], label.shape), crop, rng)
+
+
+def _widened(path: Path) -> dict[str, torch.Tensor]:
+    """Weights of a `StreetNet`; of one that took colours alone, with zeros for the other channels."""
+    from safetensors.torch import load_file
+
+    state = {name: value.float() for name, value in load_file(str(path)).items()}
+    first = state["stem.0.weight"]
+    lacking = 3 + COUNT - first.shape[1]
+    state["stem.0.weight"] = torch.cat([first, first.new_zeros(len(first), lacking, *first.shape[2:])], dim=1)
+    return state
 
 
 def _averaged(mean: torch.Tensor, new: torch.Tensor, n: torch.Tensor | int) -> torch.Tensor:
@@ -116,56 +138,22 @@ def class_weights(labels: Sequence[Path]) -> torch.Tensor:
     for label in labels[:: max(1, len(labels) // 100)]:
         count += np.bincount(index_of_code()[cv2.imread(str(label), cv2.IMREAD_GRAYSCALE)].ravel(), minlength=256)
     share = count[: len(CLASSES)] / count[: len(CLASSES)].sum()
-    weight = np.where(share > 0, 1 / np.sqrt(np.maximum(share, 2e-3)), 0)
+    weight = np.where(share > 0, 1 / np.sqrt(np.maximum(share, 4e-3)), 0)
     return torch.tensor(weight / weight[weight > 0].mean(), dtype=torch.float32)
-
-
-def seen_anew(rgb: U8, label: U8, crop: tuple[int, int], rng: np.random.Generator) -> tuple[F32, Ints]:
-    """A part of a photo as another camera might have taken it on another day: (h, w, 3) in [0, 1], (h, w)."""
-    import cv2
-
-    scale = float(np.exp(rng.uniform(np.log(0.7), np.log(1.5))))
-    h, w = crop
-    need_h, need_w = min(rgb.shape[0], math.ceil(h / scale)), min(rgb.shape[1], math.ceil(w / scale))
-    top, left = rng.integers(0, rgb.shape[0] - need_h + 1), rng.integers(0, rgb.shape[1] - need_w + 1)
-    part = rgb[top : top + need_h, left : left + need_w]
-    codes = label[top : top + need_h, left : left + need_w]
-    image = cv2.resize(part, (w, h), interpolation=cv2.INTER_LINEAR if scale > 1 else cv2.INTER_AREA)
-    truth = cv2.resize(codes, (w, h), interpolation=cv2.INTER_NEAREST)
-    if rng.random() < 0.5:
-        image, truth = image[:, ::-1], truth[:, ::-1]
-    return looks(image, rng), np.ascontiguousarray(truth, np.int64)
-
-
-def looks(image: U8, rng: np.random.Generator) -> F32:
-    """Other light, white balance, contrast, sharpness, noise and compression: (h, w, 3) in [0, 1]."""
-    import cv2
-
-    x = np.ascontiguousarray(image).astype(np.float32) / 255
-    if rng.random() < 0.3:
-        x = cv2.GaussianBlur(x, (0, 0), float(rng.uniform(0.3, 1.5)))
-    x = x ** np.float32(np.exp(rng.uniform(-0.5, 0.5)))
-    x = x * np.exp(rng.normal(0, 0.08, 3) + rng.normal(0, 0.25)).astype(np.float32)
-    grey = x.mean(axis=2, keepdims=True)
-    x = grey + (x - grey) * np.float32(rng.uniform(0.3, 1.5))
-    x = 0.5 + (x - 0.5) * np.float32(rng.uniform(0.7, 1.4))
-    if rng.random() < 0.5:
-        x += rng.normal(0, rng.uniform(0, 0.04), x.shape).astype(np.float32)
-    x = np.clip(x, 0, 1)
-    if rng.random() < 0.3:
-        quality = [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(30, 90))]
-        x = cv2.imdecode(cv2.imencode(".jpg", (x * 255).astype(np.uint8), quality)[1], -1).astype(np.float32) / 255
-    return np.ascontiguousarray(x, np.float32)
 
 
 @torch.inference_mode()
 def evaluate(network: StreetNet, check: Sequence[tuple[Path, Path]]) -> dict[str, float]:
     """Intersection over union of the pixels, by class."""
+    import cv2
+
     n = len(CLASSES)
     confusion = np.zeros((n, n), np.int64)
     for pair in check:
         rgb, truth = read(*pair)
-        logits = network(torch.from_numpy(rgb.astype(np.float32) / 255).permute(2, 0, 1)[None])
+        codes = cv2.resize(read_channels(pair[0], truth.shape), truth.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        seen = np.concatenate([rgb, codes], axis=2).astype(np.float32) / 255
+        logits = network(torch.from_numpy(seen).permute(2, 0, 1)[None])
         found = F.interpolate(logits, size=truth.shape, mode="bilinear")[0].argmax(dim=0).numpy()
         told = truth != IGNORED
         confusion += np.bincount(truth[told].astype(np.int64) * n + found[told], minlength=n * n).reshape(n, n)

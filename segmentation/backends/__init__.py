@@ -29,6 +29,7 @@ class Facts:
         sha256: of the weights' file.
         licence: of the weights, as far as the file tells.
         pixels_a_radian: angular resolution that photos should be resampled to; None: as they are.
+        channels: whether it takes those of `pipeline.channels`, too.
     """
 
     name: str
@@ -36,6 +37,7 @@ class Facts:
     sha256: str
     licence: str
     pixels_a_radian: float | None
+    channels: bool = False
 
 
 class Network(Protocol):
@@ -43,8 +45,11 @@ class Network(Protocol):
 
     facts: Facts
 
-    def probabilities(self, rgb: U8) -> F32:
+    def probabilities(self, seen: U8) -> F32:
         """(C, h, w) float32 that sum to 1 over the labels, for (H, W, 3) uint8; h, w may be a fraction of H, W.
+
+        Args:
+            seen: colours; for a network that takes `channels` (H, W, 7), with them, 0 where nothing is known.
 
         Raises:
             MemoryError: the photo doesn't fit on the device; smaller tiles may.

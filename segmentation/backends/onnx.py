@@ -3,7 +3,8 @@
 The file has one input, (1, 3, H, W) float RGB, and one output, (1, C, h, w) logits or probabilities. Its
 `metadata_props` may tell, as JSON: "labels", names of the C channels in order (else `<name>.labels.txt` beside it, one
 a line); "mean" and "std" that the input, 1 for white, is normalised with (else ImageNet's); "pixels_a_radian", the
-angular resolution that photos are resampled to (else they are taken as they are). "license" is told on.
+angular resolution that photos are resampled to (else they are taken as they are); "channels", true if the input is
+(1, 7, H, W), with those of `pipeline.channels` from 0 to 1 after the colours. "license" is told on.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from scan2sim.pipeline import extras
+from scan2sim.pipeline.channels import COUNT
 from scan2sim.pipeline.errors import InputError, SettingError
 from scan2sim.pipeline.types import F32, U8
 from scan2sim.segmentation.backends import Facts
@@ -53,14 +55,15 @@ class Network:
             names = ", ".join(value.name for value in [*inputs, *outputs])
             raise InputError(path, f"has {len(inputs)} inputs and {len(outputs)} outputs ({names})", REMEDY)
         (given,), (got,) = inputs, outputs
+        meta = self._session.get_modelmeta().custom_metadata_map
+        more = bool(_json(meta.get("channels"), False))
         wanted, told = _sizes(given.shape), _sizes(got.shape)
-        fits = len(wanted) == 4 and wanted[0] in (1, None) and wanted[1] in (3, None)
+        fits = len(wanted) == 4 and wanted[0] in (1, None) and wanted[1] in (3 + COUNT * more, None)
         if given.type not in FLOATS or not fits:
             raise InputError(path, f"takes {given.type} of {given.shape}", REMEDY)
         if got.type not in FLOATS or (got.shape and len(told) != 4):
             raise InputError(path, f"gives {got.type} of {got.shape}", REMEDY)
         self._input, self._type, self._size = given.name, FLOATS[given.type], wanted[2:]
-        meta = self._session.get_modelmeta().custom_metadata_map
         labels = _labels(path, meta)
         if got.shape and told[1] not in (None, len(labels)):
             raise InputError(path, f"gives {told[1]} channels, but {len(labels)} labels are named", "Name one each")
@@ -73,9 +76,9 @@ class Network:
         licence = meta.get("license") or "not told"
         told = _json(meta.get("pixels_a_radian"), None)
         resolution = None if told is None else float(numbers([told], 1, path)[0])
-        self.facts = Facts(f"{backend} ({path.name})", labels, digest.hexdigest(), licence, resolution)
+        self.facts = Facts(f"{backend} ({path.name})", labels, digest.hexdigest(), licence, resolution, more)
 
-    def probabilities(self, rgb: U8) -> F32:
+    def probabilities(self, seen: U8) -> F32:
         """See `segmentation.backends.Network`.
 
         Raises:
@@ -83,11 +86,12 @@ class Network:
         """
         import cv2
 
-        height, width = (fixed or own for fixed, own in zip(self._size, rgb.shape[:2], strict=True))
-        if (height, width) != rgb.shape[:2]:
-            smaller = height * width < rgb.shape[0] * rgb.shape[1]
-            rgb = cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)
-        x = (rgb.astype(np.float32) / 255 - self._mean) / self._std
+        height, width = (fixed or own for fixed, own in zip(self._size, seen.shape[:2], strict=True))
+        if (height, width) != seen.shape[:2]:
+            smaller = height * width < seen.shape[0] * seen.shape[1]
+            seen = cv2.resize(seen, (width, height), interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)
+        x = seen.astype(np.float32) / 255
+        x[..., :3] = (x[..., :3] - self._mean) / self._std
         try:
             (out,) = self._session.run(None, {self._input: x.transpose(2, 0, 1)[None].astype(self._type)})
         except Exception as error:  # onnxruntime's errors have no kind in common

@@ -55,18 +55,18 @@ class Network:
         name, digest = (path if path.is_dir() else file).name, hashlib.sha256(file.read_bytes()).hexdigest()
         self.facts = Facts(f"segformer ({name})", labels, digest, _licence(config, file.with_name("README.md")), None)
 
-    def probabilities(self, rgb: U8) -> F32:
+    def probabilities(self, seen: U8) -> F32:
         """See `segmentation.backends.Network`."""
         import torch
         from torch.nn.functional import interpolate
 
         with torch.inference_mode():
             try:
-                x = torch.from_numpy(np.ascontiguousarray(rgb)).to(self._device).permute(2, 0, 1)[None].float()
+                x = torch.from_numpy(np.ascontiguousarray(seen)).to(self._device).permute(2, 0, 1)[None].float()
                 mean, std = (torch.from_numpy(v).to(self._device)[:, None, None] for v in (self._mean, self._std))
                 x = (x * self._scale - mean) / std
-                if min(rgb.shape[:2]) < SMALLEST:
-                    x = interpolate(x, [max(n, SMALLEST) for n in rgb.shape[:2]], mode="bilinear")
+                if min(seen.shape[:2]) < SMALLEST:
+                    x = interpolate(x, [max(n, SMALLEST) for n in seen.shape[:2]], mode="bilinear")
                 with torch.autocast("cuda", torch.float16, enabled=self._device.startswith("cuda")):
                     logits = self._net(x).logits
                 return np.asarray(logits[0].float().softmax(dim=0).cpu().numpy(), np.float32)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from scan2sim.pipeline import extras
+from scan2sim.pipeline.channels import COUNT
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.types import F32, U8
 from scan2sim.segmentation.backends import Facts, onnx, torch_device
@@ -80,12 +81,13 @@ def _export(network: StreetNet, path: Path, facts: dict[str, Any]) -> None:
     with warnings.catch_warnings():  # the exporter that replaces this one needs onnxscript; this one does
         warnings.simplefilter("ignore")
         torch.onnx.export(
-            network.eval(), (torch.zeros(1, 3, 64, 96),), str(path), dynamo=False, opset_version=OPSET,
+            network.eval(), (torch.zeros(1, 3 + COUNT, 64, 96),), str(path), dynamo=False, opset_version=OPSET,
             input_names=["image"], output_names=["logits"],
             dynamic_axes={"image": {2: "height", 3: "width"}, "logits": {2: "h", 3: "w"}},
         )  # fmt: skip
     model = files.load(path)
     normalised = {"mean": [0, 0, 0], "std": [1, 1, 1], "pixels_a_radian": PIXELS_A_RADIAN, "license": LICENCE}
+    normalised["channels"] = True
     files.helper.set_model_props(model, {key: _text(value) for key, value in (facts | normalised).items()})
     files.save(model, path)
 
@@ -122,16 +124,16 @@ class Network:
             raise InputError(path, "lacks weights of StreetNet, or has others", remedy)
         self._device = device
         self._net.eval().to(device)
-        self.facts = Facts(f"street ({path.name})", labels, digest, LICENCE, PIXELS_A_RADIAN)
+        self.facts = Facts(f"street ({path.name})", labels, digest, LICENCE, PIXELS_A_RADIAN, channels=True)
 
-    def probabilities(self, rgb: U8) -> F32:
+    def probabilities(self, seen: U8) -> F32:
         """See `segmentation.backends.Network`."""
         import numpy as np
         import torch
 
         with torch.inference_mode():
             try:
-                x = torch.from_numpy(np.ascontiguousarray(rgb)).to(self._device).permute(2, 0, 1)[None].float() / 255
+                x = torch.from_numpy(np.ascontiguousarray(seen)).to(self._device).permute(2, 0, 1)[None].float() / 255
                 with torch.autocast("cuda", torch.float16, enabled=self._device.startswith("cuda")):
                     logits = self._net(x.contiguous(memory_format=torch.channels_last))
                 return np.asarray(logits[0].float().softmax(dim=0).cpu().numpy(), np.float32)

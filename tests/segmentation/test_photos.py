@@ -1,5 +1,7 @@
 """A network over photos of any size and lens, by a network that is known: it tells a pixel's class by its colour."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -67,6 +69,23 @@ def test_photos_are_looked_at_at_one_angular_resolution():
     rgb, _ = painted(PINHOLE)
     Labeller(network, "").probabilities(rgb, PINHOLE)
     assert network.seen == [(240, 320)]
+
+
+@pytest.mark.parametrize("camera", [PINHOLE, PANORAMA])
+def test_a_network_that_takes_channels_gets_them_beside_the_colours(camera):
+    class ByChannel(ByColour):
+        def probabilities(self, seen):
+            assert seen.shape[2] == 7
+            return super().probabilities(np.ascontiguousarray(seen[..., 3:]))
+
+    network = ByChannel(resolution=camera.fx or camera.width / (2 * np.pi))
+    network.facts = replace(network.facts, channels=True)
+    rgb, truth = painted(camera)
+    channels = np.zeros((camera.height // 4, camera.width // 4, 4), np.uint8)
+    channels[..., 0] = 20 * truth[2::4, 2::4]
+    labeller = Labeller(network, "")
+    assert (labels_of(labeller.probabilities(0 * rgb, camera, channels), truth.shape)[0] == truth).mean() > 0.9
+    assert (labels_of(labeller.probabilities(rgb, camera), truth.shape)[0] == 0).all(), "a photo alone has none"
 
 
 def test_a_panoramas_seam_is_no_special_place():

@@ -27,24 +27,25 @@ def weights(tmp_path_factory):
 
 
 def photos():
-    """Of the committed street, and noise of an odd size."""
+    """Of the committed street, without channels and with some, and noise of an odd size."""
     import cv2
 
-    yield np.random.default_rng(0).integers(0, 255, (101, 131, 3), np.uint8)
-    for path in sorted((ROOT / "data_samples" / "tile" / "photos").glob("*.jpg"))[:3]:
-        yield np.ascontiguousarray(cv2.imread(str(path))[..., ::-1])
+    yield np.random.default_rng(0).integers(0, 255, (101, 131, 7), np.uint8)
+    for i, path in enumerate(sorted((ROOT / "data_samples" / "tile" / "photos").glob("*.jpg"))[:3]):
+        rgb = cv2.imread(str(path))[..., ::-1]
+        yield np.concatenate([rgb, np.full((*rgb.shape[:2], 4), 60 * i, np.uint8)], axis=2)
 
 
 def test_the_weights_that_come_along_are_small_and_tell_every_class():
     network = load("street", None, "cpu")
     assert OWN.stat().st_size < 8e6 and OWN.with_suffix(".safetensors").stat().st_size < 8e6
     assert network.facts.labels == CLASSES and len(network.facts.sha256) == 64
-    found = network.probabilities(np.random.default_rng(0).integers(0, 255, (96, 128, 3), np.uint8))
+    found = network.probabilities(np.random.default_rng(0).integers(0, 255, (96, 128, 7), np.uint8))
     assert found.shape == (len(CLASSES), 24, 32) and found.sum(axis=0) == pytest.approx(1, abs=1e-4)
 
 
 def test_the_same_weights_and_photo_give_the_same_classes(weights):
-    photo = np.random.default_rng(0).integers(0, 255, (100, 130, 3), np.uint8)
+    photo = np.random.default_rng(0).integers(0, 255, (100, 130, 7), np.uint8)
     for form in (weights, weights.with_suffix(".onnx")):
         a, b = (load("street", form, "cpu").probabilities(photo) for _ in range(2))
         np.testing.assert_array_equal(a, b)
@@ -56,6 +57,7 @@ def test_onnxruntime_and_torch_tell_the_same_classes(weights, own):
     by_torch, by_onnx = load("street", form, "cpu"), load("street", form.with_suffix(".onnx"), "cpu")
     assert by_torch.facts.labels == by_onnx.facts.labels
     assert by_torch.facts.pixels_a_radian == by_onnx.facts.pixels_a_radian
+    assert by_torch.facts.channels and by_onnx.facts.channels
     for photo in photos():
         a, b = by_torch.probabilities(photo), by_onnx.probabilities(photo)
         assert a.shape == b.shape and np.abs(a - b).max() < 1e-4
@@ -63,7 +65,7 @@ def test_onnxruntime_and_torch_tell_the_same_classes(weights, own):
 
 
 def test_classes_do_not_depend_on_the_number_of_cores(monkeypatch):
-    photo = np.random.default_rng(0).integers(0, 255, (256, 320, 3), np.uint8)
+    photo = np.random.default_rng(0).integers(0, 255, (256, 320, 7), np.uint8)
     told = []
     for cores in ("1", "2", "3"):
         monkeypatch.setenv("OMP_NUM_THREADS", cores)
@@ -137,6 +139,18 @@ def test_training_learns_and_repeats(tmp_path):
     again = train(folder, recipe)
     for a, b in zip(first.network.state_dict().values(), again.network.state_dict().values(), strict=True):
         assert torch.equal(a, b)
+
+
+def test_training_goes_on_from_weights_that_took_colours_alone(tmp_path, weights):
+    from scan2sim.segmentation.train import Recipe, train
+
+    state = safetensors.load_file(weights)
+    state["stem.0.weight"] = state["stem.0.weight"][:, :3].contiguous()
+    safetensors.save_file(state, tmp_path / "old.safetensors")
+    folder = colourful(tmp_path / "set", 2)
+    learnt = train(folder, Recipe(steps=1, batch=2, crop=(64, 96), rate=0.0, start=tmp_path / "old.safetensors"))
+    first = learnt.network.state_dict()["stem.0.weight"]
+    assert torch.allclose(first[:, :3], state["stem.0.weight"].float()) and not first[:, 3:].any()
 
 
 def test_a_folder_without_labels_is_named(tmp_path):
