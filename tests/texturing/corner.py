@@ -90,6 +90,7 @@ class Street:
     clouds: dict[str, PointCloud] = field(default_factory=dict)
     files: dict[str, Path] = field(default_factory=dict)
     texel: float = 0.02
+    page_size: int = 4096
     runs: int = 0
 
     def add(self, camera, pose, image=None, mask=None):
@@ -110,7 +111,8 @@ class Street:
         self.runs += 1
         (out / "depth").mkdir(parents=True)
         self.mesh.save(out / "in.npz")
-        flat = unwrap({"mesh": out / "in.npz"}, UnwrapParams(backend="xatlas", texel=self.texel), out, silent)
+        laid = UnwrapParams(backend="xatlas", texel=self.texel, page_size=self.page_size)
+        flat = unwrap({"mesh": out / "in.npz"}, laid, out, silent)
         hides = scene(self.occluders)
         for i, view in enumerate(self.views):
             np.save(out / "depth" / f"{i}.npy", depth_map(view.camera, view.T_world_cam, hides).range)

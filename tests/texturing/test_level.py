@@ -13,7 +13,7 @@ from scan2sim.pipeline.step import silent
 from scan2sim.pipeline.types import Frame, Mesh
 from scan2sim.texturing import blend, fill
 from scan2sim.texturing.border_colours import GRID, border_step, changes, fade, meet, rim
-from scan2sim.texturing.level import LEVEL, LevelParams, level
+from scan2sim.texturing.level import LevelParams, level
 
 YS = np.append(np.arange(-3, 3, 0.3), 3)
 
@@ -267,7 +267,3 @@ def test_padding_shows_what_the_charts_show(pair):
     fill.pad(padded, seen, 4)
     around = cv2.dilate(seen, np.ones((5, 5), np.uint8)) > 0
     assert (padded[around] == page[around]).all()
-
-
-def test_the_step_is_known_by_name():
-    assert (LEVEL.name, LEVEL.version, LevelParams().reach) == ("level", 1, 4.0)

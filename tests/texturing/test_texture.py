@@ -260,11 +260,11 @@ def test_a_mesh_without_faces_passes(street):
 
 def test_several_pages_meet_without_a_seam(street):
     street.clouds["terrain"] = points()
-    street.texel = 0.005
+    street.texel, street.page_size = 0.01, 512
     folder, done = street.run()
-    assert done.facts["pages"] >= 1 and all((folder / f"page_{k}.png").is_file() for k in range(done.facts["pages"]))
+    assert done.facts["pages"] > 3 and len(list(folder.glob("page_?.png"))) == done.facts["pages"]
     rgb, _, truth, *_ = from_above(folder)
-    assert psnr(rgb, truth) > 25
+    assert np.abs(rgb - truth).max() < 12  # grey levels, at the seams, too
 
 
 def test_views_survive_their_json(street, tmp_path):
