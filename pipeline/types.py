@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scan2sim.pipeline.cells import Cell
+from scan2sim.pipeline.poses import interpolate
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
@@ -80,10 +81,13 @@ class Camera:
 
     def scaled(self, factor: float) -> Camera:
         """The camera of the photo resized by `factor` (pixel centres kept aligned)."""
-        w, h = max(1, round(self.width * factor)), max(1, round(self.height * factor))
-        sx, sy = w / self.width, h / self.height
+        return self.resized(max(1, round(self.width * factor)), max(1, round(self.height * factor)))
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The camera of the photo resized to so many pixels (pixel centres kept aligned)."""
+        sx, sy = width / self.width, height / self.height
         return replace(
-            self, width=w, height=h, fx=self.fx * sx, fy=self.fy * sy,
+            self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy,
             cx=(self.cx + 0.5) * sx - 0.5, cy=(self.cy + 0.5) * sy - 0.5,
         )  # fmt: skip
 
@@ -150,22 +154,10 @@ class Trajectory:
     def pose_at(self, times: npt.ArrayLike) -> F64:
         """(N, 4, 4) sensor to local coordinates at `times` (N,), held at both ends; only where rotations are known.
 
-        Positions move straight from pose to pose, rotations turn evenly about one axis (slerp).
+        In between, as `pipeline.poses.interpolate` says.
         """
-        from scipy.spatial.transform import Rotation
-
-        assert self.rotations is not None
         moments = np.clip(np.asarray(times, np.float64), self.times[0], self.times[-1])
-        after = np.minimum(np.maximum(np.searchsorted(self.times, moments), 1), len(self) - 1)
-        before = np.maximum(after - 1, 0)
-        span = self.times[after] - self.times[before]
-        share = np.where(span > 0, (moments - self.times[before]) / np.where(span > 0, span, 1), 0.0)[:, None]
-        start = Rotation.from_matrix(self.rotations[before])
-        turn = (start.inv() * Rotation.from_matrix(self.rotations[after])).as_rotvec()
-        poses = np.tile(np.eye(4), (len(moments), 1, 1))
-        poses[:, :3, :3] = (start * Rotation.from_rotvec(share * turn)).as_matrix()
-        poses[:, :3, 3] = (1 - share) * self.positions[before] + share * self.positions[after]
-        return poses
+        return interpolate(self.poses, self.times, moments)
 
     def save(self, path: Path) -> None:
         """Write as .npz."""

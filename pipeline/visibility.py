@@ -255,12 +255,7 @@ def load_depth_map(path: Path, camera: Camera, T_world_cam: F64) -> DepthMap:
     """The range image kept at `path` (.npy, (H, W) float32) of a view with that camera and pose."""
     depth = np.load(path)
     height, width = depth.shape
-    sx, sy = width / camera.width, height / camera.height
-    small = replace(
-        camera, width=width, height=height, fx=camera.fx * sx, fy=camera.fy * sy,
-        cx=(camera.cx + 0.5) * sx - 0.5, cy=(camera.cy + 0.5) * sy - 0.5,
-    )  # fmt: skip
-    return DepthMap(small, np.asarray(T_world_cam, np.float64), depth)
+    return DepthMap(camera.resized(width, height), np.asarray(T_world_cam, np.float64), depth)
 
 
 def visible(

@@ -46,12 +46,6 @@ def inverse(T: F64) -> F64:
     return out
 
 
-def nearest_rotation(R: F64) -> F64:
-    """The rotation nearest to a (3, 3) matrix."""
-    u, _, vt = np.linalg.svd(R)
-    return u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
-
-
 @njit(cache=True, nogil=True)
 def triangulate(poses, starts, camera_of, bearing):  # type: ignore[no-untyped-def]
     """Where rays meet, by least squares of the distances to them, and the widest angle between two.

@@ -404,11 +404,7 @@ def measure(cell: Cell, shared: Source, file: Path, threads: int = 0) -> Result:
 def _scaled(camera: Camera, height: int) -> Camera:
     """The camera of frames scaled to a height, and to an even width."""
     width = 2 * round(height * camera.width / camera.height / 2)
-    sx, sy = width / camera.width, height / camera.height
-    return replace(
-        camera, width=width, height=height, fx=camera.fx * sx, fy=camera.fy * sy,
-        cx=(camera.cx + 0.5) * sx - 0.5, cy=(camera.cy + 0.5) * sy - 0.5,
-    )  # fmt: skip
+    return camera.resized(width, height)
 
 
 def _lost(estimate: Trajectory, truth: Trajectory | GpsTrack) -> float:

@@ -65,8 +65,12 @@ def common(
 
 def utm(latitude: float, longitude: float) -> str:
     """The code of the UTM zone (WGS 84) of a place in degrees."""
-    zone = min(int((longitude + 180) // 6) + 1, 60)
-    return f"EPSG:{(32600 if latitude >= 0 else 32700) + zone}"
+    return utm_zone(min(int((longitude + 180) // 6) + 1, 60), north=latitude >= 0)
+
+
+def utm_zone(zone: int, *, north: bool) -> str:
+    """The code of a UTM zone (WGS 84), 1 to 60, of one hemisphere."""
+    return f"EPSG:{(32600 if north else 32700) + zone}"
 
 
 def to_wgs84(frame: Frame, xyz: npt.ArrayLike = (0.0, 0.0, 0.0)) -> tuple[float, float, float] | None:

@@ -26,8 +26,9 @@ from scan2sim.pipeline.io import crs as crs_io
 from scan2sim.pipeline.io import files, las
 from scan2sim.pipeline.io.importing import place, tile_folder
 from scan2sim.pipeline.io.merging import GREY as GREY
-from scan2sim.pipeline.io.merging import borrow_colours, colour, interpolate, phase_of, read_bin
+from scan2sim.pipeline.io.merging import borrow_colours, colour, phase_of, read_bin
 from scan2sim.pipeline.io.tile import tile_name, write_tile
+from scan2sim.pipeline.poses import interpolate, nearest_rotation
 from scan2sim.pipeline.step import Report, silent
 from scan2sim.pipeline.types import F32, F64, Camera, Frame, PointCloud
 
@@ -284,8 +285,7 @@ def rig(P: F64, T_cam0_velo: F64, width: int, height: int) -> Rig:
     shift = np.eye(4)
     shift[:3, 3] = np.linalg.solve(K, P[:, 3])  # rectified camera 0 to this camera
     T_cam_velo = shift @ T_cam0_velo
-    u, _, vt = np.linalg.svd(T_cam_velo[:3, :3])  # the files have seven digits
-    T_cam_velo[:3, :3] = u @ vt
+    T_cam_velo[:3, :3] = nearest_rotation(T_cam_velo[:3, :3])  # the files have seven digits
     T_velo_cam = np.linalg.inv(T_cam_velo).astype(np.float64)
     return Rig(Camera("pinhole", width, height, K[0, 0], K[1, 1], K[0, 2], K[1, 2]), T_velo_cam)
 

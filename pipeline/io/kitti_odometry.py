@@ -16,6 +16,7 @@ from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.io import files
 from scan2sim.pipeline.io.image import size_of
 from scan2sim.pipeline.io.kitti import PHOTOS, Drive, Rig, assemble, entry, numbered, read_poses, rig, within
+from scan2sim.pipeline.poses import nearest_rotation
 from scan2sim.pipeline.step import Report, silent
 from scan2sim.pipeline.types import F64
 
@@ -56,8 +57,7 @@ def import_kitti_odometry(
     photos = {folder: numbered(sequence / folder, PHOTOS) for folder in cameras}
     T_cam0_velo = np.eye(4)
     T_cam0_velo[:3] = entry(sequence, "calib.txt", "Tr", 12).reshape(3, 4)
-    u, _, vt = np.linalg.svd(T_cam0_velo[:3, :3])  # rounded digits: nearest true rotation
-    T_cam0_velo[:3, :3] = u @ vt
+    T_cam0_velo[:3, :3] = nearest_rotation(T_cam0_velo[:3, :3])
     T_cam0 = read_poses(poses or _poses_of(sequence), numbers)
     T_first = np.linalg.inv(T_cam0_velo) @ np.linalg.inv(T_cam0[0])  # camera 0 of frame 0 to the first sweep
     times = _times(sequence / "times.txt", numbers)

@@ -1,4 +1,4 @@
-"""What importers of a moving scanner's sweeps share: poses between poses, colours from photos, thinning."""
+"""What importers of a moving scanner's sweeps share: sweeps as KITTI has them, colours from photos, thinning."""
 
 from __future__ import annotations
 
@@ -33,22 +33,6 @@ def read_bin(path: Path) -> tuple[F32, F32]:
     data = data.reshape(-1, 4)
     data = data[np.isfinite(data).all(axis=1)]
     return data[:, :3], np.clip(data[:, 3], 0, 1)
-
-
-def interpolate(T: F64, at: F64, times: F64) -> F64:
-    """(N, 4, 4) poses at `times`, by the motion between neighbours of (F, 4, 4) `T` at `at`, beyond its ends too."""
-    from scipy.spatial.transform import Rotation
-
-    if len(T) == 1:
-        return np.repeat(T, len(times), axis=0)
-    b = np.clip(np.searchsorted(at, times), 1, len(at) - 1)
-    a = b - 1
-    share = ((times - at[a]) / (at[b] - at[a]))[:, None]
-    turn = Rotation.from_matrix(np.swapaxes(T[:-1, :3, :3], 1, 2) @ T[1:, :3, :3]).as_rotvec()[a]
-    out = np.tile(np.eye(4), (len(times), 1, 1))
-    out[:, :3, :3] = T[a, :3, :3] @ Rotation.from_rotvec(share * turn).as_matrix()
-    out[:, :3, 3] = T[a, :3, 3] + share * (T[b, :3, 3] - T[a, :3, 3])
-    return out
 
 
 def phase_of(xyz: F32) -> F64:

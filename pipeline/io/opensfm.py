@@ -19,6 +19,7 @@ import numpy as np
 
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.io import files
+from scan2sim.pipeline.io.crs import utm_zone
 from scan2sim.pipeline.io.models import Model, Photos, Shot
 from scan2sim.pipeline.types import F64, Camera, CameraModel
 
@@ -138,4 +139,4 @@ def _crs(path: Path) -> str | None:
         return None
     with open(file, encoding="utf-8", errors="replace") as lines:
         told = re.match(r"WGS84 UTM (\d{1,2})([NS])", lines.readline(200))
-    return f"EPSG:{(32600 if told[2] == 'N' else 32700) + int(told[1])}" if told and 1 <= int(told[1]) <= 60 else None
+    return utm_zone(int(told[1]), north=told[2] == "N") if told and 1 <= int(told[1]) <= 60 else None

@@ -27,9 +27,10 @@ from scan2sim.pipeline.io import files, las, toml
 from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.io.image import read_rgb
 from scan2sim.pipeline.io.importing import place, tile_folder
-from scan2sim.pipeline.io.merging import borrow_colours, colour, interpolate, phase_of, read_bin, thin
+from scan2sim.pipeline.io.merging import borrow_colours, colour, phase_of, read_bin, thin
 from scan2sim.pipeline.io.points import sixteen_bits
 from scan2sim.pipeline.io.tile import DISTORTION_LENGTHS, CameraEntry, read_tile, tile_name, write_tile
+from scan2sim.pipeline.poses import interpolate, nearest_rotation
 from scan2sim.pipeline.step import Report, silent
 from scan2sim.pipeline.types import F32, F64, U8, Camera, Frame, PointCloud, Trajectory
 
@@ -208,9 +209,8 @@ def read_extrinsics(path: Path) -> F64:
     R = rows[:3, :3]
     if not np.isfinite(rows).all() or np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
         raise InputError(path, "its left 3x3 is no rotation", remedy)
-    u, _, vt = np.linalg.svd(R)  # rounded digits: nearest true rotation
     T = np.eye(4)
-    T[:3, :3], T[:3, 3] = u @ vt, rows[:3, 3]
+    T[:3, :3], T[:3, 3] = nearest_rotation(R), rows[:3, 3]
     return T
 
 

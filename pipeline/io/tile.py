@@ -51,6 +51,7 @@ from scan2sim.pipeline.io import clouds as cloud_io
 from scan2sim.pipeline.io import crs as crs_io
 from scan2sim.pipeline.io import files, orthophoto, toml
 from scan2sim.pipeline.io import trajectory as trajectory_io
+from scan2sim.pipeline.poses import nearest_rotation
 from scan2sim.pipeline.ranges import Name
 from scan2sim.pipeline.types import Camera, CameraModel, Frame, Tile, Trajectory, View
 
@@ -302,9 +303,8 @@ def _view(tile: Path, index: int, entry: PhotoEntry, cameras: dict[str, Camera],
             f"{where}: `rotation` is no rotation (rows must be orthonormal, determinant +1)",
             "Give the 3x3 camera-to-world rotation, camera axes x right, y down, z forward",
         )
-    u, _, vt = np.linalg.svd(rotation)  # rounded digits: nearest true rotation
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = u @ vt, frame.to_local(position)
+    pose[:3, :3], pose[:3, 3] = nearest_rotation(rotation), frame.to_local(position)
     return View(
         name=entry.name or Path(entry.file).with_suffix("").as_posix(),
         camera=cameras[entry.camera],

@@ -25,6 +25,7 @@ import numpy as np
 from scan2sim.pipeline.errors import DataError, InputError, SettingError, from_os_error
 from scan2sim.pipeline.io import crs as crs_io
 from scan2sim.pipeline.io import files
+from scan2sim.pipeline.poses import nearest_rotation
 from scan2sim.pipeline.types import F64, Frame, Trajectory
 
 POSITION = ("time", "x", "y", "z")
@@ -223,12 +224,11 @@ def _from_kitti(path: Path, lines: Lines, frame: Frame, times: F64 | None) -> Tr
     odd = np.flatnonzero((skew > 1e-3) | (np.linalg.det(rotations) < 0))
     if len(odd):
         raise _bad(path, ".kitti", lines[odd[0]][0], "its left 3x3 is no rotation")
-    u, _, vt = np.linalg.svd(rotations)  # rounded digits: nearest true rotation
     if times is None:
         times = np.arange(len(lines)) / KITTI_RATE
     if len(times) != len(lines):
         raise InputError(path, f"has {len(lines)} poses for {len(times)} times", "Give a time for each line")
-    return Trajectory(np.asarray(times, np.float64), frame.to_local(matrices[:, :, 3]), u @ vt)
+    return Trajectory(np.asarray(times, np.float64), frame.to_local(matrices[:, :, 3]), nearest_rotation(rotations))
 
 
 def _take(trajectory: Trajectory, index: Any) -> Trajectory:
