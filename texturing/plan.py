@@ -24,6 +24,8 @@ RIM = 1.0
 """Metres around what is to be filled within which texels coloured from points are thought of as filled, too: so holes
 reach to what photos saw, and have its tone."""
 
+BESIDE = 2.5
+"""Metres around what was taken out within which points, where no photo shows the ground, may have its colours."""
 SEEN = 255
 """Mark of texels that a photo saw."""
 
@@ -48,10 +50,11 @@ class Plan:
         self._sum, self._count = np.zeros((rows, columns, 3), np.float32), np.zeros((rows, columns), np.float32)
         self._wanted, self._from_points = np.zeros((rows, columns), bool), np.zeros((rows, columns), bool)
         self._stood = drawn([(ring - self.low) / self.cell for ring in stood], (rows, columns))
+        self._beside = grown(self._stood, BESIDE / self.cell)
 
-    def stood(self, places: F32) -> Bools:
-        """(N,) at which places (N, 3) something stood that was taken out."""
-        return np.asarray(self._stood[self.at(places)], bool)
+    def beside(self, places: F32) -> Bools:
+        """(N,) which places (N, 3) are where something stood that was taken out, or beside it."""
+        return np.asarray(self._beside[self.at(places)], bool)
 
     def clear(self, page: Page) -> None:
         """Forget what photos saw below things that were taken out, in place."""

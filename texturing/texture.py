@@ -384,7 +384,7 @@ def _colours_of(inputs: Inputs, plan: Plan | None) -> tuple[Colours | None, bool
     """The points' colours, and whether they are their own (else their classes'); None where there are no points.
 
     What is coloured by points that were made up (`made.*`) is marked as filled. Points lend none where something stood
-    on the `plan` that was taken out: theirs is of its shade.
+    on the `plan` that was taken out, or beside it: theirs is its shade, or its own.
     """
     import numpy as np
 
@@ -402,7 +402,7 @@ def _colours_of(inputs: Inputs, plan: Plan | None) -> tuple[Colours | None, bool
     real = np.arange(len(cloud)) < len(cloud) - sum(len(PointCloud.load(inputs[name])) for name in made)
     known = cloud.coloured
     if plan is not None:
-        known &= ~plan.stood(cloud.xyz)
+        known &= ~plan.beside(cloud.xyz)
     if not known.any():
         return None, False
     return Colours(
