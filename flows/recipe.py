@@ -16,6 +16,7 @@ from scan2sim.pipeline.steps.clip import CLIP
 from scan2sim.pipeline.steps.collision import COLLISION
 from scan2sim.pipeline.steps.decimate import DECIMATE
 from scan2sim.pipeline.steps.export import EXPORT
+from scan2sim.pipeline.steps.facades import FACADES
 from scan2sim.pipeline.steps.furniture import FURNITURE
 from scan2sim.pipeline.steps.geometry import GEOMETRY
 from scan2sim.pipeline.steps.ground import GROUND
@@ -52,9 +53,9 @@ from scan2sim.texturing.texture import TEXTURE
 from scan2sim.texturing.unwrap import UNWRAP
 
 STEPS: tuple[Step, ...] = (
-    INGEST, PATH, CARVE, VIEWS, LABEL, SEGMENT, THINGS, REACH, OVERLAP, FURNITURE, SPLIT, VOXEL, GROUND, WALLS, POISSON,
-    TRIM, PLANES, ISLANDS, CLIP, JOIN, DECIMATE, PLANTS, UNWRAP, REFINE, VISIBILITY, EXPOSURE, AGREEMENT, CHOOSE,
-    TEXTURE, LEVEL, COLLISION, EXPORT, RASTERS, GEOMETRY, SCORE, PICTURES, PREVIEW, BORDERS,
+    INGEST, PATH, CARVE, VIEWS, LABEL, SEGMENT, THINGS, REACH, OVERLAP, FURNITURE, SPLIT, VOXEL, GROUND, WALLS, FACADES,
+    POISSON, TRIM, PLANES, ISLANDS, CLIP, JOIN, DECIMATE, PLANTS, UNWRAP, REFINE, VISIBILITY, EXPOSURE, AGREEMENT,
+    CHOOSE, TEXTURE, LEVEL, COLLISION, EXPORT, RASTERS, GEOMETRY, SCORE, PICTURES, PREVIEW, BORDERS,
 )  # fmt: skip
 PER_CLASS: tuple[Step, ...] = (VOXEL, POISSON, TRIM, ISLANDS, CLIP, JOIN, DECIMATE, CHOOSE, UNWRAP, TEXTURE, LEVEL)
 
@@ -177,6 +178,12 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
             others = {f"{k}.{name}": at("things", k, name) for k in hidden for name in met}
             add(step, seen_from_above | theirs | below | hidden | others, **around)
             made[group] = {"made": at(step.name, "made")}
+    if rays and photographed and settings.params(FACADES).when == "auto" and "building" not in made:
+        shown = {name: told[name] for name in ("views", "labels")}
+        size = settings.params(VOXEL, "building").size
+        beside_it = {f"other.{part}": at(f"voxel.{part}", "cloud") for part in parted if part != "building"}
+        add(FACADES, {"cloud": at("voxel.building", "cloud")} | beside_it | rays | shown, voxel=size, **cell)
+        made["building"] = {"made": at("facades", "made")}
     for group in groups:
         cloud, size = at(f"voxel.{group}", "cloud"), settings.params(VOXEL, group).size
         borne = {"cloud": cloud, **made.get(group, {})}
@@ -187,7 +194,7 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
         if group == "building" and (when == "always" or (when == "auto" and path)):
             others = {f"other.{part}": at(f"voxel.{part}", "cloud") for part in parted if part != group}
             points = {"cloud": cloud, "points": at("split", group)}
-            add(PLANES, {"mesh": surface, **points, **others}, voxel=size, **cell)
+            add(PLANES, {"mesh": surface, **points, **others, **made.get(group, {})}, voxel=size, **cell)
             surface = at("planes", "mesh")
         add(ISLANDS, {"mesh": surface}, group)
         surface = at(f"islands.{group}", "mesh")

@@ -59,6 +59,11 @@ CLASSES: tuple[PointClass, ...] = (
 )
 CODE: dict[str, int] = {c.name: c.code for c in CLASSES}
 OTHER_NAMES = {"ground": 2, "vegetation": 5, "noise": 7, "bridge": 17, "sign": 64, "car": 66, "wall": 68, "fence": 68}
+SHOWN = (
+    "road", "sidewalk", "terrain", "building", "road_sign", "pole", "low_vegetation", "high_vegetation", "vehicle",
+    "person", "wall_or_fence", "sky",
+)  # fmt: skip
+"""The classes that networks tell of a photo's pixels, in the order of the step `label`'s probabilities."""
 NOISE = (7, 18)
 UNCLASSIFIED = CODE["unclassified"]
 UNKNOWN = (0, UNCLASSIFIED, 12)  # never classified, unclassified, legacy overlap

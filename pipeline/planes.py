@@ -30,6 +30,8 @@ BENT = float(np.radians(10.0))
 """Turn of a plane's normal from end to end, by a parabola through its points, from which on it is no plane."""
 BENT_SAMPLE = 2000
 """Points that tell it."""
+SCALE = 100.0
+"""Metres by which two planes are told as different as by a radian between their normals."""
 ROUNDS = 2
 """Times that planes grow by the points beside them, whose normals are those of a corner."""
 
@@ -53,6 +55,13 @@ class Planes:
     def join(parts: Sequence[Planes]) -> Planes:
         """All planes of parts, in order."""
         return Planes(np.concatenate([p.normal for p in parts]), np.concatenate([p.offset for p in parts]))
+
+    def of(self, xyz: F32, normal: F32) -> I32:
+        """(N,) the plane that each of places (N, 3) was laid on, by their unit normals (N, 3)."""
+        places, facing = xyz.astype(np.float64), normal.astype(np.float64)
+        offset = np.einsum("ij,ij->i", places, facing)
+        tree = cKDTree(np.column_stack([SCALE * self.normal, self.offset]))
+        return np.asarray(tree.query(np.column_stack([SCALE * facing, offset]))[1], np.int32)
 
     def beyond(self, xyz: npt.NDArray[Any], which: I32) -> F64:
         """(N,) metres from points (N, 3), local coordinates, to planes `which` (N,), positive outside."""

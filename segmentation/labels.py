@@ -6,14 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from scan2sim.pipeline.classes import CODE
+from scan2sim.pipeline.classes import CODE, SHOWN
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.types import U8
 
-CLASSES = (
-    "road", "sidewalk", "terrain", "building", "road_sign", "pole", "low_vegetation", "high_vegetation", "vehicle",
-    "person", "wall_or_fence", "sky",
-)  # fmt: skip
+CLASSES = SHOWN
 GROUND = ("road", "sidewalk", "terrain")
 SKY = CLASSES.index("sky")
 IGNORED = 255

@@ -38,8 +38,9 @@ class PlanesParams(Params):
 def planes(inputs: Inputs, params: PlanesParams, out: Path, report: Report) -> Done:
     """Find the planes of `cloud`, thinned of `points`, and lay `mesh` onto them.
 
-    Where two planes meet, the mesh folds there; where one ends before a parallel one (a window's reveal), it gets the
-    face between them; where one ends and nothing is behind, none of `other.*` either, so does the mesh.
+    What was made up on planes (`made`, optional) is as good as scanned. Where two planes meet, the mesh folds there;
+    where one ends before a parallel one (a window's reveal), it gets the face between them; where one ends and nothing
+    is behind, none of `other.*` either, so does the mesh.
     """
     import numpy as np
 
@@ -57,6 +58,12 @@ def planes(inputs: Inputs, params: PlanesParams, out: Path, report: Report) -> D
     report(0.2, "extents")
     points = PointCloud.load(inputs["points"]).xyz
     own = extents.members(points, found, cloud.xyz, which, voxel, tolerance)
+    if "made" in inputs:
+        made = PointCloud.load(inputs["made"])
+        assert made.normal is not None
+        theirs = found.of(made.xyz, made.normal)
+        points, own = np.concatenate([points, made.xyz]), np.concatenate([own, theirs])
+        cloud, which = PointCloud.join([cloud, made]), np.concatenate([which, theirs])
     sides = extents.sides(points, own, found, voxel)
     faces, between, of_face = extents.steps(sides, found, cloud.xyz, which, voxel, tolerance)
     others = [PointCloud.load(path).xyz for name, path in inputs.items() if name.startswith("other.")]
