@@ -17,16 +17,17 @@ from scan2sim.flows.execute import locked
 from scan2sim.flows.settings import Settings
 from scan2sim.pipeline.errors import InputError, SettingError
 from scan2sim.pipeline.extras import need
+from scan2sim.pipeline.io import gps as gps_io
 from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.io.image import read_rgb
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.store import contents
-from scan2sim.pipeline.types import Camera, Trajectory
+from scan2sim.pipeline.types import Camera, GpsTrack, Trajectory
 from scan2sim.slam import output
 from scan2sim.slam.adjust import adjust
 from scan2sim.slam.charts import Charts
 from scan2sim.slam.evaluate import AlignmentKind, Evaluation, evaluate, plot
-from scan2sim.slam.gps import GpsTrack, read_gps, smooth
+from scan2sim.slam.gps import smooth
 from scan2sim.slam.loops import Places
 from scan2sim.slam.loops import close as close_loops
 from scan2sim.slam.odometry import Odometry, OdometryParams
@@ -202,7 +203,7 @@ def _gps(video: Video, options: Options) -> GpsTrack | None:
     """The track in the frames' times, smoothed."""
     if options.gps is None:
         return None
-    track_ = read_gps(options.gps)
+    track_ = gps_io.read(options.gps)
     absolute = track_.times[0] > 1e8
     if options.gps_offset is not None:
         track_ = track_.shifted(options.gps_offset)
@@ -244,9 +245,9 @@ def evaluate_trajectory(estimate: Path, truth: Path, *, segment: float, alignmen
 
 def _truth(path: Path) -> Trajectory | GpsTrack:
     if path.suffix.lower() in (".gpx", ".nmea", ".mp4"):
-        return read_gps(path)
+        return gps_io.read(path)
     if path.suffix.lower() == ".csv" and "lat" in path.read_text(encoding="utf-8", errors="replace")[:200]:
-        return read_gps(path)
+        return gps_io.read(path)
     return trajectory_io.read(path)
 
 

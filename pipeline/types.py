@@ -169,6 +169,49 @@ class Trajectory:
         return _load(cls, path)
 
 
+@dataclass(frozen=True)
+class GpsTrack:
+    """Where a receiver was.
+
+    Attributes:
+        times: (N,) seconds, ascending: UNIX time, or the video's own clock for telemetry inside a video.
+        positions: (N, 3) metres east, north, up, local to `frame`; heights as the receiver gave them.
+        sigma: (N,) metres, one standard deviation of a horizontal axis as the receiver's DOP tells it, or None.
+        frame: UTM zone of the track, origin near its first fix; "local" for a file of local metres.
+        epoch: UNIX time at which `times` are 0, where a video's telemetry tells it, or None.
+    """
+
+    times: F64
+    positions: F64
+    sigma: F64 | None = None
+    frame: Frame = field(default_factory=Frame)
+    epoch: float | None = None
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    def shifted(self, seconds: float) -> GpsTrack:
+        """The track with `seconds` added to its times: a video that began at UNIX time t0 needs -t0."""
+        return replace(self, times=self.times + seconds, epoch=None if self.epoch is None else self.epoch - seconds)
+
+    def at(self, times: npt.ArrayLike, max_gap: float = 3.0) -> F64:
+        """(M, 3) positions at `times` (M,), linearly interpolated; NaN outside and within gaps over `max_gap` s."""
+        moments = np.asarray(times, np.float64)
+        after = np.minimum(np.searchsorted(self.times, moments), len(self) - 1)
+        before = np.maximum(after - 1, 0)
+        near = self.times[after] - self.times[before] <= max_gap
+        inside = (moments >= self.times[0]) & (moments <= self.times[-1]) & (near | (moments == self.times[after]))
+        positions = np.stack([np.interp(moments, self.times, self.positions[:, k]) for k in range(3)], axis=-1)
+        return np.where(inside[..., None], positions, np.nan)
+
+    def distance(self, start: npt.ArrayLike, end: npt.ArrayLike, max_gap: float = 3.0) -> F64:
+        """Metres as the crow flies between the positions at times `start` and `end` (M,); NaN as `at` has it.
+
+        Short chords of a track that wasn't smoothed are mostly noise: take 1 s or 50 m at least.
+        """
+        return np.linalg.norm(self.at(end, max_gap) - self.at(start, max_gap), axis=-1)
+
+
 def _save(value: Any, path: Path) -> None:
     """Write a dataclass of arrays and a frame as an uncompressed .npz."""
     arrays: dict[str, Any] = {}

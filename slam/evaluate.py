@@ -20,8 +20,8 @@ from scan2sim.pipeline.errors import DataError
 from scan2sim.pipeline.extras import need
 from scan2sim.pipeline.io.trajectory import replacing
 from scan2sim.pipeline.similarity import umeyama
-from scan2sim.pipeline.types import F64, Trajectory
-from scan2sim.slam.gps import GpsTrack, noise, smooth
+from scan2sim.pipeline.types import F64, GpsTrack, Trajectory
+from scan2sim.slam.gps import noise, smooth
 
 AlignmentKind = Literal["similarity2d", "rigid2d", "similarity3d"]
 Index = npt.NDArray[np.int64]

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from scan2sim.pipeline.types import F64, Frame, Trajectory
+from scan2sim.pipeline.types import F64, Frame, GpsTrack, Trajectory
 from scan2sim.slam import scale
 from scan2sim.slam.geometry import exp_so3
-from scan2sim.slam.gps import GpsTrack
 from scan2sim.slam.odometry import Odometry
 
 DRIFT, TURN = 0.003, 2e-5

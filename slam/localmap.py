@@ -12,10 +12,9 @@ from pydantic import Field
 
 from scan2sim.pipeline.ranges import Reach
 from scan2sim.pipeline.step import Params
-from scan2sim.pipeline.types import F64, I32, Camera
+from scan2sim.pipeline.types import F64, I32, Camera, GpsTrack
 from scan2sim.slam import shared
 from scan2sim.slam.geometry import triangulate
-from scan2sim.slam.gps import GpsTrack
 from scan2sim.slam.graph import backend_named
 from scan2sim.slam.graph.problem import Chord, Graph, errors
 

@@ -17,10 +17,9 @@ import numpy as np
 from pydantic import Field
 
 from scan2sim.pipeline.ranges import Seed
-from scan2sim.pipeline.types import F64, U8, Camera
+from scan2sim.pipeline.types import F64, U8, Camera, GpsTrack
 from scan2sim.slam.charts import Charts
 from scan2sim.slam.geometry import angles, exp_so3, inverse, log_so3, relative_pose, rigid
-from scan2sim.slam.gps import GpsTrack
 from scan2sim.slam.graph import backend_named
 from scan2sim.slam.graph.problem import Graph
 from scan2sim.slam.localmap import Keyframe, LocalMap, MapParams, gps_distance

@@ -9,8 +9,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from scan2sim.pipeline.types import F64
-from scan2sim.slam.gps import GpsTrack
+from scan2sim.pipeline.types import F64, GpsTrack
 
 KNOT = 50.0
 """Metres between the places where the factor may change."""

@@ -31,9 +31,9 @@ from scan2sim.pipeline.io.trajectory import replacing
 from scan2sim.pipeline.io.video import Encoder
 from scan2sim.pipeline.step import Report, silent
 from scan2sim.pipeline.store import contents
-from scan2sim.pipeline.types import U8, Camera, Trajectory
+from scan2sim.pipeline.types import U8, Camera, GpsTrack, Trajectory
 from scan2sim.slam.evaluate import SEGMENT, evaluate, way
-from scan2sim.slam.gps import GpsTrack, smooth
+from scan2sim.slam.gps import smooth
 from scan2sim.slam.odometry import Odometry, OdometryParams
 from scan2sim.slam.track import VERSION as TRACK_VERSION
 from scan2sim.slam.track import camera_of, track

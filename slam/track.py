@@ -12,10 +12,9 @@ import numpy as np
 
 from scan2sim.pipeline.errors import DataError, InputError
 from scan2sim.pipeline.step import Report, silent
-from scan2sim.pipeline.types import U8, Camera, Frame, Trajectory
+from scan2sim.pipeline.types import U8, Camera, Frame, GpsTrack, Trajectory
 from scan2sim.slam.features import Found
 from scan2sim.slam.finish import Placing, finish
-from scan2sim.slam.gps import GpsTrack
 from scan2sim.slam.localmap import Keyframe, Landmarks
 from scan2sim.slam.matching import SeenInChart
 from scan2sim.slam.odometry import Odometry, Placed

@@ -13,9 +13,9 @@ from scan2sim.flows.inspect import inspect_path
 from scan2sim.pipeline.io.tile import read_tile
 from tests.fuzz import clouds, models, tables
 from tests.fuzz.damage import Damage
+from tests.pipeline.io import test_gps as gps
 from tests.pipeline.io.test_cloud_formats import FORMATS
 from tests.pipeline.io.test_model_imports import WRITERS
-from tests.slam import test_gps as gps
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ KINDS: dict[str, Kind] = {
     "gps gpx": Kind(*tables.track("g.gpx", gps.gpx("1.1"))),
     "gps nmea": Kind(*tables.track("g.nmea", gps.nmea())),
     "gps csv": Kind(*tables.track("g.csv", gps.table("time,latitude,longitude,altitude"))),
-    "gps gopro": Kind(tables.film, lambda folder: gps.read_gps(folder / "g.mp4"), tables.telemetry),
+    "gps gopro": Kind(tables.film, lambda folder: gps.gps.read(folder / "g.mp4"), tables.telemetry),
     "video": Kind(tables.film, models.read_video),
     "colmap txt": Kind(*models.colmap("txt")),
     "colmap bin": Kind(*models.colmap("bin")),

@@ -13,17 +13,17 @@ import tomli_w
 from scan2sim.flows.prepare import read_drive
 from scan2sim.flows.recipe import PER_CLASS, STEPS
 from scan2sim.flows.settings import Settings
+from scan2sim.pipeline.io import gps as gps_io
 from scan2sim.pipeline.io import sweeps
 from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.io.las_csv import import_las
 from scan2sim.pipeline.io.survey import read_survey, write_survey
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.slam.gps import read_gps
 from tests.fuzz.damage import TEXT
+from tests.pipeline.io import test_gps as gps
 from tests.pipeline.io.test_las_import import cloud
 from tests.pipeline.io.test_tile import body, save
 from tests.pipeline.test_trajectory_io import UTM, made_up
-from tests.slam import test_gps as gps
 
 Make, Read = Callable[[Path], list[Path]], Callable[[Path], object]
 
@@ -144,7 +144,7 @@ def read_camera_file(folder: Path) -> object:
 
 def track(name: str, text: str) -> tuple[Make, Read]:
     """A GPS track, and its reader."""
-    return written(name, text), lambda folder: read_gps(folder / name)
+    return written(name, text), lambda folder: gps_io.read(folder / name)
 
 
 def film(folder: Path) -> list[Path]:

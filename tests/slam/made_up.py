@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from scan2sim.pipeline.types import GpsTrack
 from scan2sim.slam.geometry import exp_so3, rigid
-from scan2sim.slam.gps import GpsTrack
 from scan2sim.slam.odometry import Odometry, OdometryParams
 from scan2sim.slam.tracking import Tracks
 

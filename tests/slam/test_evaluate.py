@@ -13,9 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from scan2sim.pipeline.errors import DataError
 from scan2sim.pipeline.similarity import umeyama
-from scan2sim.pipeline.types import F64, Trajectory
+from scan2sim.pipeline.types import F64, GpsTrack, Trajectory
 from scan2sim.slam.evaluate import evaluate, local, plot, way, z_up
-from scan2sim.slam.gps import GpsTrack
 
 
 def yaw(degrees: float | F64) -> F64:

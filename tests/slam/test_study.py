@@ -14,9 +14,8 @@ import numpy as np
 import pytest
 
 from scan2sim.pipeline.errors import InputError, SettingError
-from scan2sim.pipeline.types import Camera, Trajectory
+from scan2sim.pipeline.types import Camera, GpsTrack, Trajectory
 from scan2sim.slam import study as study_module
-from scan2sim.slam.gps import GpsTrack
 from scan2sim.slam.odometry import OdometryParams
 from scan2sim.slam.study import Cell, Result, Source, measure, study
 from scan2sim.slam.video import open_video
