@@ -104,6 +104,31 @@ def test_a_chord_sets_the_scale():
     assert np.linalg.norm(positions(solved)[-1]) == pytest.approx(1.2 * length, rel=1e-3)
 
 
+def test_the_gradient_is_half_the_costs_slope():
+    """Of everything that a graph may hold, with no end of a chord or factor fixed."""
+    _, graph = street(5, 20)
+    rng = np.random.default_rng(4)
+    wheels = Factor((3, 1), lambda a, b, m: (a[:3, :3].T @ (b[:3, 3] - a[:3, 3]) - m) / 0.5, np.array([1.0, 0, -4]))
+    graph = replace(
+        graph, chords=(Chord(2, 4, 6.0, 0.8), Chord(0, 3, 8.0, 0.5)), factors=(wheels,), sigma=np.radians(2.0),
+        bend=rng.normal(0, 0.3, (len(graph.bearing), 2, 6)), shared=np.array([1e-3, -2e-3]),
+        shared_sigma=np.array([0.02, 0.03]),
+    )  # fmt: skip
+    free = np.cumsum(~graph.fixed) - 1
+    free[graph.fixed] = -1
+    shared, size = np.zeros(2), 6 * int((~graph.fixed).sum()) + 2
+    starts = np.searchsorted(graph.point_of, np.arange(len(graph.points) + 1))
+    _, g, _, gp, _ = lm._normal(graph, graph.poses, graph.points, shared, free, starts, size, True)
+
+    def cost(step):
+        poses, bent = lm._moved(graph.poses, shared, step[:size], graph.fixed)
+        return lm._cost(graph, poses, graph.points + step[size:].reshape(-1, 3), bent)
+
+    h = 1e-6 * np.eye(size + graph.points.size)
+    slope = np.array([(cost(step) - cost(-step)) / 2e-6 for step in h])
+    assert np.allclose(np.concatenate([g, gp.ravel()]), slope / 2, rtol=1e-4, atol=1e-4 * np.abs(slope).max())
+
+
 def test_covariance_grows_away_from_what_is_fixed_and_fits_the_scatter():
     found = []
     for seed in range(12):
