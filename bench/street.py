@@ -1,6 +1,7 @@
 """Two real streets, from raw data to a scored world, by a scorer of its own, with OpenMVS' figures beside.
 
-`python -m bench.street [--parts odo04 raw0009 keep synthetic time] [--out bench-out/street] [--score-only]`
+`python -m bench.street [--parts odo04 raw0009 keep synthetic time] [--out bench-out/street] [--score-only]
+[--set KEY=VALUE ...]`
 
 The streets are 25 frames each of KITTI odometry 04 (traffic) and of KITTI raw drive 0009 (parked cars); every 8th photo
 (frames 4, 12 and 20) is held out. The world is read as anyone would read it (OBJ and PNG), cast with 3 x 3 rays a pixel
@@ -306,6 +307,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=ROOT / "bench-out" / "street")
     parser.add_argument("--old", type=Path, help="an older checkout, for `time`")
     parser.add_argument("--score-only", action="store_true", help="score the worlds that are there already")
+    parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="settings of the real streets' runs")
     arguments = parser.parse_args()
     out: Path = arguments.out.resolve()
     for part in arguments.parts:
@@ -319,7 +321,7 @@ def main() -> None:
             print("raw0009_keep_psnr_db: null, there is no split.vehicles yet")
             continue
         if street:
-            settings = ("split.vehicles=keep",) if part == "keep" else ()
+            settings = (*arguments.set, *(("split.vehicles=keep",) if part == "keep" else ()))
             tile, run = made(street, folder, settings, run=not arguments.score_only)
             found = scored(street, tile, run, out / "pictures" / part, keep=part == "keep")
         else:

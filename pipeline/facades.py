@@ -39,6 +39,8 @@ SEEN_THROUGH = 0.25
 """Share of its cells that rays went through, beyond which a wall is none."""
 DEEP = 0.3
 """Metres behind a wall from which on a ray went through it."""
+SHOWN = 2.0
+"""What an edge of the picture is worth, in cells of which it is sure that they are the wall's."""
 STEP, JUMP = 0.6, 10.0
 """Price of each cell by which neighbouring columns end at different heights, and the most that is paid."""
 
@@ -227,11 +229,12 @@ def closed(known: Bools, through: Bools, reach: int) -> Bools:
     return np.asarray((whole[reach:-reach, reach:-reach] > 0) & ~known & (open_ == 0))
 
 
-def highest(value: F32, least: I32, most: I32) -> I32:
-    """(C,) the row that each column ends at: those with the greatest sum of `value` below, neighbours alike.
+def highest(value: F32, edge: F32, least: I32, most: I32) -> I32:
+    """(C,) the row that each column ends at: those with most of `value` below, at an `edge`, neighbours alike.
 
     Args:
         value: (R, C) of each cell.
+        edge: (R, C) from 0 to 1, whether there is an edge above each cell.
         least, most: (C,) rows between which each ends.
     """
     rows, columns = value.shape
@@ -243,7 +246,7 @@ def highest(value: F32, least: I32, most: I32) -> I32:
         through = cost + step
         back[c] = np.argmin(through, axis=1)
         cost = through[row, back[c]]
-        cost = cost - gain[:, c]
+        cost = cost - gain[:, c] - SHOWN * edge[:, c]
         cost[(row < least[c]) | (row > most[c])] = np.inf
     out = np.empty(columns, np.int32)
     out[-1] = np.argmin(cost)

@@ -44,6 +44,8 @@ OFF = 0.3
 """Metres before the wall from which on something hides it."""
 NOISE = 3.0
 """Grey levels, standard deviation in a patch, below which there is no pattern to compare."""
+SHARP = 12.0
+"""Grey levels by which the picture changes at a sharp edge."""
 ALIKE = 25.0
 """Grey levels by which a plain place may differ from the scanned wall below it."""
 WHITE = 245.0
@@ -123,12 +125,17 @@ def looked_at(wall: Wall, photo: Looked, offset: float = 0.0, texels: float = TE
     return Patch(sampled(photo.levels[level]), seen, sky)
 
 
-def evidence(wall: Wall, photos: Sequence[Looked]) -> F32:
-    """(R, C) what photos say of each cell: above 0 for the wall, below 0 for something else, about -1 to 1."""
+def evidence(wall: Wall, photos: Sequence[Looked]) -> tuple[F32, F32]:
+    """What photos say of each cell.
+
+    Returns:
+        (R, C) above 0 for the wall, below 0 for something else, about -1 to 1; and (R, C) from 0 to 1 how sharply the
+        picture changes at the cell's upper side, as it does where a wall ends.
+    """
     chosen = [photo for photo in photos if looked_at(wall, photo, 0.0, GLANCE).seen.any()]
     chosen = [chosen[round(k)] for k in np.linspace(0, len(chosen) - 1, min(VIEWS, len(chosen)))]
     if len(chosen) < 2:
-        return np.full(wall.known.shape, UNSEEN, np.float32)
+        return np.full(wall.known.shape, UNSEEN, np.float32), np.zeros(wall.known.shape, np.float32)
     window = 2 * round(WINDOW / 2 / wall.cell * TEXELS) + 1
     own = [looked_at(wall, photo) for photo in chosen]
     alike, deep, count = agreement(_alike_bright(own, wall), window)
@@ -141,7 +148,8 @@ def evidence(wall: Wall, photos: Sequence[Looked]) -> F32:
     patterned = np.clip(2 * alike - 1, -0.5, 0.5) - np.clip(4 * (elsewhere - alike - SAME), 0, 1)
     plain = np.where(np.abs(light - _below(light, wall)) < ALIKE, np.where(light < WHITE, 0.05, UNSEEN), -0.4)
     value = np.where(deep > NOISE, patterned, plain) - 1.5 * np.clip(sky - 0.3, 0, 1)
-    return _cells(_raised(np.where(count >= 2, value, UNSEEN).astype(np.float32), count >= 2, window // 2))
+    value = _raised(np.where(count >= 2, value, UNSEEN).astype(np.float32), count >= 2, window // 2)
+    return _cells(value), _edges(_cells(light), _cells((count >= 2).astype(np.float32)) == 1)
 
 
 def agreement(patches: Sequence[Patch], window: int) -> tuple[F32, F32, I32]:
@@ -191,6 +199,16 @@ def _raised(value: F32, seen: Bools, half: int) -> F32:
     up, there = np.roll(value, -half, axis=0), np.roll(seen, -half, axis=0)
     there[-half:] = False
     return np.where(there, up, value)
+
+
+def _edges(light: F32, seen: Bools) -> F32:
+    """(R, C) how sharply grey levels (R, C) change above each cell, 0 to 1; 0 but at the sharpest of three rows."""
+    smooth = cv2.blur(light, (5, 1), borderType=cv2.BORDER_REPLICATE)
+    change = np.zeros_like(smooth)
+    inner = seen[:-3] & seen[1:-2] & seen[2:-1] & seen[3:]
+    apart = np.abs(smooth[3:] + smooth[2:-1] - smooth[1:-2] - smooth[:-3]) / 2
+    change[1:-2] = np.where(inner, np.minimum(apart / SHARP, 1), 0)
+    return np.where(change == cv2.dilate(change, np.ones((3, 1), np.uint8)), change, 0).astype(np.float32)
 
 
 def _mean(pictures: Sequence[F32], masks: Sequence[Bools]) -> F32:

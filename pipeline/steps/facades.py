@@ -137,9 +137,9 @@ def raised(wall: Wall, rays: Rays, own: Numbers, through: Bools, photos: list[Lo
     if len(photos) < 2 or not (most > wall.ends).any():
         return above
     low, high = max(0, int(wall.tops.min() - BELOW / wall.cell)), int(most.max()) + 1 + margin
-    value = evidence(wall.part(low, high), photos)
+    value, edge = evidence(wall.part(low, high), photos)
     value[through[low:high]] = -1
-    ends = low + highest(value, wall.ends - low, most - low)
+    ends = low + highest(value, edge, wall.ends - low, most - low)
     row = np.arange(low, high)[:, None]
     dips = (row > wall.tops) & (row <= wall.ends) & (value > 0)
     above[low:high] = dips & solid(wall, through) | (row > wall.ends) & (row <= ends)
@@ -166,4 +166,4 @@ def inland(xyz: F64, origin: tuple[float, ...], params: FacadesParams) -> Bools:
     return np.asarray(Cell(params.seed, params.neighbours).outside(xyz[:, :2] + np.asarray(origin[:2])) < -INLAND)
 
 
-FACADES = Step("facades", 1, facades, FacadesParams)
+FACADES = Step("facades", 2, facades, FacadesParams)

@@ -54,7 +54,7 @@ def photo(place: F64, scene: Scene) -> np.ndarray:
         far = (y - place[1]) / ray[:, 1]
         x, z = place[0] + far * ray[:, 0], place[2] + far * ray[:, 2]
         on = (z > 0) & (z < height) & ((y != WALL) | ((x > 0) & (x < LONG)))
-        grey = np.where(on, 120.0 if scene.plain and y == WALL else pattern(x, z, seed), grey)
+        grey = np.where(on, 120.0 if scene.plain and y == WALL else pattern(x, z, seed) - 40 * (y == BEHIND), grey)
     noisy = grey + np.random.default_rng(3).normal(0, 1.5, grey.shape)
     shape = (CAMERA.height, CAMERA.width, 1)
     return np.repeat(np.clip(noisy, 0, 255).astype(np.uint8).reshape(shape), 3, axis=2)
@@ -125,7 +125,7 @@ def tops(made: PointCloud) -> F64:
 def test_a_wall_goes_on_to_where_photos_show_its_top(tmp_path: Path, height: float, behind: float) -> None:
     made, done = built(tmp_path, wall(height), Scene(height, behind))
     assert np.abs(tops(made)[1:-1] - height).max() < 0.3
-    assert np.ptp(tops(made)[1:-1]) < 0.15, "its top is no straight line"
+    assert np.ptp(tops(made)[1:-1]) < 0.25, "its top is no straight line"
     assert np.abs(made.xyz[:, 1] - WALL).max() < 0.03
     assert made.xyz[:, 0].min() > -0.1 and made.xyz[:, 0].max() < LONG + 0.1, "it goes on beside its ends"
     assert done.facts["above_m2"] > 0.5 * LONG * (height - 2.0)
@@ -133,7 +133,7 @@ def test_a_wall_goes_on_to_where_photos_show_its_top(tmp_path: Path, height: flo
 
 def test_a_plain_wall_goes_on_while_it_looks_as_it_does_below(tmp_path: Path) -> None:
     made, _ = built(tmp_path, wall(4.0), Scene(4.0, plain=True))
-    assert np.median(tops(made)) == pytest.approx(4.0, abs=0.5) and tops(made).max() < 4.3
+    assert np.median(tops(made)) == pytest.approx(4.0, abs=0.2) and tops(made).max() < 4.3
 
 
 @pytest.mark.parametrize("behind", [0.0, 9.0])
