@@ -62,14 +62,14 @@ class Looked:
 
     Attributes:
         view: its camera and pose.
-        levels: its grey levels, float32: whole, halved, and halved again.
+        levels: its grey levels, uint8: whole, halved, and halved again.
         usable: (H, W) uint8, 0 where it must not be used; None: everywhere.
         sky: (h, w) uint8, 255 where it surely shows the sky; None: unknown.
         hides: what of the cloud it sees first.
     """
 
     view: View
-    levels: tuple[F32, ...]
+    levels: tuple[U8, ...]
     usable: U8 | None
     sky: U8 | None
     hides: DepthMap

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from scan2sim.pipeline.planesweep import Looked
     from scan2sim.pipeline.types import F64, PointCloud
 
+MOST = 1_000_000  # pixels at which a photo is looked at: all of a tile are kept in memory
 PIXELS = 120_000  # of the range images that tell what hides a wall
 APART = 1.5  # cells from any point within which none is made up
 FILLING = 4  # points a cell
@@ -97,6 +98,8 @@ def facades(inputs: Inputs, params: FacadesParams, out: Path, report: Report) ->
 
 def looked(inputs: Inputs, whole: PointCloud) -> list[Looked]:
     """The photos from the ground that aren't held out, with what hides walls from them."""
+    from dataclasses import replace
+
     import cv2
     import numpy as np
 
@@ -113,14 +116,19 @@ def looked(inputs: Inputs, whole: PointCloud) -> list[Looked]:
         grey = None if out or view.camera.model == "orthographic" else image.read_levels(view.photo)
         if grey is None or grey.shape != (view.camera.height, view.camera.width):
             continue
-        levels = [grey.astype(np.float32)]
+        levels, camera = [grey], view.camera
+        if grey.size > MOST:
+            camera = camera.scaled((MOST / grey.size) ** 0.5)
+            levels = [cv2.resize(grey, (camera.width, camera.height), interpolation=cv2.INTER_AREA)]
         for _ in range(2):
-            levels.append(np.asarray(cv2.resize(levels[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)))
+            levels.append(cv2.resize(levels[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
         labels = inputs["labels"] / f"{i}.npy"
         sky = np.ascontiguousarray(np.load(labels)[..., SHOWN.index("sky")]) if labels.is_file() else None
         usable = image.read_mask(view) if view.mask else None
-        depth = depth_map(view.camera, view.T_world_cam, hides, time=view.time, pixels=PIXELS)
-        photos.append(Looked(view, tuple(levels), usable, sky, depth))
+        if usable is not None:
+            usable = cv2.resize(usable, (camera.width, camera.height), interpolation=cv2.INTER_NEAREST)
+        depth = depth_map(camera, view.T_world_cam, hides, time=view.time, pixels=PIXELS)
+        photos.append(Looked(replace(view, camera=camera), tuple(map(np.asarray, levels)), usable, sky, depth))
     return photos
 
 
@@ -166,4 +174,4 @@ def inland(xyz: F64, origin: tuple[float, ...], params: FacadesParams) -> Bools:
     return np.asarray(Cell(params.seed, params.neighbours).outside(xyz[:, :2] + np.asarray(origin[:2])) < -INLAND)
 
 
-FACADES = Step("facades", 2, facades, FacadesParams)
+FACADES = Step("facades", 1, facades, FacadesParams)
