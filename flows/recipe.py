@@ -41,6 +41,7 @@ from scan2sim.pipeline.steps.walls import WALLS
 from scan2sim.pipeline.types import Tile
 from scan2sim.segmentation.label import LABEL
 from scan2sim.segmentation.segment import SEGMENT
+from scan2sim.segmentation.signs import SIGNS
 from scan2sim.segmentation.things import THINGS
 from scan2sim.texturing.agreement import AGREEMENT
 from scan2sim.texturing.borders import BORDERS
@@ -54,8 +55,8 @@ from scan2sim.texturing.unwrap import UNWRAP
 
 STEPS: tuple[Step, ...] = (
     INGEST, PATH, CARVE, VIEWS, LABEL, SEGMENT, THINGS, REACH, OVERLAP, FURNITURE, SPLIT, VOXEL, GROUND, WALLS, FACADES,
-    POISSON, TRIM, PLANES, ISLANDS, CLIP, JOIN, DECIMATE, PLANTS, UNWRAP, REFINE, VISIBILITY, EXPOSURE, AGREEMENT,
-    CHOOSE, TEXTURE, LEVEL, COLLISION, EXPORT, RASTERS, GEOMETRY, SCORE, PICTURES, PREVIEW, BORDERS,
+    POISSON, TRIM, PLANES, ISLANDS, CLIP, JOIN, DECIMATE, PLANTS, UNWRAP, REFINE, SIGNS, VISIBILITY, EXPOSURE,
+    AGREEMENT, CHOOSE, TEXTURE, LEVEL, COLLISION, EXPORT, RASTERS, GEOMETRY, SCORE, PICTURES, PREVIEW, BORDERS,
 )  # fmt: skip
 PER_CLASS: tuple[Step, ...] = (VOXEL, POISSON, TRIM, ISLANDS, CLIP, JOIN, DECIMATE, CHOOSE, UNWRAP, TEXTURE, LEVEL)
 
@@ -150,7 +151,7 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
     standing: dict[str, Path | Output] = {}
     if path and settings.params(FURNITURE).when == "auto":
         add(FURNITURE, {"cloud": cloud} | scanner, **cell)
-        standing = {name: at("furniture", name) for name in ("taken", "building", "vegetation", "geojson", "csv")}
+        standing = {name: at("furniture", name) for name in (*GROUPS[1:], "taken", "plates", "geojson", "csv")}
     kept = listed if settings.params(SPLIT).vehicles == "keep" else {}
     add(SPLIT, {"cloud": cloud} | kept | {name: standing[name] for name in standing if name == "taken"})
 
@@ -208,7 +209,8 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
             surface = at(f"join.{group}", "mesh")
         things = {"furniture": standing[group]} if group in standing else {}
         add(DECIMATE, {"mesh": surface, **things}, group, keep_border=bool(cell))
-    meshes = {f"mesh.{g}": at(f"decimate.{g}", "mesh") for g in groups}
+    surfaces: dict[str, Path | Output] = {g: at(f"decimate.{g}", "mesh") for g in groups}
+    meshes = {f"mesh.{g}": surfaces[g] for g in groups}
     clouds = {f"cloud.{part}": at(f"voxel.{part}", "cloud") for part in parted}
     own = {"cloud.furniture": at("split", "furniture")} if standing else {}
     invented = {f"made.{group}": points["made"] for group, points in made.items()}
@@ -222,6 +224,12 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
     if photographed and settings.params(REFINE).when == "auto":
         add(REFINE, meshes | {"cloud.rest": clouds["cloud.rest"]} | moving | seen)
         seen = {"views": at("refine", "views")}
+    if photographed and standing and settings.params(SIGNS).when == "auto":
+        plates = {name: standing[name] for name in ("plates", "geojson")}
+        add(SIGNS, meshes | plates | seen | {"labels": at("label", "labels")}, **cell)
+        surfaces |= {g: at("signs", g) for g in groups if g in ("building", "vegetation")}
+        meshes = {f"mesh.{g}": surfaces[g] for g in groups}
+        lists |= {"furniture": at("signs", "geojson"), "furniture_csv": at("signs", "csv")}
     add(VISIBILITY, meshes | clouds | moving | seen)
     seen = seen | {"depth": at("visibility", "depth")}
     prior = settings.params(EXPOSURE).prior
@@ -230,7 +238,7 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
     add(AGREEMENT, seen)
     seen = seen | {"agreement": at("agreement", "agreement")}
     for group in groups:
-        mesh = {"mesh": at(f"decimate.{group}", "mesh")}
+        mesh = {"mesh": surfaces[group]}
         add(CHOOSE, mesh | seen, group)
         choice = {"choice": at(f"choose.{group}", "choice")}
         by_photo = {**choice, **seen} if settings.params(UNWRAP, group).backend == "photo" else {}
@@ -243,7 +251,7 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
         others = {f"neighbour.{name}": at(f"texture.{group}", "textured", name) for name in met}
         add(LEVEL, {"textured": textured[group]} | others, group)
         textured[group] = at(f"level.{group}", "textured")
-    add(COLLISION, {g: at(f"decimate.{g}", "mesh") for g in groups}, keep_border=bool(cell))
+    add(COLLISION, surfaces, keep_border=bool(cell))
     add(EXPORT, textured | lists | listed | {"collision": at("collision", "mesh")}, name=tile.name)
     if settings.params(EXPORT).rasters:
         add(RASTERS, textured, name=tile.name, **_fineness(settings))

@@ -95,9 +95,14 @@ class Thing:
         pole = primitives.tube(path, self.stem.radius, SIDES[self.kind])
         parts = [(pole, CODE["high_vegetation"] if self.kind == "trunk" else CODE["pole"])]
         for plate in self.plates:
-            corners = plate.centre + plate.outline[:, :1] * plate.across + plate.outline[:, 1:] * (0, 0, 1)
-            parts.append((primitives.plate(corners, -SHEET * plate.normal), CODE["road_sign"]))
+            parts.append((sheet(plate), CODE["road_sign"]))
         return parts + [(part, CODE["pole"]) for part in (self.arm.meshes() if self.arm else [])]
+
+
+def sheet(plate: Plate) -> Triangles:
+    """A plate's mesh."""
+    corners = plate.centre + plate.outline[:, :1] * plate.across + plate.outline[:, 1:] * (0, 0, 1)
+    return primitives.plate(corners, -SHEET * plate.normal)
 
 
 def find(cloud: PointCloud, height: F32, path: Trajectory) -> list[Thing]:

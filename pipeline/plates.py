@@ -6,9 +6,10 @@ shapes that its points fill and don't leave.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +17,7 @@ import numpy.typing as npt
 from scan2sim.pipeline.types import F64
 
 Bools = npt.NDArray[np.bool_]
-Shape = Literal["rectangle", "disc", "triangle", "triangle_down", "diamond"]
+Shape = Literal["rectangle", "disc", "octagon", "triangle", "triangle_down", "diamond"]
 
 THIN = 0.04
 """Metres that points may lie beside their plate: noise of a range, and of poses between two drives."""
@@ -33,11 +34,14 @@ TRIALS = 200
 OUTLINES: dict[Shape, F64] = {
     "rectangle": np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)], np.float64),
     "disc": np.column_stack([np.cos(a := np.arange(20) * np.pi / 10), np.sin(a)]) / np.cos(np.pi / 20) ** 0.5,
+    "octagon": np.column_stack([np.cos(a := np.arange(0.5, 8) * np.pi / 4), np.sin(a)]) / np.cos(np.pi / 8),
     "triangle": np.array([(-1, -1), (1, -1), (0, 1)], np.float64),
     "triangle_down": np.array([(0, -1), (1, 1), (-1, 1)], np.float64),
     "diamond": np.array([(0, -1), (1, 0), (0, 1), (-1, 0)], np.float64),
 }
 """Corners counter-clockwise, in halves of the width and height."""
+ASPECT: dict[Shape, float] = {"triangle": 0.866, "triangle_down": 0.866}
+"""Height by width of signs of a shape, where that isn't 1; rectangles have any."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +70,25 @@ class Plate:
     def outline(self) -> F64:
         """(K, 2) corners across and up from the centre, metres, counter-clockwise for who looks at its face."""
         return OUTLINES[self.shape] * (self.width / 2, self.height / 2)
+
+    @property
+    def area(self) -> float:
+        """Square metres."""
+        (x, y), (u, v) = self.outline.T, np.roll(self.outline, -1, axis=0).T
+        return float((x * v - u * y).sum() / 2)
+
+    def to_json(self) -> dict[str, Any]:
+        """As `from_json` reads it."""
+        return {
+            "centre": self.centre.tolist(), "normal": self.normal.tolist(), "shape": self.shape,
+            "width": self.width, "height": self.height,
+        }  # fmt: skip
+
+    @classmethod
+    def from_json(cls, row: Mapping[str, Any]) -> Plate:
+        """What `to_json` told."""
+        centre, normal = np.array(row["centre"], np.float64), np.array(row["normal"], np.float64)
+        return cls(centre, normal, row["shape"], row["width"], row["height"])
 
     def holds(self, xyz: npt.NDArray[np.floating], margin: float, thin: float) -> Bools:
         """(N,) which points lie within its outline and `margin`, and not further than `thin` from its plane."""

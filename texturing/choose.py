@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 FLAT = 0.99
 """cos of the angle between two faces of one side of a plate."""
+FINE_ENOUGH = 0.16
+"""Of the finest photo's pixels on a plate, those of the coarsest that it is painted from at least."""
 
 
 class ChooseParams(Params):
@@ -133,9 +135,9 @@ def choose_views(
 
 
 def with_whole_signs(choice: Choice, mesh: Mesh, pixel: Sequence[float]) -> Choice:
-    """The choice with one photo for each side of a sign's plate, if one sees all of it: the finest of these, alone.
+    """The choice with the same photos for all of each side of a sign's plate: those that see all of it finely.
 
-    Photos that are a pixel off would blur what is to be read.
+    Plates hang where photos agree on them: their mean is as sharp as they are, and without their noise.
 
     Args:
         choice: of all faces.
@@ -154,12 +156,13 @@ def with_whole_signs(choice: Choice, mesh: Mesh, pixel: Sequence[float]) -> Choi
     for side in _sides(mesh, faces, adjacent(mesh.faces[faces])[0]):
         shown, good = view[side], quality[side]
         area = mesh.face_area[side][:, None]
-        whole = [v for v in np.unique(shown[shown >= 0]) if (shown == v).any(axis=1).all()]
-        if whole:
-            best = whole[int(np.argmax([(good * area)[shown == v].sum() / pixel[v] ** 2 for v in whole]))]
-            own = (good * (shown == best)).max(axis=1)
-            view[side], quality[side] = -1, 0
-            view[side, 0], quality[side, 0], label[side] = best, own, best
+        whole = np.array([v for v in np.unique(shown[shown >= 0]) if (shown == v).any(axis=1).all()], np.int32)
+        if len(whole):
+            fineness = np.array([(good * area)[shown == v].sum() / pixel[v] ** 2 for v in whole])
+            used = whole[np.argsort(-fineness, kind="stable")][: (fineness >= FINE_ENOUGH * fineness.max()).sum()]
+            view[side], quality[side], label[side] = -1, 0, used[0]
+            for k, best in enumerate(used):
+                view[side, k], quality[side, k] = best, (good * (shown == best)).max(axis=1)
     return Choice(view, quality, label)
 
 
@@ -188,4 +191,4 @@ def seams(mesh: Mesh, smoothness: float) -> tuple[I32, F32, F32]:
     return pairs, length, (smoothness * np.minimum(length / median, 4)).astype(np.float32)
 
 
-CHOOSE = Step("choose", 3, choose, ChooseParams)
+CHOOSE = Step("choose", 4, choose, ChooseParams)

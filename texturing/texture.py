@@ -233,6 +233,9 @@ class Painter:
         agreement: Agreement,
         params: TextureParams,
     ) -> None:
+        import numpy as np
+
+        from scan2sim.pipeline.classes import CODE
         from scan2sim.texturing.photos import Photos
 
         self._mesh, self._views, self._params = mesh, views, params
@@ -240,6 +243,8 @@ class Painter:
         self._choice, self._depth_file, self._exposures = choice, depth_file, exposures
         self._mask, self._warp = agreement.mask, agreement.warp
         self._share = shares(mesh.faces, choice.label, len(mesh.vertices), len(views))
+        label = mesh.label
+        self._sign = np.zeros(len(mesh), bool) if label is None else label == CODE["road_sign"]
         self._backwards, self._device = True, params.device if params.device != "auto" else best_device()
         self._ranges = lru_cache(maxsize=KEPT)(self._read_ranges)
         self.photos = Photos(views, max(1, params.band))
@@ -316,6 +321,7 @@ class Painter:
         depth, near, apart, reach = self._ranges(i)
         T = np.linalg.inv(view.T_world_cam)
         share = self._share(i)[self._mesh.faces[faces]] if p.fade else self._alone(i, faces)
+        share[self._sign[faces]] = 1.0  # photos of a plate have been chosen to agree: all give its detail
         look = Look(
             photo, self._mask(i, view), MODEL_ID[view.camera.model], parameters(view.camera), depth.range, near, apart,
             reach, np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3]), pixel_angle(depth.camera),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -15,6 +17,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from scan2sim.pipeline.furniture import Thing
+    from scan2sim.pipeline.plates import Plate
     from scan2sim.pipeline.types import F32, Frame, Mesh
 
 CELL = 0.5  # metres, of the ground's heights
@@ -45,14 +48,13 @@ def furniture(inputs: Inputs, params: FurnitureParams, out: Path, report: Report
     Files: `building` and `vegetation`, meshes of signs, poles and lamps, and of trunks, with a class code for every
     face; `taken`, .npz with `index` (N,) of the cloud's points that are theirs; `geojson` and `csv`: places in the
     tile's CRS, kind, height above the ground, radius, and of plates the way that they face (of lamps, that they
-    reach), clockwise from the CRS's north.
+    reach), clockwise from the CRS's north; `plates`, JSON list of all plates, local metres.
     """
     import numpy as np
 
     from scan2sim.pipeline.cells import Cell
     from scan2sim.pipeline.classes import CODE, NOISE, group_of
     from scan2sim.pipeline.furniture import find
-    from scan2sim.pipeline.io import geojson
     from scan2sim.pipeline.types import PointCloud, Trajectory
 
     cloud, path = PointCloud.load(inputs["cloud"]), Trajectory.load(inputs["path"])
@@ -87,13 +89,24 @@ def furniture(inputs: Inputs, params: FurnitureParams, out: Path, report: Report
         files[group] = out / f"{group}.npz"
         faces += len(mesh)
     rows = [_row(thing, cloud.frame) for thing in things]
-    text = "\n".join([",".join(COLUMNS), *(",".join(str(row.get(c, "")) for c in COLUMNS) for row in rows)])
-    (out / "furniture.csv").write_text(text + "\n", encoding="utf-8")
-    features = [((r["x"], r["y"], r["z"]), {k: v for k, v in r.items() if k not in "xyz"}) for r in rows]
-    geojson.write_points(out / "furniture.geojson", cloud.frame.crs, features)
-    files |= {"csv": out / "furniture.csv", "geojson": out / "furniture.geojson"}
+    files |= listed(out, cloud.frame.crs, rows)
+    files["plates"] = out / "plates.json"
+    plates = [plate.to_json() for thing in shown for plate in thing.plates]
+    files["plates"].write_text(json.dumps(plates), encoding="utf-8")
     kinds = {kind: sum(thing.kind == kind for thing in things) for kind in ("pole", "sign", "lamp", "trunk")}
     return Done(files, {**kinds, "points": len(taken), "faces": faces})
+
+
+def listed(out: Path, crs: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, Path]:
+    """Write `furniture.csv` and `furniture.geojson`; each row's `x`, `y` and `z` are in the CRS."""
+    from scan2sim.pipeline.io import geojson
+
+    files = {"csv": out / "furniture.csv", "geojson": out / "furniture.geojson"}
+    text = "\n".join([",".join(COLUMNS), *(",".join(str(row.get(c, "")) for c in COLUMNS) for row in rows)])
+    files["csv"].write_text(text + "\n", encoding="utf-8")
+    features = [((r["x"], r["y"], r["z"]), {k: v for k, v in r.items() if k not in "xyz"}) for r in rows]
+    geojson.write_points(files["geojson"], crs, features)
+    return files
 
 
 def heights(ground: F32, xyz: F32) -> F32:
@@ -145,11 +158,17 @@ def _row(thing: Thing, frame: Frame) -> dict[str, Any]:
     if thing.arm is not None:
         row["heading_deg"] = round(float(np.degrees(np.arctan2(*thing.arm.direction))) % 360, 1)
     if thing.plates:
-        plate = max(thing.plates, key=lambda p: p.width * p.height)
-        heading = float(np.degrees(np.arctan2(plate.normal[0], plate.normal[1]))) % 360
-        row |= {"heading_deg": round(heading, 1), "shape": plate.shape, "plate_width_m": round(plate.width, 2)}
-        row |= {"plate_height_m": round(plate.height, 2)}
+        row |= of_plate(max(thing.plates, key=lambda p: p.width * p.height))
     return row
 
 
-FURNITURE = Step("furniture", 2, furniture, FurnitureParams)
+def of_plate(plate: Plate) -> dict[str, Any]:
+    """What the lists tell of a plate."""
+    import numpy as np
+
+    heading = float(np.degrees(np.arctan2(plate.normal[0], plate.normal[1]))) % 360
+    size = {"plate_width_m": round(plate.width, 2), "plate_height_m": round(plate.height, 2)}
+    return {"heading_deg": round(heading, 1), "shape": plate.shape, **size}
+
+
+FURNITURE = Step("furniture", 3, furniture, FurnitureParams)

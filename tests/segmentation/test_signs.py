@@ -1,0 +1,148 @@
+"""Signs by photos: plates are found, whole, where the scan ends or has nothing, and nowhere else."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from scan2sim.pipeline import primitives
+from scan2sim.pipeline.classes import CODE
+from scan2sim.pipeline.furniture import sheet
+from scan2sim.pipeline.io import image
+from scan2sim.pipeline.io import views as views_io
+from scan2sim.pipeline.plates import Plate, inside
+from scan2sim.pipeline.step import Done, silent
+from scan2sim.pipeline.types import F64, U8, Camera, Frame, Mesh, View
+from scan2sim.segmentation.labels import CLASSES
+from scan2sim.segmentation.signs import SIGNS, SignsParams
+
+FRAME = Frame("EPSG:25832", (500_000.0, 5_400_000.0, 100.0))
+CAMERA = Camera("pinhole", 640, 240, 500, 500, 320, 120)
+NORMAL = np.array([-np.cos(0.25), np.sin(0.25), 0.0])
+SIGN = Plate(np.array([14.0, -3.0, 3.2]), NORMAL, "disc", 0.6, 0.6)
+BELOW = Plate(np.array([14.0, -3.0, 2.77]), NORMAL, "rectangle", 0.42, 0.22)
+WALL = 24.0
+"""Metres ahead of the first photo."""
+
+
+def _views(folder: Path) -> list[View]:
+    """Photos on a drive towards the sign, each 1.3 m on."""
+    R = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], float)
+    views = []
+    for i in range(8):
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = R, (1.3 * i - 4, 0, 1.7)
+        views.append(View(f"{i}", CAMERA, T, folder / f"{i}.png"))
+    return views
+
+
+def _colour(shown: str | None, flat: F64, noise: F64) -> F64:
+    """(N, 3) of places (N, 2) on a sign's face, or on the wall behind."""
+    if shown is None:
+        return noise[(flat[:, 0] * 12).astype(int) % 400, (flat[:, 1] * 12).astype(int) % 400]
+    out = np.full((len(flat), 3), 240.0)
+    radius = np.hypot(*flat.T)
+    if shown == "disc":
+        out[(radius > 0.21) & (radius < 0.28)] = (190, 20, 30)
+        out[(np.abs(flat[:, 0]) < 0.03) & (np.abs(flat[:, 1]) < 0.12)] = 20
+    else:
+        out[(np.abs(flat[:, 1]) < 0.03) & (np.abs(flat[:, 0]) < 0.15)] = 20
+    return out
+
+
+def _photo(view: View, plates: list[Plate]) -> tuple[U8, U8]:
+    """A photo (H, W, 3), four rays a pixel, and a network's probabilities at a quarter of its size."""
+    import cv2
+
+    noise = np.random.default_rng(0).uniform(20, 130, (400, 400, 1)) * [0.6, 1.0, 0.5]
+    row, column = np.mgrid[: 2 * CAMERA.height, : 2 * CAMERA.width] / 2 - 0.25
+    rays = np.stack([(column - CAMERA.cx) / CAMERA.fx, (row - CAMERA.cy) / CAMERA.fy, np.ones_like(row)], axis=-1)
+    rays = rays.reshape(-1, 3) @ view.T_world_cam[:3, :3].T
+    at = view.centre + rays * ((WALL - view.centre[0]) / rays[:, :1])
+    rgb, sign = _colour(None, at[:, 1:] + 50, noise), np.zeros(len(rays), np.float32)
+    for plate in plates:
+        at = view.centre + rays * ((plate.centre - view.centre) @ plate.normal / (rays @ plate.normal))[:, None]
+        flat = np.column_stack([(at - plate.centre) @ plate.across, at[:, 2] - plate.centre[2]])
+        on = inside(flat, plate.outline, 0)
+        rgb[on], sign[on] = _colour(plate.shape, flat[on], noise), 255
+    size = (CAMERA.width, CAMERA.height)
+    photo = cv2.resize(rgb.reshape(*row.shape, 3), size, interpolation=cv2.INTER_AREA)
+    small = cv2.resize(sign.reshape(row.shape), (size[0] // 4, size[1] // 4), interpolation=cv2.INTER_AREA)
+    return photo.round().astype(np.uint8), small.round().astype(np.uint8)
+
+
+def _run(folder: Path, plates: list[Plate], known: list[Plate]) -> Done:
+    """The step, on a street where `plates` hang and `known` were found among points."""
+    views = _views(folder)
+    labels = folder / "labels"
+    labels.mkdir()
+    for i, view in enumerate(views):
+        rgb, sign = _photo(view, plates)
+        image.write(view.photo, rgb)
+        told = np.zeros((*sign.shape, len(CLASSES)), np.uint8)
+        told[..., CLASSES.index("road_sign")] = sign
+        np.save(labels / f"{i}.npy", told)
+    views_io.save(folder / "views.json", views, [i == 5 for i in range(len(views))])
+    parts = [(primitives.tube([(14.05, -3, 0), (14.05, -3, 3)], [0.04, 0.04], 8), CODE["pole"])]
+    parts += [(sheet(plate), CODE["road_sign"]) for plate in known]
+    before = np.array([(13.8, -3.1, 3.1), (13.8, -2.9, 3.1), (13.8, -3, 3.3), (5, 9, 0), (5, 9, 3), (6, 9, 0)])
+    parts += [((before, np.array([[0, 1, 2], [3, 4, 5]], np.int32)), 0)]
+    vertices, faces = primitives.join([part for part, _ in parts])
+    label = np.concatenate([np.full(len(part[1]), code, np.uint8) for part, code in parts])
+    Mesh(FRAME, vertices.astype(np.float32), faces, label=label).save(folder / "building.npz")
+    flat = np.array([(-20, -20, 0), (40, -20, 0), (40, 20, 0), (-20, 20, 0)], np.float32)
+    Mesh(FRAME, flat, np.array([[0, 1, 2], [0, 2, 3]], np.int32)).save(folder / "terrain.npz")
+    (folder / "plates.json").write_text(json.dumps([plate.to_json() for plate in known]))
+    place = FRAME.to_crs([14.05, -3, 0]).tolist()
+    pole = {"geometry": {"coordinates": place}, "properties": {"kind": "pole", "height_m": 3.0, "radius_m": 0.04}}
+    (folder / "furniture.geojson").write_text(json.dumps({"features": [pole]}))
+    inputs = {f"mesh.{group}": folder / f"{group}.npz" for group in ("terrain", "building")}
+    inputs |= {"plates": folder / "plates.json", "geojson": folder / "furniture.geojson"}
+    inputs |= {"views": folder / "views.json", "labels": labels}
+    out = folder / "out"
+    out.mkdir()
+    return SIGNS.run(inputs, SignsParams(), out, silent)
+
+
+def _hung(done: Done) -> list[F64]:
+    """Corners of each plate in the mesh, that of the highest first."""
+    from scan2sim.segmentation.hanging import pieces
+
+    mesh = Mesh.load(done.files["building"])
+    corners = [mesh.vertices[np.unique(mesh.faces[piece])] for piece in pieces(mesh, CODE["road_sign"])]
+    return sorted(corners, key=lambda c: -float(c[:, 2].mean()))
+
+
+HALF = Plate(np.array([14.1, -2.95, 3.05]), np.array([-1.0, 0, 0]), "rectangle", 0.55, 0.3)
+"""What a scan that ends at the sign's middle shows of it."""
+
+
+@pytest.mark.parametrize("known", [[], [HALF]], ids=["unscanned", "half scanned"])
+def test_a_sign_is_whole_where_photos_show_it(tmp_path: Path, known: list[Plate]) -> None:
+    done = _run(tmp_path, [SIGN, BELOW], known)
+    assert done.facts == {"from_points": len(known), "fitted": 2, "new": 0 if known else 2}
+    for corners, plate in zip(_hung(done), [SIGN, BELOW], strict=True):
+        front = corners[: len(corners) // 2]
+        assert front.mean(axis=0) == pytest.approx(plate.centre, abs=0.03)
+        assert np.ptp(front[:, 2]) == pytest.approx(plate.height, abs=0.03)
+        assert np.ptp(front @ plate.across) == pytest.approx(plate.width, abs=0.03)
+        assert np.ptp(front @ plate.normal) < 0.1
+    mesh = Mesh.load(done.files["building"])
+    assert mesh.label is not None
+    pole = mesh.vertices[np.unique(mesh.faces[mesh.label == CODE["pole"]])]
+    assert ((pole - SIGN.centre) @ SIGN.normal).max() < 0  # it stands behind its plate
+    assert (mesh.label == 0).sum() == 1  # what points made before the plate is gone
+    (feature,) = json.loads(done.files["geojson"].read_text())["features"]
+    told = feature["properties"]
+    assert told["kind"] == "sign" and told["shape"] == "disc" and told["radius_m"] == 0.04
+    assert told["height_m"] == pytest.approx(3.5, abs=0.03) and told["plate_width_m"] == pytest.approx(0.6, abs=0.03)
+
+
+def test_where_photos_show_nothing_plates_stay_as_points_tell(tmp_path: Path) -> None:
+    done = _run(tmp_path, [], [HALF])
+    assert done.facts["fitted"] == 0
+    (corners,) = _hung(done)
+    assert corners.mean(axis=0) == pytest.approx(HALF.centre, abs=0.02)
