@@ -39,6 +39,8 @@ CLOSED = 2 / 3
 """Where an outline is weakest, the contrast across it is twice what photos disagree by there and their noise."""
 ALIKE = 0.8
 """Share of what is seen of a plate's face that all photos agree on."""
+NEARLY = 0.8
+"""Share of both from which a plate is looked at more closely."""
 TURN = math.radians(60)
 """By which a plate's heading may be wrong."""
 LARGER = 0.03
@@ -84,10 +86,10 @@ class CloseUps:
         """
         return _clear(self.pictures, self.project, self.focal, plates, *_samples(shape), RIM, off, NOISE)
 
-    def shows(self, plate: Plate) -> bool:
-        """Whether a plate is there."""
+    def shows(self, plate: Plate, share: float = 1.0) -> bool:
+        """Whether a plate is there, as clear as one must be, or a share of it."""
         _, weakest, alike = self.clear(plate.shape, _row(plate))[0]
-        return bool(weakest >= CLOSED and alike >= ALIKE)
+        return bool(weakest >= share * CLOSED and alike >= share * ALIKE)
 
     def worth(self, shape: Shape, plates: F64, off: float = 1.0) -> F64:
         """(N,) what is to be as large as can be, of plates as `clear` takes them."""
@@ -202,7 +204,7 @@ def _clearest(
         turns: radians by which the heading of what is found may be off.
     """
     best = [_best(shown, shape, at, low, high) for shape in OUTLINES]
-    found = [_outermost(shown, plate, turns) for plate in best if shown.shows(plate)]
+    found = [_outermost(shown, plate, turns) for plate in best if shown.shows(plate, NEARLY)]
     there = [plate for plate in found if shown.shows(plate)]
     if not there:
         return None

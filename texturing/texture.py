@@ -504,4 +504,4 @@ def can_texture(params: TextureParams) -> None:
         need(f"texture.device {params.device}", "torch")
 
 
-TEXTURE = Step("texture", 5, texture, TextureParams, {"terrain": {"continued": True}}, can_texture)
+TEXTURE = Step("texture", 6, texture, TextureParams, {"terrain": {"continued": True}}, can_texture)
