@@ -17,10 +17,10 @@ import numpy as np
 from bench.street import STREETS, made
 from bench.street import scan2sim as run
 from scan2sim.pipeline.classes import colour_of
-from scan2sim.pipeline.io import image, las
+from scan2sim.pipeline.io import image
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.steps.voxel import sample
-from scan2sim.pipeline.types import U8, View
+from scan2sim.pipeline.types import U8, PointCloud, View
 from scan2sim.segmentation.backends import load
 from scan2sim.segmentation.drawn import Drawn
 from scan2sim.segmentation.labels import CLASSES, code_of_index, index_of_code
@@ -66,7 +66,8 @@ def _told(name: str, folder: Path) -> Iterator[tuple[View, dict[str, U8]]]:
     path, _ = made(STREETS[name], folder, run=False)
     run("segment", path / "tile.toml", "--out", folder / "told")
     tile = read_tile(path / "tile.toml")
-    cloud = sample(las.read(folder / "told" / "classified" / "cloud.laz", tile.frame), VOXEL)
+    standing = next((folder / "told" / "steps" / "things").rglob("cloud.npz"))  # without what moved, which is elsewhere
+    cloud = sample(PointCloud.load(standing), VOXEL)
     assert cloud.label is not None
     scan, labeller = Drawn(cloud, VOXEL), Labeller(load("street", None), "street")
     for view in tile.views:

@@ -51,8 +51,9 @@ def worn(channels: U8, label: U8, rng: Rng) -> U8:
     """What a real scan would have of (h, w, 4): less high, less far, with holes, noise and without what moved."""
     if rng.random() < WITHOUT:
         return np.zeros_like(channels)
-    x = np.roll(channels.astype(np.float32), rng.integers(-1, 2, 2), axis=(0, 1))
     shape = label.shape
+    down, right = rng.integers(-1, 2, 2)  # poses are a little off
+    x = np.pad(channels.astype(np.float32), ((1, 1), (1, 1), (0, 0)))[1 - down :, 1 - right :][: shape[0], : shape[1]]
     there = x[..., 3] > 0
     far = x[..., 1] / 255
     reach = rng.choice([rng.uniform(1.5, 5), rng.uniform(5, 15), 1e3], p=[0.5, 0.25, 0.25])  # lidars look up little
