@@ -32,6 +32,7 @@ import numpy as np
 from bench.measure import measure
 from bench.segmentation_kitti import kitti, mean
 from bench.street import STREETS as STREETS_OF_KITTI
+from scan2sim.pipeline.channels import COUNT
 from scan2sim.pipeline.classes import CODE
 from scan2sim.segmentation.score import MEAN_OF, Confusion, confusion
 
@@ -122,7 +123,8 @@ def network() -> dict[str, float]:
     from scan2sim.segmentation.backends.street import OWN
 
     bgr = cv2.imread(str(next((ROOT / "data_samples" / "tile" / "photos").glob("*_front.jpg"))))
-    photo = np.ascontiguousarray(cv2.resize(bgr, (1536, 1024))[..., ::-1])
+    rgb = cv2.resize(bgr, (1536, 1024))[..., ::-1]
+    photo = np.concatenate([rgb, np.zeros((*rgb.shape[:2], COUNT), np.uint8)], axis=2)
     networks = {form: load("street", OWN.with_suffix(form), "cpu") for form in (".onnx", ".safetensors")}
     told = {form: one.probabilities(photo).argmax(axis=0) for form, one in networks.items()}
     seconds: dict[str, list[float]] = {form: [] for form in networks}

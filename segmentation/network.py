@@ -60,6 +60,8 @@ class _Merge(nn.Module):
 class StreetNet(nn.Module):
     """(B, 3 + 4, H, W) colours and `pipeline.channels` in [0, 1] to (B, classes, H / 4, W / 4) logits.
 
+    Once trained it looks twice, the second time at the picture mirrored, and tells the mean.
+
     Args:
         classes: number of them.
         widths: channels at strides 2, 4, 8, 16, 32.
@@ -83,6 +85,11 @@ class StreetNet(nn.Module):
         self.head = nn.Sequential(nn.Dropout2d(0.1), nn.Conv2d(pyramid, classes, 1))
 
     def forward(self, seen: Tensor) -> Tensor:
+        if self.training:
+            return self._look(seen)
+        return (self._look(seen) + self._look(seen.flip(3)).flip(3)) / 2
+
+    def _look(self, seen: Tensor) -> Tensor:
         rgb, codes, there = seen[:, :3], seen[:, 3:-1], seen[:, -1:]
         codes = (codes - CODE_MEAN) / CODE_SPREAD * there
         x = self.stem(torch.cat([(rgb - self.mean) / self.spread, codes, there], dim=1))
