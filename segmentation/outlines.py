@@ -236,7 +236,7 @@ def _best(
 
     bounds = list(zip(low, high, strict=True))
     found = differential_evolution(
-        price, bounds, popsize=16, maxiter=80, tol=1e-6, rng=0, polish=False, updating="deferred", vectorized=True
+        price, bounds, popsize=16, maxiter=50, tol=1e-2, rng=0, polish=False, updating="deferred", vectorized=True
     )
     finer = minimize(
         one, found.x, method="Nelder-Mead", bounds=bounds, options={"maxiter": 300, "xatol": 1e-3, "fatol": 1e-5}
