@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -70,12 +72,11 @@ def facades(inputs: Inputs, params: FacadesParams, out: Path, report: Report) ->
     assert cloud.normal is not None
     planes, which, _ = detect(cloud.xyz, cloud.normal, params.voxel)
     rays = kernels.Rays.of(Trajectory.load(inputs["path"]).at(whole.time), whole.xyz)
-    report(0.1, "photos")
-    photos = looked(inputs, whole)
+    photos = cache(lambda: looked(inputs, whole))
     numba.set_num_threads(1)  # many small pictures: threads would wait for one another
     tree, parts = cKDTree(cloud.xyz), []
     for wall in kernels.walls(cloud.xyz, which, planes, params.voxel, params.rise + WINDOW / 2):
-        report(0.4 + 0.6 * wall.plane / len(planes), "walls")
+        report(0.1 + 0.9 * wall.plane / len(planes), "walls")
         through = kernels.passed(wall, rays)
         above = raised(wall, rays, np.flatnonzero(which == wall.plane), through, photos)
         gaps = kernels.closed(wall.known | above, through, round(params.gap / params.voxel))
@@ -132,20 +133,25 @@ def looked(inputs: Inputs, whole: PointCloud) -> list[Looked]:
     return photos
 
 
-def raised(wall: Wall, rays: Rays, own: Numbers, through: Bools, photos: list[Looked]) -> Bools:
-    """(R, C) cells of a wall above its scan; its points are `own` of the rays' ends, which went `through` its cells."""
+def raised(wall: Wall, rays: Rays, own: Numbers, through: Bools, photos: Callable[[], list[Looked]]) -> Bools:
+    """(R, C) cells of a wall above its scan; its points are `own` of the rays' ends, which went `through` its cells.
+
+    Photos are asked of walls that somewhere end where the scanner's rays do.
+    """
     import numpy as np
 
     from scan2sim.pipeline.facades import ceiling, highest, solid
     from scan2sim.pipeline.planesweep import BELOW, WINDOW, evidence
 
     above, margin = np.zeros_like(wall.known), round(WINDOW / 2 / wall.cell)
-    most = np.minimum(ceiling(wall, rays, own), len(wall.known) - 1 - margin)
-    most = np.where(solid(wall, through), most, wall.ends)
-    if len(photos) < 2 or not (most > wall.ends).any():
+    most = ceiling(wall, rays, own)
+    if not (most == len(wall.known) - 1).any():
+        return above
+    most = np.where(solid(wall, through), np.minimum(most, len(wall.known) - 1 - margin), wall.ends)
+    if len(photos()) < 2 or not (most > wall.ends).any():
         return above
     low, high = max(0, int(wall.tops.min() - BELOW / wall.cell)), int(most.max()) + 1 + margin
-    value, edge = evidence(wall.part(low, high), photos)
+    value, edge = evidence(wall.part(low, high), photos())
     value[through[low:high]] = -1
     ends = low + highest(value, edge, wall.ends - low, most - low)
     row = np.arange(low, high)[:, None]
@@ -174,4 +180,4 @@ def inland(xyz: F64, origin: tuple[float, ...], params: FacadesParams) -> Bools:
     return np.asarray(Cell(params.seed, params.neighbours).outside(xyz[:, :2] + np.asarray(origin[:2])) < -INLAND)
 
 
-FACADES = Step("facades", 1, facades, FacadesParams)
+FACADES = Step("facades", 2, facades, FacadesParams)
