@@ -25,6 +25,8 @@ WITHOUT: dict[str, tuple[str, ...]] = {
     "things": ("things.find=false",),
     "reach": ("reach.limit=off",),
     "outlines": ("planes.when=never", "furniture.when=never", "agreement.sky=false"),
+    "facades": ("facades.when=never",),
+    "signs": ("signs.when=never",),
     "filling": ("ground.when=never", "texture.continued=false"),
     "refine": ("refine.when=never",),
 }

@@ -27,8 +27,8 @@ def without_specks(best: U8, height: F32, xyz: F32, near: I32) -> U8:
     the air, as photos take the inside of a car for that is seen through its window: (N,) indices."""
     plants = np.isin(best, [CLASSES.index("low_vegetation"), CLASSES.index("high_vegetation")])
     ground = np.isin(best, [CLASSES.index(name) for name in GROUND])
-    hugs = _close(xyz, np.isin(best, [CLASSES.index("building"), CLASSES.index("wall_or_fence")]), HUG)
-    plant_speck = _specks(plants, height, xyz, near, hugs)
+    walls = np.isin(best, [CLASSES.index("building"), CLASSES.index("wall_or_fence")])
+    plant_speck = _specks(plants, height, xyz, near, xyz[walls])
     ground_speck = _specks(ground, height, xyz, near)
     out = best.copy()
     for speck, stands in ((plant_speck, ~plant_speck), (ground_speck, ~ground & ~plant_speck)):
@@ -38,10 +38,11 @@ def without_specks(best: U8, height: F32, xyz: F32, near: I32) -> U8:
     return out
 
 
-def _specks(member: Bools, height: F32, xyz: F32, near: I32, hugs: Bools | None = None) -> Bools:
-    """(N,) which members are of small pieces that touch no ground; of larger ones if most of them `hugs` a wall."""
+def _specks(member: Bools, height: F32, xyz: F32, near: I32, walls: F32 | None = None) -> Bools:
+    """(N,) which members are of small pieces that touch no ground, or of larger ones that hug `walls` (M, 3)."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
 
     rows = np.flatnonzero(member)
     if not len(rows):
@@ -53,17 +54,11 @@ def _specks(member: Bools, height: F32, xyz: F32, near: I32, hugs: Bools | None 
     size, lowest = np.bincount(part[rows], minlength=n), np.full(n, np.inf)
     np.minimum.at(lowest, part[rows], height[rows])
     small = size < SPECK
-    if hugs is not None:
-        hugging = np.bincount(part[rows], hugs[rows], minlength=n) / np.maximum(size, 1)
+    if walls is not None:
+        hugs = np.isfinite(cKDTree(walls).query(xyz[rows], distance_upper_bound=HUG, workers=-1)[0])
+        hugging = np.bincount(part[rows], hugs, minlength=n) / np.maximum(size, 1)
         small |= (size < PIECE) & (hugging > MOSTLY)
     return np.asarray(member & ((lowest > FLOATING) & small)[part])
-
-
-def _close(xyz: F32, to: Bools, distance: float) -> Bools:
-    """(N,) which points are within a distance of those `to`."""
-    from scipy.spatial import cKDTree
-
-    return np.isfinite(cKDTree(xyz[to]).query(xyz, distance_upper_bound=distance, workers=-1)[0])
 
 
 def _most_around(best: U8, xyz: F32, places: F32) -> U8:

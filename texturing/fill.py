@@ -25,7 +25,8 @@ SPACINGS = 3.0
 """In between it is so many times what points are apart."""
 FAR_NEIGHBOURS, FAR_STEP = 32, 8
 """What is farther from every point takes the mean of so many of every so-manieth: one point's would be a flat patch."""
-FROM_POINTS, FILLED = 128, 64
+SEEN, FROM_POINTS, FILLED = 255, 128, 64
+"""Marks of texels: a photo saw them, points lent their colour, or neither."""
 
 
 class Colours:
@@ -101,7 +102,7 @@ def fill(page: Page, colours: Colours, texel: float) -> None:
 
 def seen_points(page: Page, every: int) -> tuple[F32, U8]:
     """Places (N, 3) and colours (N, 3) of every n-th texel each way that a photo saw."""
-    rows, columns = np.nonzero(page.seen[::every, ::every] == 255)
+    rows, columns = np.nonzero(page.seen[::every, ::every] == SEEN)
     rows, columns = rows * every, columns * every
     return texel_places(page.owner, page.flat, page.corners, rows, columns), page.rgb[rows, columns]
 

@@ -16,7 +16,7 @@ from scan2sim.pipeline.heightfield import MOST, drawn, grown
 from scan2sim.pipeline.types import F32, F64, U8, Mesh
 from scan2sim.texturing.blend import frame
 from scan2sim.texturing.continuation import FACTOR, continued
-from scan2sim.texturing.fill import FILLED, FROM_POINTS, Page, texel_places
+from scan2sim.texturing.fill import FILLED, FROM_POINTS, SEEN, Page, texel_places
 
 CELL = 0.03
 """Metres of the picture's cells: grain, joints and markings, for a fraction of the texels."""
@@ -26,8 +26,6 @@ reach to what photos saw, and have its tone."""
 
 BESIDE = 2.5
 """Metres around what was taken out within which points, where no photo shows the ground, may have its colours."""
-SEEN = 255
-"""Mark of texels that a photo saw."""
 
 Bools = npt.NDArray[np.bool_]
 
