@@ -28,13 +28,11 @@ def without_specks(best: U8, height: F32, xyz: F32, near: I32) -> U8:
     plants = np.isin(best, [CLASSES.index("low_vegetation"), CLASSES.index("high_vegetation")])
     ground = np.isin(best, [CLASSES.index(name) for name in GROUND])
     walls = np.isin(best, [CLASSES.index("building"), CLASSES.index("wall_or_fence")])
-    plant_speck = _specks(plants, height, xyz, near, xyz[walls])
-    ground_speck = _specks(ground, height, xyz, near)
+    speck = _specks(plants, height, xyz, near, xyz[walls]) | _specks(ground, height, xyz, near)
+    want, have = np.flatnonzero(speck), np.flatnonzero(~speck & ~ground)
     out = best.copy()
-    for speck, stands in ((plant_speck, ~plant_speck), (ground_speck, ~ground & ~plant_speck)):
-        want, have = np.flatnonzero(speck), np.flatnonzero(stands)
-        if len(want) and len(have):
-            out[want] = _most_around(best[have], xyz[have], xyz[want])
+    if len(want) and len(have):
+        out[want] = _most_around(best[have], xyz[have], xyz[want])
     return out
 
 

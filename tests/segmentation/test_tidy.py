@@ -55,6 +55,15 @@ def test_road_in_the_air_is_what_stands_around_it_and_a_ramp_is_road():
     assert (found[: len(road)] == ROAD).all() and (found[-len(ramp) :] == ROAD).all()
 
 
+def test_plants_in_the_air_are_not_what_road_in_the_air_is():
+    road, seat, leaf, car = (sheet(4, *z)[:, [0, 2, 1]] for z in ((0, 4), (1, 1.5), (1.5, 1.7), (1.7, 3)))
+    seat[:, 2] = leaf[:, 2] = car[:, 2] = 1.0
+    xyz = np.concatenate([road, seat, leaf, car])
+    best = np.repeat([ROAD, ROAD, HIGH, VEHICLE], [len(road), len(seat), len(leaf), len(car)]).astype(np.uint8)
+    found = without_specks(best, xyz[:, 2], xyz, neighbours(xyz))
+    assert (found[len(road) :] == VEHICLE).all()
+
+
 def test_the_foot_of_a_wall_is_the_walls_and_a_kerb_is_not():
     wall, road = sheet(4, 0, 3), sheet(4, 0, 3, 5.0)[:, [0, 2, 1]]
     kerb = sheet(4, 0, 0.2, 9.0)
