@@ -44,10 +44,10 @@ from scan2sim.segmentation.segment import SEGMENT
 from scan2sim.segmentation.signs import SIGNS
 from scan2sim.segmentation.things import THINGS
 from scan2sim.texturing.agreement import AGREEMENT
-from scan2sim.texturing.borders import BORDERS
+from scan2sim.texturing.borders.level import LEVEL
+from scan2sim.texturing.borders.measure import BORDERS
 from scan2sim.texturing.choose import CHOOSE
 from scan2sim.texturing.exposure import EXPOSURE
-from scan2sim.texturing.level import LEVEL
 from scan2sim.texturing.refine import REFINE
 from scan2sim.texturing.score import SCORE
 from scan2sim.texturing.texture import TEXTURE

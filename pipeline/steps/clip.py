@@ -35,11 +35,11 @@ class CellParams(Params):
 
 def clip(inputs: Inputs, params: CellParams, out: Path, report: Report) -> Done:
     """Cut `mesh` to the tile's own cell, and tell which vertices lie on which border (`on`)."""
-    from scan2sim.pipeline import border
+    from scan2sim.pipeline.borders.clip import clip as clip_mesh
     from scan2sim.pipeline.types import Mesh
 
     mesh = Mesh.load(inputs["mesh"])
-    clipped = border.clip(mesh, params.cell)
+    clipped = clip_mesh(mesh, params.cell)
     clipped.save(out / "mesh.npz", out / "on.npz")
     on = {name: int(flags.sum()) for name, flags in clipped.on.items()}
     facts = {"faces_in": len(mesh), "faces": len(clipped.mesh), "on_border": on}

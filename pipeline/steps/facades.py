@@ -56,7 +56,7 @@ def facades(inputs: Inputs, params: FacadesParams, out: Path, report: Report) ->
     from scipy.spatial import cKDTree
 
     from scan2sim.pipeline import facades as kernels
-    from scan2sim.pipeline.border import on_grid
+    from scan2sim.pipeline.borders.grid import on_grid
     from scan2sim.pipeline.classes import CODE
     from scan2sim.pipeline.planes import detect
     from scan2sim.pipeline.planesweep import WINDOW

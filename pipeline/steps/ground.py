@@ -68,7 +68,7 @@ def ground(inputs: Inputs, params: GroundParams, out: Path, report: Report) -> D
     """
     import numpy as np
 
-    from scan2sim.pipeline.border import on_grid
+    from scan2sim.pipeline.borders.grid import on_grid
     from scan2sim.pipeline.classes import CODE
     from scan2sim.pipeline.heightfield import Raster, closed, grown, membrane, spacing
     from scan2sim.pipeline.types import UNCOLOURED, PointCloud
@@ -171,7 +171,7 @@ def united(inputs: Inputs, params: MadeUpParams, part: str) -> PointCloud:
 
     import numpy as np
 
-    from scan2sim.pipeline.border import on_grid
+    from scan2sim.pipeline.borders.grid import on_grid
     from scan2sim.pipeline.steps.overlap import nearest
     from scan2sim.pipeline.types import PointCloud
 

@@ -30,13 +30,14 @@ def join(inputs: Inputs, params: JoinParams, out: Path, report: Report) -> Done:
 
     Neighbours whose names sort after the tile's own needn't be given: they fit theirs to this one.
     """
-    from scan2sim.pipeline import border
+    from scan2sim.pipeline.borders.clip import Clipped
+    from scan2sim.pipeline.borders.join import join as join_mesh
 
-    clips = {params.name: border.Clipped.load(inputs["mesh"], inputs["on"])}
+    clips = {params.name: Clipped.load(inputs["mesh"], inputs["on"])}
     for name in sorted(params.neighbours):
         if f"mesh.{name}" in inputs:
-            clips[name] = border.Clipped.load(inputs[f"mesh.{name}"], inputs[f"on.{name}"])
-    joined = border.join(params.name, clips, params.tolerance, params.reach)
+            clips[name] = Clipped.load(inputs[f"mesh.{name}"], inputs[f"on.{name}"])
+    joined = join_mesh(params.name, clips, params.tolerance, params.reach)
     joined.mesh.save(out / "mesh.npz")
     facts = {"faces_in": len(clips[params.name].mesh), "faces": len(joined.mesh), "turned": joined.turned}
     missing = sorted(name for name in params.neighbours if name < params.name and name not in clips)

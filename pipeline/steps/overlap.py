@@ -36,13 +36,13 @@ def overlap(inputs: Inputs, params: OverlapParams, out: Path, report: Report) ->
     A point belongs to the tile with the nearest seed (of several as near, to the one whose name sorts first), and
     is taken from there with what that tile knows of it, its class above all. So tiles see the same points around
     their border. Where the nearest tile's cloud is not given, the tile's own points stand in. Coordinates are
-    rounded to `pipeline.border.GRID`: the same in every tile.
+    rounded to `pipeline.borders.grid.GRID`: the same in every tile.
     """
     from dataclasses import replace
 
     import numpy as np
 
-    from scan2sim.pipeline.border import on_grid
+    from scan2sim.pipeline.borders.grid import on_grid
     from scan2sim.pipeline.types import PointCloud
 
     seeds = dict(sorted({params.name: params.seed, **params.neighbours}.items()))

@@ -105,7 +105,7 @@ def inland(mesh: Mesh, params: PlanesParams) -> F64:
     """
     import numpy as np
 
-    from scan2sim.pipeline.border import world
+    from scan2sim.pipeline.borders.grid import world
     from scan2sim.pipeline.cells import Cell
 
     share = np.ones(len(mesh.vertices))

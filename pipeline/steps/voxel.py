@@ -53,14 +53,14 @@ def voxel(inputs: Inputs, params: VoxelParams, out: Path, report: Report) -> Don
 def sample(cloud: PointCloud, size: float) -> PointCloud:
     """One point a voxel of `size` metres: mean position and colour; class, intensity and time of one member.
 
-    Means are rounded to `pipeline.border.GRID`, so that tiles which know the same points around their border, in
+    Means are rounded to `pipeline.borders.grid.GRID`, so that tiles which know the same points around their border, in
     the same order (`overlap`), have the same samples there.
     """
     from dataclasses import replace
 
     import numpy as np
 
-    from scan2sim.pipeline.border import on_grid
+    from scan2sim.pipeline.borders.grid import on_grid
 
     if len(cloud) == 0:
         return cloud

@@ -173,7 +173,7 @@ def _cloud(xyz: F64, normal: F64, building: PointCloud, params: WallsParams) -> 
     import numpy as np
     from scipy.spatial import cKDTree
 
-    from scan2sim.pipeline.border import on_grid
+    from scan2sim.pipeline.borders.grid import on_grid
     from scan2sim.pipeline.classes import CODE
     from scan2sim.pipeline.types import PointCloud
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.border import Clipped
+from scan2sim.pipeline.borders.clip import Clipped
 from scan2sim.pipeline.io import views
 from scan2sim.pipeline.types import Camera, Frame, Mesh, PointCloud, Trajectory, View
 

@@ -7,13 +7,16 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from scan2sim.pipeline.borders.grid import on_grid
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.io import image, textured
 from scan2sim.pipeline.step import silent
 from scan2sim.pipeline.types import Frame, Mesh
 from scan2sim.texturing import blend, fill
-from scan2sim.texturing.border_colours import GRID, border_step, changes, fade, meet, rim
-from scan2sim.texturing.level import LevelParams, level
+from scan2sim.texturing.borders.fading import changes, fade
+from scan2sim.texturing.borders.level import LevelParams, level
+from scan2sim.texturing.borders.measure import colour_step
+from scan2sim.texturing.borders.meeting import meet, rim
 
 YS = np.append(np.arange(-3, 3, 0.3), 3)
 
@@ -41,7 +44,7 @@ def sheet(xs, ys, place):
     i, j = np.meshgrid(np.arange(len(xs) - 1), np.arange(len(ys) - 1), indexing="ij")
     a, n = (i * len(ys) + j).ravel(), len(ys)
     faces = np.concatenate([np.column_stack([a, a + n, a + n + 1]), np.column_stack([a, a + n + 1, a + 1])])
-    return np.column_stack([s, t]), np.round(place(s, t) * GRID) / GRID, faces
+    return np.column_stack([s, t]), on_grid(place(s, t)), faces
 
 
 def half(sign, cells, ys=YS):
@@ -111,7 +114,7 @@ def run(folder: Path, neighbours=(), **params):
 
 
 def step(*folders):
-    return border_step(*(textured.read(folder) for folder in folders))
+    return colour_step(*(textured.read(folder) for folder in folders))
 
 
 def same_bytes(one: Path, two: Path) -> bool:

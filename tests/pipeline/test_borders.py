@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scan2sim.pipeline import border
-from scan2sim.pipeline.border import Clipped, Gap
+from scan2sim.pipeline.borders.clip import Clipped, clip
+from scan2sim.pipeline.borders.gap import Gap, gap
+from scan2sim.pipeline.borders.grid import GRID, world
+from scan2sim.pipeline.borders.join import join
 from scan2sim.pipeline.cells import Cell
 from scan2sim.pipeline.classes import CODE, GROUPS, group_of
 from scan2sim.pipeline.io import las
@@ -87,7 +89,7 @@ def scene(frame: Frame, spacing: float, seed: int, noise: float = 0.02) -> Mesh:
 
 def outward(mesh: Mesh) -> np.ndarray:
     """(F,) positive for faces of the scene that look up, to the wall's front, or out of the box."""
-    middle = border.world(mesh)[mesh.faces].mean(axis=1) - (X, Y, Z)
+    middle = world(mesh)[mesh.faces].mean(axis=1) - (X, Y, Z)
     y = middle[:, 1]
     out = np.tile([0.0, 0.0, 1.0], (len(mesh), 1))
     out[y > 5] = 0, -1, 0
@@ -97,8 +99,8 @@ def outward(mesh: Mesh) -> np.ndarray:
 
 def met(meshes: Mapping[str, Mesh], where: Mapping[str, Cell]) -> tuple[dict[str, Clipped], dict[str, Mesh]]:
     """All clipped, and all joined."""
-    clips = {name: border.clip(mesh, where[name]) for name, mesh in meshes.items()}
-    return clips, {name: border.join(name, clips, 0.3, 0.5).mesh for name in meshes}
+    clips = {name: clip(mesh, where[name]) for name, mesh in meshes.items()}
+    return clips, {name: join(name, clips, 0.3, 0.5).mesh for name in meshes}
 
 
 def crowded(mesh: Mesh) -> int:
@@ -124,29 +126,29 @@ def test_clip_keeps_the_own_side_and_the_surface(two: Any) -> None:
     meshes, clips, _ = two
     area = sum(float(clip.mesh.face_area.sum()) for clip in clips.values())
     assert area == pytest.approx(float(meshes["east"].face_area.sum()), rel=0.1)
-    for name, clip in clips.items():
+    for name, cut in clips.items():
         cell = cells(SEEDS)[name]
-        outside = cell.outside(border.world(clip.mesh)[:, :2])
-        (on,) = clip.on.values()
+        outside = cell.outside(world(cut.mesh)[:, :2])
+        (on,) = cut.on.values()
         assert outside.max() < 2e-4 and on.sum() > 100
         assert np.abs(outside[on]).max() < 2e-4
-        assert (border.world(clip.mesh)[on] % border.GRID == 0).all()
-        assert crowded(clip.mesh) == 0 and outward(clip.mesh).min() > 0
-        assert clip.mesh.face_area.min() > 1e-7, "no degenerate faces"
+        assert (world(cut.mesh)[on] % GRID == 0).all()
+        assert crowded(cut.mesh) == 0 and outward(cut.mesh).min() > 0
+        assert cut.mesh.face_area.min() > 1e-7, "no degenerate faces"
 
 
 def test_the_border_is_the_very_same(two: Any) -> None:
     _, clips, joined = two
     cell = cells(SEEDS)["east"]
-    before = border.gap(clips["east"].mesh, clips["west"].mesh, cell, "west")
+    before = gap(clips["east"].mesh, clips["west"].mesh, cell, "west")
     assert before.shared == 0 and 0.005 < before.mean_m < 0.03
-    after = border.gap(joined["east"], joined["west"], cell, "west")
+    after = gap(joined["east"], joined["west"], cell, "west")
     assert after.shared == 1 and after.max_m == 0 and after.crack_m2 == 0 and after.one_sided_m == 0
     assert after.overlap_m < 2e-4
     assert after.length_m == pytest.approx(before.length_m, rel=0.05)
     small = {name: simplify(mesh, 2000) for name, mesh in joined.items()}
     assert max(map(len, small.values())) < 2200
-    thin = border.gap(small["east"], small["west"], cell, "west")
+    thin = gap(small["east"], small["west"], cell, "west")
     assert replace(thin, overlap_m=0) == replace(after, overlap_m=0) and thin.overlap_m < 0.005
 
 
@@ -168,7 +170,7 @@ def test_the_surface_behind_the_border_goes_along(tmp_path: Path) -> None:
     }
     flat["west"] = replace(flat["west"], vertices=flat["west"].vertices - np.float32([0, 0, 0.1]))
     joined = met(flat, cells(SEEDS))[1]
-    xyz = border.world(joined["west"])
+    xyz = world(joined["west"])
     behind = -cells(SEEDS)["west"].beyond("east", xyz[:, :2])
     lift = xyz[:, 2] - Z - height(xyz[:, 0] - X, xyz[:, 1] - Y) + 0.1
     assert np.abs(lift[behind < 0.001] - 0.1).max() < 0.005 and np.abs(lift[behind > 0.51]).max() < 1e-4
@@ -183,13 +185,13 @@ def test_four_tiles_meet_in_one_vertex() -> None:
     _, joined = met(meshes, where)
     corners = set()
     for name, mesh in joined.items():
-        xyz = border.world(mesh)
+        xyz = world(mesh)
         here = np.hypot(xyz[:, 0] - X, xyz[:, 1] - Y) < 1e-3
         assert here.sum() == 1
         corners.add(tuple(xyz[here][0].tolist()))
         for other in where[name].neighbours:
-            gap = border.gap(mesh, joined[other], where[name], other)
-            assert gap.shared == 1 and gap.max_m == 0 and gap.overlap_m < 2e-4, (name, other, gap)
+            between = gap(mesh, joined[other], where[name], other)
+            assert between.shared == 1 and between.max_m == 0 and between.overlap_m < 2e-4, (name, other, between)
         assert crowded(mesh) == 0 and outward(mesh).min() > -0.1
     assert len(corners) == 1
 
@@ -198,16 +200,16 @@ def test_three_tiles_meet_where_the_first_has_a_hole() -> None:
     seeds = {"a": (X - 5.0, Y + 1.0), "b": (X + 4.0, Y - 5.0), "c": (X + 4.0, Y + 5.0)}
     where = cells(seeds)
     meshes = {name: scene(EAST, 0.07 + 0.01 * k, k) for k, name in enumerate(seeds)}
-    near = np.hypot(*(border.world(meshes["a"])[meshes["a"].faces].mean(axis=1)[:, :2] - (X - 0.4, Y)).T) < 1
+    near = np.hypot(*(world(meshes["a"])[meshes["a"].faces].mean(axis=1)[:, :2] - (X - 0.4, Y)).T) < 1
     meshes["a"] = meshes["a"].keep(~near)
     _, joined = met(meshes, where)
-    gap = border.gap(joined["b"], joined["c"], where["b"], "c")
-    assert gap.shared == 1 and gap.max_m == 0
+    between = gap(joined["b"], joined["c"], where["b"], "c")
+    assert between.shared == 1 and between.max_m == 0
 
 
 def test_a_missing_neighbour_leaves_the_border_as_cut(two: Any) -> None:
     _, clips, _ = two
-    alone = border.join("west", {"west": clips["west"]}, 0.3, 0.5)
+    alone = join("west", {"west": clips["west"]}, 0.3, 0.5)
     assert np.array_equal(alone.mesh.vertices, clips["west"].mesh.vertices) and alone.facts == {}
 
 
@@ -215,16 +217,16 @@ def test_nothing_meets_nothing(two: Any) -> None:
     meshes, clips, _ = two
     empty = Mesh(EAST, np.empty((0, 3), np.float32), np.empty((0, 3), np.int32), np.empty(0, np.float32))
     cell = cells(SEEDS)["east"]
-    nothing = border.clip(empty, cell)
+    nothing = clip(empty, cell)
     assert len(nothing.mesh) == 0 and list(nothing.on) == ["west"]
-    assert len(border.join("west", {"east": nothing, "west": nothing}, 0.3, 0.5).mesh) == 0
-    kept = border.join("west", {"east": nothing, "west": clips["west"]}, 0.3, 0.5)
+    assert len(join("west", {"east": nothing, "west": nothing}, 0.3, 0.5).mesh) == 0
+    kept = join("west", {"east": nothing, "west": clips["west"]}, 0.3, 0.5)
     assert np.array_equal(kept.mesh.vertices, clips["west"].mesh.vertices)
-    assert len(border.join("west", {"east": clips["east"], "west": border.clip(empty, cell)}, 0.3, 0.5).mesh) == 0
-    assert border.gap(empty, empty, cell, "west") == Gap(0, 0, 1, 0, 0, 0, 0, 0)
-    one = border.gap(clips["east"].mesh, empty, cell, "west")
+    assert len(join("west", {"east": clips["east"], "west": clip(empty, cell)}, 0.3, 0.5).mesh) == 0
+    assert gap(empty, empty, cell, "west") == Gap(0, 0, 1, 0, 0, 0, 0, 0)
+    one = gap(clips["east"].mesh, empty, cell, "west")
     assert one.shared == 0 and one.one_sided_m == pytest.approx(2 * one.length_m)
-    away = border.clip(meshes["east"], Cell((X + 500, Y), {"west": (X + 100, Y)}))
+    away = clip(meshes["east"], Cell((X + 500, Y), {"west": (X + 100, Y)}))
     assert len(away.mesh) == 0
 
 
@@ -249,8 +251,8 @@ def test_the_steps_pass_it_on(two: Any, tmp_path: Path) -> None:
     assert thin.facts["border_kept"] and not thin.warnings
     solid = go(COLLISION, tmp_path / "solid", {"terrain": thin.files["mesh"]}, triangles=100, keep_border=True)
     assert solid.facts["border_kept"] and solid.facts["triangles"] > 100 and "kept" in solid.warnings[0]
-    gap = border.gap(joined["east"], Mesh.load(solid.files["mesh"]), cells(SEEDS)["east"], "west")
-    assert gap.shared == 1
+    between = gap(joined["east"], Mesh.load(solid.files["mesh"]), cells(SEEDS)["east"], "west")
+    assert between.shared == 1
 
 
 def test_decimate_may_be_told_to_keep_the_border(tmp_path: Path) -> None:
@@ -269,10 +271,10 @@ def cloud(frame: Frame, seed: int = 0, n: int = 60_000) -> PointCloud:
     """Points of the ground around the middle as LAS holds them, to the millimetre; the same for every frame."""
     random = np.random.default_rng(seed)
     xy = random.uniform(-8, 8, (n, 2))
-    world = np.column_stack([xy, height(*xy.T)]).round(3) + (X, Y, Z)
+    xyz = np.column_stack([xy, height(*xy.T)]).round(3) + (X, Y, Z)
     return PointCloud(
         frame,
-        (world - np.asarray(frame.origin)).astype(np.float32),
+        (xyz - np.asarray(frame.origin)).astype(np.float32),
         random.integers(0, 255, (n, 3), np.uint8),
         label=np.full(n, CODE["road"], np.uint8),
         time=np.arange(n, dtype=np.float64),
@@ -350,10 +352,10 @@ def test_voxels_of_two_tiles_are_the_same_where_they_overlap(tmp_path: Path) -> 
     rows = {}
     for name, points in overlapped(seeds, tmp_path).items():
         thin = sample(points, 0.1)
-        world = everywhere(thin)
-        both = np.abs(where["a"].beyond("b", world[:, :2])) < 1.8
+        xyz = everywhere(thin)
+        both = np.abs(where["a"].beyond("b", xyz[:, :2])) < 1.8
         assert both.sum() > 1000
-        columns = (world, thin.rgb, thin.label, thin.time, thin.intensity)
+        columns = (xyz, thin.rgb, thin.label, thin.time, thin.intensity)
         rows[name] = np.column_stack([column[both] for column in columns if column is not None])
     assert np.array_equal(rows["a"], rows["b"])
 
@@ -403,10 +405,10 @@ def test_a_real_reconstruction_cut_in_two_meets_again(tmp_path: Path) -> None:
     where, raw = cells(seeds), {}
     for name, cell in where.items():
         origin = tuple(np.floor((*cell.seed, 33.0)).tolist())
-        world = everywhere(whole)
-        part = replace(whole, frame=replace(frame, origin=origin), xyz=(world - origin).astype(np.float32))
+        xyz = everywhere(whole)
+        part = replace(whole, frame=replace(frame, origin=origin), xyz=(xyz - origin).astype(np.float32))
         raw[name] = tmp_path / f"{name}.npz"
-        part.take(np.flatnonzero(cell.outside(world[:, :2]) <= 5)).save(raw[name])
+        part.take(np.flatnonzero(cell.outside(xyz[:, :2]) <= 5)).save(raw[name])
     meshes = {}
     for name, cell in where.items():
         out, other = tmp_path / name, "b" if name == "a" else "a"
@@ -417,9 +419,9 @@ def test_a_real_reconstruction_cut_in_two_meets_again(tmp_path: Path) -> None:
         surface = go(TRIM, out / "3", {"mesh": surface, "cloud": thin}, **TRIM.per_class["terrain"]).files["mesh"]
         meshes[name] = Mesh.load(go(ISLANDS, out / "4", {"mesh": surface}).files["mesh"])
     clips, joined = met(meshes, where)
-    before = border.gap(clips["a"].mesh, clips["b"].mesh, where["a"], "b")
+    before = gap(clips["a"].mesh, clips["b"].mesh, where["a"], "b")
     assert before.shared < 0.1 and before.mean_m > 0.0005 and before.length_m > 20
     small = {name: simplify(mesh, 10_000) for name, mesh in joined.items()}
-    after = border.gap(small["a"], small["b"], where["a"], "b")
+    after = gap(small["a"], small["b"], where["a"], "b")
     assert after.shared > 0.99 and after.p99_m == 0 and after.one_sided_m == 0 and after.overlap_m < 0.005
-    assert border.join("b", clips, 0.3, 0.5).turned == 0 and crowded(joined["b"]) <= crowded(clips["b"].mesh)
+    assert join("b", clips, 0.3, 0.5).turned == 0 and crowded(joined["b"]) <= crowded(clips["b"].mesh)

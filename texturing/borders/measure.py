@@ -13,6 +13,9 @@ if TYPE_CHECKING:
     from scan2sim.pipeline.cells import Cell
     from scan2sim.pipeline.io.textured import Textured
 
+SPACING = 0.01
+"""Metres between the places of an edge where colours are compared: other places than those that are levelled."""
+
 
 def borders(inputs: Inputs, params: CellParams, out: Path, report: Report) -> Done:
     """Measure the borders of `textured.GROUP` with those of the neighbours, `textured.GROUP.NAME`.
@@ -37,16 +40,36 @@ def borders(inputs: Inputs, params: CellParams, out: Path, report: Report) -> Do
 
 
 def _measured(own: Textured, other: Textured, cell: Cell, name: str) -> dict[str, float]:
-    from scan2sim.pipeline.border import gap
-    from scan2sim.texturing.border_colours import border_step
+    from scan2sim.pipeline.borders.gap import gap
 
-    between, (step, p95, _) = gap(own.mesh, other.mesh, cell, name), border_step(own, other)
+    between, (step, p95, _) = gap(own.mesh, other.mesh, cell, name), colour_step(own, other)
     values = {
         "length_m": between.length_m, "gap_m": between.max_m, "gap_p99_m": between.p99_m,
         "one_sided_m": between.one_sided_m,
         "shared": between.shared, "overlap_m": between.overlap_m, "colour_step": step, "colour_step_p95": p95,
     }  # fmt: skip
     return {key: round(float(value), 6 if key.startswith("gap") else 4) for key, value in values.items()}
+
+
+def colour_step(a: Textured, b: Textured) -> tuple[float, float, float]:
+    """The colour step between two textured meshes where they meet: (mean, 95th percentile, metres of border).
+
+    Grey levels, absolute, over places (other ones than `level` works with) and channels; zero where they don't meet.
+
+    Raises:
+        InputError: a page can't be read.
+    """
+    import numpy as np
+
+    from scan2sim.texturing.borders.meeting import meet, rim
+    from scan2sim.texturing.borders.showing import colours
+
+    border = meet([rim(a.mesh), rim(b.mesh)], SPACING)
+    if not len(border):
+        return 0.0, 0.0, 0.0
+    one, two = (colours(looks, t.pages, len(border)) for looks, t in zip(border.looks, (a, b), strict=True))
+    step = np.abs(one - two)
+    return float(step.mean()), float(np.percentile(step, 95)), border.length[0]
 
 
 BORDERS = Step("borders", 1, borders, CellParams)

@@ -1,0 +1,1 @@
+"""Borders: where tiles that were made apart meet, with the same vertices at the same height."""
