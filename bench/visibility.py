@@ -33,8 +33,9 @@ from scan2sim.data_samples.scanner import plan_drive
 from scan2sim.data_samples.scene import Scene
 from scan2sim.data_samples.street import generate
 from scan2sim.flows.execute import execute
+from scan2sim.flows.graph import NodeId, needed
 from scan2sim.flows.planning import plan
-from scan2sim.flows.recipe import Node, Output, recipe
+from scan2sim.flows.recipe import recipe
 from scan2sim.flows.settings import Settings
 from scan2sim.pipeline import visibility
 from scan2sim.pipeline.cameras import inside, project
@@ -143,24 +144,16 @@ def main() -> None:
 
 def make(tile: Tile, out: Path) -> Made:
     """Run our recipe up to what depth maps are drawn from; what an earlier run has finished is kept."""
-    meshes, clouds = [f"decimate.{g}" for g in GROUPS], [f"voxel.{part}" for part in (*GROUPS, "rest")]
+    meshes, clouds = [NodeId("decimate", g) for g in GROUPS], [NodeId("voxel", part) for part in (*GROUPS, "rest")]
     store = Store(out)
-    planned = plan(needed(recipe(tile, Settings()), {*meshes, *clouds}), store)
+    planned = plan(needed(recipe(tile, Settings()), [*meshes, *clouds]), store)
     execute(planned, store, jobs=2, watch=lambda node, event, fraction, message: None)
-    folder = {p.node.label: store.folder(p.node.label, p.key) for p in planned}
+    folder = {p.node.id: store.folder(p.node.label, p.key) for p in planned}
     return Made(
-        {g: Mesh.load(folder[label] / "mesh.npz") for g, label in zip(GROUPS, meshes, strict=True)},
-        PointCloud.join([PointCloud.load(folder[label] / "cloud.npz") for label in clouds]),
+        {g: Mesh.load(folder[node] / "mesh.npz") for g, node in zip(GROUPS, meshes, strict=True)},
+        PointCloud.join([PointCloud.load(folder[node] / "cloud.npz") for node in clouds]),
         tile.views,
     )
-
-
-def needed(nodes: list[Node], labels: set[str]) -> list[Node]:
-    """Of a recipe, the nodes of these labels and all that they depend on, in order."""
-    for node in reversed(nodes):
-        if node.label in labels:
-            labels = labels | {source.node for source in node.inputs.values() if isinstance(source, Output)}
-    return [node for node in nodes if node.label in labels]
 
 
 def draw(meshes: dict[str, Mesh], view: View, count: int, seed: int) -> Iterator[tuple[str, tuple[F32, F32]]]:

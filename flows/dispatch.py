@@ -8,10 +8,11 @@ from functools import partial
 from queue import SimpleQueue
 from typing import Any, Protocol
 
-from scan2sim.flows.execute import Frontier
+from scan2sim.flows.execute import Frontier, Outcome
+from scan2sim.flows.graph import NodeId
 from scan2sim.flows.planning import Planned
 from scan2sim.pipeline.errors import DamagedError, ScanError, StepError
-from scan2sim.pipeline.store import Manifest, Store
+from scan2sim.pipeline.store import Store
 
 PERIOD = 1.0  # seconds between two looks; what shows it may cost a tenth of one
 
@@ -29,11 +30,10 @@ class Future(Protocol):
 def dispatch(
     planned: Sequence[Planned],
     store: Store,
-    failures: dict[str, ScanError],
     submit: Callable[[Planned], Future],
     at_once: int,
     show: Callable[[str, float], None],
-) -> dict[str, Manifest]:
+) -> Outcome:
     """Submit what a plan says is missing as soon as what it reads is there; an `execute.Executor` but for the rest.
 
     Steps are submitted when they can run, not before: those that wait would take the places of those that could.
@@ -44,42 +44,39 @@ def dispatch(
         show: told a tile's name and how many percent of its steps are done, once a second at most.
     """
     board = Board(planned, show)
-    front = Frontier(planned, store, lambda node, event, *_: None if event == "again" else board.end(node.label))
-    running: dict[str, tuple[Planned, Future]] = {}
-    ended: SimpleQueue[str] = SimpleQueue()
+    front = Frontier(planned, store, lambda node, event, *_: None if event == "again" else board.end(node.id))
+    running: dict[NodeId, tuple[Planned, Future]] = {}
+    ended: SimpleQueue[NodeId] = SimpleQueue()
     while front or running:
         for item in front.ready():
             if len(running) >= at_once:
                 break
-            label = item.node.label
-            front.take(label)
-            running[label] = (item, submit(item))
-            running[label][1].add_done_callback(partial(_tell, ended, label))
+            front.take(item)
+            running[item.node.id] = (item, submit(item))
+            running[item.node.id][1].add_done_callback(partial(_tell, ended, item.node.id))
         if running:
-            label = ended.get()
-            item, future = running.pop(label)
+            item, future = running.pop(ended.get())
             try:
                 outcome = future.result(raise_on_failure=False)
             except Exception as error:  # the runner has given the step up: it took several workers with it
                 outcome = error
             if isinstance(outcome, DamagedError):
-                front.again(item, outcome.where)
+                front.again(item, outcome)
                 continue
+            label = item.node.label
             manifest = None if isinstance(outcome, BaseException) else store.find(label, item.key)
             if manifest is not None:
                 front.end(item, manifest)
             else:
                 cause = f"its worker failed ({type(outcome).__name__}: {outcome})"
                 lost = StepError(label, cause, "Run again: what is finished is kept; the worker's log tells more")
-                failures[label] = outcome if isinstance(outcome, ScanError) else lost
-                front.fail(label)
-            board.end(label)
+                front.fail(item, outcome if isinstance(outcome, ScanError) else lost)
     board.flush()
-    return front.done
+    return front.outcome
 
 
-def _tell(ended: SimpleQueue[str], label: str, _: object) -> None:
-    ended.put(label)
+def _tell(ended: SimpleQueue[NodeId], node: NodeId, _: object) -> None:
+    ended.put(node)
 
 
 class Board:
@@ -92,28 +89,23 @@ class Board:
 
     def __init__(self, planned: Sequence[Planned], show: Callable[[str, float], None]) -> None:
         self._show = show
-        self._left: dict[str, set[str]] = {}
+        self._left: dict[str, set[NodeId]] = {}
         for item in planned:
-            self._left.setdefault(self._tile(item.node.label), set()).add(item.node.label)
-        self._steps = {name: len(labels) for name, labels in self._left.items()}
+            self._left.setdefault(item.node.tile, set()).add(item.node.id)
+        self._steps = {name: len(nodes) for name, nodes in self._left.items()}
         self._changed: set[str] = set()
         self._next = 0.0
 
-    def end(self, label: str) -> None:
+    def end(self, node: NodeId) -> None:
         """A step has ended."""
-        name = self._tile(label)
-        self._left[name].discard(label)
-        self._changed.add(name)
+        self._left[node.tile].discard(node)
+        self._changed.add(node.tile)
         if time.monotonic() >= self._next:
             self.flush()
 
     def flush(self) -> None:
         """Show what has changed."""
         for name in sorted(self._changed):
-            self._show(name, 100.0 * (1 - len(self._left[name]) / self._steps[name]))
+            self._show(name or "tile", 100.0 * (1 - len(self._left[name]) / self._steps[name]))
         self._changed.clear()
         self._next = time.monotonic() + PERIOD
-
-    @staticmethod
-    def _tile(label: str) -> str:
-        return label.rpartition("/")[0] or "tile"

@@ -15,7 +15,7 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 from rich.table import Column
 
 from scan2sim.flows.execute import Event
-from scan2sim.flows.recipe import Node
+from scan2sim.flows.graph import Node
 from scan2sim.pipeline.errors import printable
 from scan2sim.pipeline.step import Report
 

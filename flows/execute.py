@@ -17,6 +17,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from functools import cache
 from multiprocessing import forkserver
 from multiprocessing.connection import Connection, wait
@@ -25,9 +26,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from scan2sim import __version__
+from scan2sim.flows.graph import Node, NodeId
 from scan2sim.flows.memory import need, share
 from scan2sim.flows.planning import Planned, check
-from scan2sim.flows.recipe import Node
 from scan2sim.pipeline import libraries
 from scan2sim.pipeline.errors import BusyError, DamagedError, ScanError, StepError, UnavailableError, from_os_error
 from scan2sim.pipeline.step import Report, silent
@@ -42,67 +43,103 @@ SAID = 10_000
 Event = Literal["start", "progress", "done", "kept", "failed", "again"]
 Watch = Callable[[Node, Event, float, str], None]
 """Told what happens: node, event, fraction done, message."""
-Executor = Callable[["list[Planned]", Store, dict[str, ScanError]], dict[str, Manifest]]
-"""Runs what a plan says is missing, notes failures by label, and returns what is done."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a plan.
+
+    Attributes:
+        done: results, what is kept from before among them.
+        failed: why others failed; what depends on them is in neither.
+    """
+
+    done: Mapping[NodeId, Manifest]
+    failed: Mapping[NodeId, ScanError]
+
+    def of_tile(self, tile: str = "") -> dict[str, Manifest]:
+        """Results of one tile by their names within it (`poisson.terrain`)."""
+        return {node.name: manifest for node, manifest in self.done.items() if node.tile == tile}
+
+    def check(self) -> None:
+        """Raise the first error, if any node failed."""
+        for error in self.failed.values():
+            raise error
+
+
+Executor = Callable[[list[Planned], Store], Outcome]
+"""Runs what a plan says is missing."""
 
 
 class Frontier:
     """Which nodes of a plan can run next, as results come in.
 
     Attributes:
-        done: results by label; what is kept from before comes by itself.
+        done: results; what is kept from before comes by itself.
+        failed: why others failed.
     """
 
     def __init__(self, planned: Sequence[Planned], store: Store, watch: Watch) -> None:
-        self.done: dict[str, Manifest] = {}
+        self.done: dict[NodeId, Manifest] = {}
+        self.failed: dict[NodeId, ScanError] = {}
         self._store, self._watch = store, watch
-        self._planned = {item.node.label: item for item in planned}
+        self._planned = {item.node.id: item for item in planned}
+        self._labels = {item.node.label: item.node.id for item in planned}
         self._waiting = dict(self._planned)
-        self._missing: set[str] = set()  # known not to be kept
-        self._lost: set[str] = set()  # failed, or in need of what failed
+        self._missing: set[NodeId] = set()  # known not to be kept
+        self._lost: set[NodeId] = set()  # failed, or in need of what failed
 
     def __bool__(self) -> bool:
         return bool(self._waiting)
 
+    @property
+    def outcome(self) -> Outcome:
+        """As far as the plan has come."""
+        return Outcome(self.done, self.failed)
+
     def ready(self) -> Iterator[Planned]:
         """Nodes that can run now, in the plan's order; to be taken, or offered again."""
-        for label, item in list(self._waiting.items()):
+        for node, item in list(self._waiting.items()):
             if not self._lost.isdisjoint(item.upstream):
-                self.fail(label)
+                self.take(item)
+                self._lost.add(node)
             elif all(name in self.done for name in item.upstream):
-                kept = None if label in self._missing else item.kept(self._store)
+                kept = None if node in self._missing else item.kept(self._store)
                 if kept is None:
-                    self._missing.add(label)
+                    self._missing.add(node)
                     yield item
                 else:
-                    self.take(label)
-                    self.done[label] = kept
+                    self.take(item)
+                    self.done[node] = kept
                     self._watch(item.node, "kept", 1.0, "")
 
-    def take(self, label: str) -> None:
+    def take(self, item: Planned) -> None:
         """The node has been started."""
-        self._waiting.pop(label, None)
+        self._waiting.pop(item.node.id, None)
 
     def end(self, item: Planned, manifest: Manifest) -> None:
         """The node is done; what it has read was intact."""
-        self.done[item.node.label] = manifest
-        for label in (item.node.label, *item.upstream):
-            self._store.trust(label, self._planned[label].key)
+        self.done[item.node.id] = manifest
+        for node in (item.node.id, *item.upstream):
+            self._store.trust(node.label, self._planned[node].key)
         self._watch(item.node, "done", 1.0, "")
 
-    def again(self, item: Planned, damaged: str) -> None:
+    def again(self, item: Planned, error: DamagedError) -> None:
         """The node has met a result that is damaged: that is made anew, and the node waits for it."""
-        self._waiting[item.node.label] = item
+        self._waiting[item.node.id] = item
+        damaged = self._labels[error.where]
         if self.done.pop(damaged, None) is not None:
-            self._store.discard(damaged, self._planned[damaged].key)
+            self._store.discard(damaged.label, self._planned[damaged].key)
             self._missing.add(damaged)
             self._waiting[damaged] = self._planned[damaged]
         self._watch(item.node, "again", 0.0, f"the kept result of {damaged} is damaged: made anew")
 
-    def fail(self, label: str) -> None:
+    def fail(self, item: Planned, error: ScanError) -> None:
         """The node, and whatever depends on it, will not be done."""
-        self.take(label)
-        self._lost.add(label)
+        self.take(item)
+        self._lost.add(item.node.id)
+        self.failed[item.node.id] = error
+        self._watch(item.node, "failed", 1.0, error.cause)
 
 
 def execute(
@@ -111,19 +148,18 @@ def execute(
     *,
     jobs: int,
     watch: Watch,
-    failures: dict[str, ScanError] | None = None,
+    to_the_end: bool = False,
     memory: float | None = None,
-) -> dict[str, Manifest]:
+) -> Outcome:
     """Run what the plan says is missing, up to `jobs` nodes at a time, each in a process of its own.
 
     Args:
-        failures: gets what went wrong, by node's label: what doesn't depend on it is run all the same.
-            Without it the first failure ends the run.
+        to_the_end: run all that doesn't depend on what has failed, rather than stop at the first failure.
         memory: GB that nodes may need together (`flows.memory`); one that needs more runs alone.
 
     Raises:
-        ScanError: of a node that can't run here, before any does; of the first that failed; what was finished is kept.
-        KeyboardInterrupt: likewise.
+        ScanError: of a node that can't run here, before any does.
+        KeyboardInterrupt: what was finished is kept.
     """
     check(planned)
     front = Frontier(planned, store, watch)
@@ -139,25 +175,22 @@ def execute(
                         continue
                     started, process = _start(item, store)
                 except DamagedError as error:
-                    front.again(item, error.where)
+                    front.again(item, error)
                     break
-                front.take(item.node.label)
+                front.take(item)
                 watch(item.node, "start", 0.0, "")
                 running[started] = (item, process, needed)
             for connection in wait(list(running), timeout=1.0) if running else ():
                 assert isinstance(connection, Connection)
                 item, process, _ = running[connection]
-                label = item.node.label
                 try:
                     manifest = _receive(connection, item, process, watch)
                 except DamagedError as error:
-                    front.again(item, error.where)
+                    front.again(item, error)
                 except ScanError as error:
-                    if failures is None:
-                        raise
-                    failures[label] = error
-                    front.fail(label)
-                    watch(item.node, "failed", 1.0, error.cause)
+                    front.fail(item, error)
+                    if not to_the_end:
+                        return front.outcome
                 else:
                     if manifest is None:
                         continue
@@ -167,7 +200,7 @@ def execute(
     finally:
         for _, process, _ in running.values():
             _stop(process)
-    return front.done
+    return front.outcome
 
 
 def check_version(item: Planned, wanted: Mapping[str, str]) -> None:

@@ -70,14 +70,14 @@ def _finish_tile(one: Made, store: Store, out: Path, settings: Settings) -> None
     """A tile's folder, as `scan2sim run` leaves it; what is no longer of use is removed from the store."""
     assert one.tile is not None and one.done is not None
     planned, done = list(one.planned), dict(one.done)
-    keys = {item.node.label: item.key for item in planned}
+    keys = {item.node.id.name: item.key for item in planned}
     out.mkdir(parents=True, exist_ok=True)
     if not (one.kept and is_finished(store, planned, out)):
         for label in keys.keys() & to_read(store, planned, out):
             store.read(label, keys[label])
         for warning in publish(store, planned, done, out, one.tile, settings):
             warn(warning)
-        seconds = sum(done[item.node.label].seconds for item in planned if item.reason is not None)
+        seconds = sum(done[item.node.id.name].seconds for item in planned if item.reason is not None)
         shown = store.folder("pictures", keys["pictures"]) / done["pictures"].files["pictures"] / "hero.jpg"
         if shown.is_file():
             shutil.copyfile(shown, out / PICTURE)

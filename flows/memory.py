@@ -21,30 +21,12 @@ if TYPE_CHECKING:
 SLOT = 0.25  # GB; memory is shared out in pieces of it
 LARGEST = 20_000  # GB, of what steps may need together
 PAUSE = 0.2  # seconds between looks for free memory
-NEEDS: dict[str, tuple[float, float]] = {
-    "ingest": (0.4, 12),
-    "carve": (0.5, 6),
-    "label": (1.5, 3),
-    "segment": (0.5, 6),
-    "poisson": (0.4, 70),
-    "trim": (0.4, 12),
-    "decimate": (0.4, 30),
-    "unwrap": (0.5, 10),
-    "visibility": (0.7, 3),
-    "texture": (1.2, 3),
-    "level": (1.0, 3),
-    "pictures": (1.3, 3),
-    "rasters": (1.3, 3),
-    "score": (1.3, 3),
-}
-"""Of a step: GB at least, and GB for every GB that it reads; measured on generated streets (docs/scale.md)."""
-OTHERS = (0.5, 6)
 PHOTO = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 
 
 def need(item: Planned, store: Store) -> float:
     """GB that a node is expected to need at its peak, from the sizes of what it reads."""
-    least, share = NEEDS.get(item.node.step.name, OTHERS)
+    least, share = item.node.step.memory
     # photos are read one after the other, and are no matter of the whole
     sizes = [_size(path) for path in item.inputs(store).values() if path.suffix.lower() not in PHOTO]
     return least + share * sum(sizes) / 1e9

@@ -4,15 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
+from enum import Enum
 from pathlib import Path
 
-from scan2sim.flows.recipe import Node, Output
+from scan2sim.flows.graph import Node, NodeId, Output
 from scan2sim.pipeline import libraries
 from scan2sim.pipeline.errors import DamagedError
 from scan2sim.pipeline.store import Manifest, Store, digest, key_of
 
-AGAIN = ("forced", "asked", "follows")
-"""How reasons begin by which a node runs though its result is there."""
+
+class Reason(Enum):
+    """Why a node runs; the value says it to the user."""
+
+    NEW = "it was never run"
+    CHANGED = "its input, settings or version changed"
+    DAMAGED = "its result was damaged or deleted"
+    FORCED = "forced"
+    ASKED = "asked for by --from"
+    FOLLOWS = "follows what --from asks for"
+
+    @property
+    def again(self) -> bool:
+        """Whether it holds though a result may be there."""
+        return self in (Reason.FORCED, Reason.ASKED, Reason.FOLLOWS)
 
 
 @dataclass(frozen=True)
@@ -26,16 +40,16 @@ class Planned:
     node: Node
     key: str
     keys: dict[str, str]
-    reason: str | None
+    reason: Reason | None
 
     @property
     def again(self) -> bool:
         """Whether it is to run though its result may be there."""
-        return (self.reason or "").startswith(AGAIN)
+        return self.reason is not None and self.reason.again
 
     @property
-    def upstream(self) -> list[str]:
-        """Labels of the nodes whose outputs it reads."""
+    def upstream(self) -> list[NodeId]:
+        """The nodes whose outputs it reads."""
         return [source.node for source in self.node.inputs.values() if isinstance(source, Output)]
 
     def fed(self, store: Store) -> str:
@@ -47,7 +61,7 @@ class Planned:
         contents = dict(self.keys)
         for name, source in self.node.inputs.items():
             if isinstance(source, Output):
-                manifest = self._found(store.find(source.node, self._key(name)), source)
+                manifest = self._found(store.find(source.node.label, self._key(name)), source)
                 contents[name] = f"{manifest.content}/{source.name}"
         return key_of(self.node.step, self.node.params, contents)
 
@@ -67,8 +81,8 @@ class Planned:
         paths = {}
         for name, source in self.node.inputs.items():
             if isinstance(source, Output):
-                manifest = self._found(store.read(source.node, self._key(name)), source)
-                paths[name] = store.folder(source.node, self._key(name)) / manifest.files[source.name]
+                manifest = self._found(store.read(source.node.label, self._key(name)), source)
+                paths[name] = store.folder(source.node.label, self._key(name)) / manifest.files[source.name]
             else:
                 paths[name] = store.source(source)
         return paths
@@ -80,15 +94,15 @@ class Planned:
             DamagedError: naming the node whose result is to be made anew.
         """
         for name, source in self.node.inputs.items():
-            if isinstance(source, Output) and not store.intact(source.node, self._key(name)):
-                raise DamagedError(source.node)
+            if isinstance(source, Output) and not store.intact(source.node.label, self._key(name)):
+                raise DamagedError(source.node.label)
 
     def _key(self, name: str) -> str:
         return self.keys[name].split("/")[0]
 
     def _found(self, manifest: Manifest | None, source: Output) -> Manifest:
         if manifest is None:
-            raise DamagedError(source.node, "its result has gone in the meantime")
+            raise DamagedError(source.node.label, "its result has gone in the meantime")
         return manifest
 
 
@@ -107,7 +121,7 @@ def plan(
         digest: of a source file.
         start: the name of a step that runs again, with all that depends on it.
     """
-    planned: dict[str, Planned] = {}
+    planned: dict[NodeId, Planned] = {}
     digests: dict[Path, str] = {}
     for node in nodes:
         keys = {}
@@ -121,14 +135,12 @@ def plan(
         key = key_of(node.step, node.params, keys)
         reason = _reason(node, key, store)
         if force:
-            reason = "forced"
+            reason = Reason.FORCED
         elif start is not None and node.step.name == start:
-            reason = f"asked for by --from {start}"
-        elif start is not None:
-            upstream = [s.node for s in node.inputs.values() if isinstance(s, Output)]
-            again = [name for name in upstream if planned[name].again]
-            reason = f"follows {again[0]}" if again else reason
-        planned[node.label] = Planned(node, key, keys, reason)
+            reason = Reason.ASKED
+        elif any(planned[s.node].again for s in node.inputs.values() if isinstance(s, Output)):
+            reason = Reason.FOLLOWS
+        planned[node.id] = Planned(node, key, keys, reason)
     return list(planned.values())
 
 
@@ -147,19 +159,19 @@ def check(planned: Sequence[Planned]) -> None:
             node.step.check(node.params)
 
 
-def drop_damaged(planned: Sequence[Planned], store: Store, labels: Collection[str]) -> bool:
-    """Remove those results of these nodes that are kept, and not as they were made; whether there were any."""
-    kept = [item for item in planned if item.reason is None and item.node.label in labels]
+def drop_damaged(planned: Sequence[Planned], store: Store, names: Collection[str]) -> bool:
+    """Remove those results of nodes of these names that are kept, and not as they were made; whether there were any."""
+    kept = [item for item in planned if item.reason is None and item.node.id.name in names]
     damaged = [item for item in kept if not store.intact(item.node.label, item.key)]
     for item in damaged:
         store.discard(item.node.label, item.key)
     return bool(damaged)
 
 
-def _reason(node: Node, key: str, store: Store) -> str | None:
+def _reason(node: Node, key: str, store: Store) -> Reason | None:
     if store.find(node.label, key) is not None:
         return None
     if store.folder(node.label, key).exists():
-        return "its result was damaged or deleted"
+        return Reason.DAMAGED
     others = [p for p in (store.root / node.label).glob("*") if not p.name.startswith(".")]
-    return "its input, settings or version changed" if others else "it was never run"
+    return Reason.CHANGED if others else Reason.NEW

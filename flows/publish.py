@@ -35,7 +35,7 @@ def publish(
     Raises:
         DamagedError: a result has gone in the meantime.
     """
-    keys = {p.node.label: p.key for p in planned}
+    keys = {p.node.id.name: p.key for p in planned}
     changed: list[Path] = []
     places = _published(store, keys, out)
     for label in PLACES.keys() & done.keys():
@@ -63,14 +63,14 @@ def publish(
 
 def to_read(store: Store, planned: Iterable[Planned], out: Path) -> set[str]:
     """Labels of results that will be read for what is shown; what is published already isn't read again."""
-    keys = {item.node.label: item.key for item in planned}
+    keys = {item.node.id.name: item.key for item in planned}
     places = _published(store, keys, out)
     return {*READ, *(label for label, (source, place) in places.items() if not _current(source, place, keys[label]))}
 
 
 def published(store: Store, planned: Iterable[Planned], out: Path) -> bool:
     """Whether all that is published beside the report is as the kept results are, file by file."""
-    keys = {item.node.label: item.key for item in planned}
+    keys = {item.node.id.name: item.key for item in planned}
     places = _published(store, keys, out)
     return "export" in places and all(_current(*both, keys[label]) for label, both in places.items())
 

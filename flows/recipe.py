@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from scan2sim.flows.graph import Node, NodeId, Output
 from scan2sim.flows.settings import Settings
 from scan2sim.pipeline.classes import GROUPS
 from scan2sim.pipeline.io import views as views_io
-from scan2sim.pipeline.step import Params, Step
+from scan2sim.pipeline.step import Step
 from scan2sim.pipeline.steps.carve import CARVE
 from scan2sim.pipeline.steps.clip import CLIP
 from scan2sim.pipeline.steps.collision import COLLISION
@@ -58,31 +58,6 @@ STEPS: tuple[Step, ...] = (
     POISSON, TRIM, PLANES, ISLANDS, CLIP, JOIN, DECIMATE, PLANTS, UNWRAP, REFINE, SIGNS, VISIBILITY, EXPOSURE,
     AGREEMENT, CHOOSE, TEXTURE, LEVEL, COLLISION, EXPORT, RASTERS, GEOMETRY, SCORE, PICTURES, PREVIEW, BORDERS,
 )  # fmt: skip
-PER_CLASS: tuple[Step, ...] = (VOXEL, POISSON, TRIM, ISLANDS, CLIP, JOIN, DECIMATE, CHOOSE, UNWRAP, TEXTURE, LEVEL)
-
-
-@dataclass(frozen=True)
-class Output:
-    """An output of a node, as another's input."""
-
-    node: str
-    name: str
-
-
-@dataclass(frozen=True)
-class Node:
-    """A step to be run.
-
-    Attributes:
-        label: unique in the graph: the step's name, with the class where it is per class.
-        step, params: what is run.
-        inputs: name to a source file, or to another node's output.
-    """
-
-    label: str
-    step: Step
-    params: Params
-    inputs: Mapping[str, Path | Output]
 
 
 def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None) -> list[Node]:
@@ -97,16 +72,16 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
     Raises:
         SettingError: a setting that doesn't exist or is out of range.
     """
-    settings.check(STEPS, PER_CLASS)
+    settings.check(STEPS)
     nodes: list[Node] = []
 
-    def at(label: str, name: str, other: str = tile.name) -> Output:
+    def at(step: Step, name: str, group: str = "", other: str = tile.name) -> Output:
         """An output of a node of this tile, or of a neighbour."""
-        return Output(label if beside is None else f"{other}/{label}", name)
+        return Output(NodeId(step.name, group, "" if beside is None else other), name)
 
-    def add(step: Step, inputs: Mapping[str, Path | Output], group: str | None = None, **given: Any) -> None:
-        label = f"{step.name}.{group}" if group else step.name
-        nodes.append(Node(at(label, "").node, step, settings.params(step, group, **given), inputs))
+    def add(step: Step, inputs: Mapping[str, Path | Output], group: str = "", **given: Any) -> None:
+        of = "" if beside is None else tile.name
+        nodes.append(Node(step, settings.params(step, group, **given), inputs, group, of))
 
     frame: dict[str, Any] = {"crs": tile.frame.crs, "origin": tile.frame.origin, "unit": tile.frame.unit}
     files = {f"cloud.{i:04d}": path for i, path in enumerate(tile.clouds)}
@@ -114,44 +89,44 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
     path = scanner_path(tile)
     if path:
         add(PATH, {}, **path)
-    scanner = {"path": at("path", "path")} if path else {}
+    scanner = {"path": at(PATH, "path")} if path else {}
     cameras = _rows([view.centre for view in tile.views if view.camera.model != "orthographic"])
     rays = scanner if tile.trajectory is not None else {}  # cameras aren't where the scanner was
-    add(CARVE, {"cloud": at("ingest", "cloud")} | rays, cameras=cameras)
-    whole = {"cloud": at("carve", "cloud")}
-    moving = {"moving": at("carve", "moving")}
+    add(CARVE, {"cloud": at(INGEST, "cloud")} | rays, cameras=cameras)
+    whole = {"cloud": at(CARVE, "cloud")}
+    moving = {"moving": at(CARVE, "moving")}
     photos: dict[str, Path | Output] = {f"photo.{i}": view.photo for i, view in enumerate(tile.views)}
     masks: dict[str, Path | Output] = {f"mask.{i}": view.mask for i, view in enumerate(tile.views) if view.mask}
     add(VIEWS, photos | masks | whole, poses=tuple(views_io.to_json(view, with_paths=False) for view in tile.views))
-    seen: dict[str, Path | Output] = {"views": at("views", "views")}
+    seen: dict[str, Path | Output] = {"views": at(VIEWS, "views")}
     photographed = any(view.camera.model != "orthographic" for view in tile.views)
     if photographed:
         add(LABEL, whole | seen | _weights(settings), **_kept(settings))
-    told = {**seen, **moving, "labels": at("label", "labels")} if photographed else {}
+    told = {**seen, **moving, "labels": at(LABEL, "labels")} if photographed else {}
     add(SEGMENT, whole | scanner | told)
-    last = "segment"  # step whose cloud is split, in every tile of a survey the same
+    last = SEGMENT  # step whose cloud is split, in every tile of a survey the same
     cell: dict[str, Any] = {"seed": tile.cell.seed, "neighbours": dict(tile.cell.neighbours)} if tile.cell else {}
     met = [name for name in cell.get("neighbours", {}) if name in (beside or ())]
     first = [name for name in met if name < tile.name]  # they own the borders with this one
     listed: dict[str, Path | Output] = {}
     if settings.params(THINGS).find and (path or met):
-        classified = {name: at("segment", name) for name in ("cloud", "confidence")}
+        classified = {name: at(SEGMENT, name) for name in ("cloud", "confidence")}
         add(THINGS, classified | moving | scanner)
-        last, listed = "things", {"things": at("things", "things")} if path else {}
+        last, listed = THINGS, {"things": at(THINGS, "things")} if path else {}
     limit = settings.params(REACH).limit
     if limit != "off" and (met or (path and (photographed or limit != "auto"))):
         shown = seen if photographed else {}
         add(REACH, {"cloud": at(last, "cloud")} | scanner | shown, voxel=settings.params(VOXEL, "terrain").size)
-        last = "reach"
+        last = REACH
     cloud = at(last, "cloud")
     if met and tile.cell:
-        others = {f"cloud.{name}": at(last, "cloud", name) for name in met}
+        others = {f"cloud.{name}": at(last, "cloud", other=name) for name in met}
         add(OVERLAP, {"cloud": cloud} | others, name=tile.name, buffer=tile.cell.buffer, **cell)
-        cloud = at("overlap", "cloud")
+        cloud = at(OVERLAP, "cloud")
     standing: dict[str, Path | Output] = {}
     if path and settings.params(FURNITURE).when == "auto":
         add(FURNITURE, {"cloud": cloud} | scanner, **cell)
-        standing = {name: at("furniture", name) for name in (*GROUPS[1:], "taken", "plates", "geojson", "csv")}
+        standing = {name: at(FURNITURE, name) for name in (*GROUPS[1:], "taken", "plates", "geojson", "csv")}
     kept = listed if settings.params(SPLIT).vehicles == "keep" else {}
     add(SPLIT, {"cloud": cloud} | kept | {name: standing[name] for name in standing if name == "taken"})
 
@@ -160,7 +135,7 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
     groups += ["vehicle"] if kept else []
     parted = (*GROUPS, "rest", "vehicle") if kept else (*GROUPS, "rest")
     for part in parted:
-        add(VOXEL, {"cloud": at("split", part)} | scanner, part)
+        add(VOXEL, {"cloud": at(SPLIT, part)} | scanner, part)
     made: dict[str, dict[str, Path | Output]] = {}  # by group, what no airborne scanner sees
     around = {"name": tile.name, "buffer": tile.cell.buffer, **cell} if tile.cell else {}
     for step, group, parts in (
@@ -170,89 +145,89 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
         when = settings.params(step).when
         hidden = listed if step is GROUND and when == "auto" else {}
         if when == "always" or (when == "auto" and not path) or hidden:
-            seen_from_above = {part: at(f"voxel.{part}", "cloud") for part in parts}
-            theirs = {f"{part}.{name}": at(f"voxel.{part}", "cloud", name) for part in parts for name in met}
+            seen_from_above = {part: at(VOXEL, "cloud", part) for part in parts}
+            theirs = {f"{part}.{name}": at(VOXEL, "cloud", part, name) for part in parts for name in met}
             below: dict[str, Path | Output] = {}
             if step is WALLS:
                 below = {"ground": made["terrain"]["made"]} if "terrain" in made else {}
                 below |= {"footprints": tile.footprints} if tile.footprints else {}
-            others = {f"{k}.{name}": at("things", k, name) for k in hidden for name in met}
+            others = {f"{k}.{name}": at(THINGS, k, other=name) for k in hidden for name in met}
             add(step, seen_from_above | theirs | below | hidden | others, **around)
-            made[group] = {"made": at(step.name, "made")}
+            made[group] = {"made": at(step, "made")}
     if rays and photographed and settings.params(FACADES).when == "auto" and "building" not in made:
         shown = {name: told[name] for name in ("views", "labels")}
         size = settings.params(VOXEL, "building").size
-        beside_it = {f"other.{part}": at(f"voxel.{part}", "cloud") for part in parted if part != "building"}
-        add(FACADES, {"cloud": at("voxel.building", "cloud")} | beside_it | rays | shown, voxel=size, **cell)
-        made["building"] = {"made": at("facades", "made")}
+        beside_it = {f"other.{part}": at(VOXEL, "cloud", part) for part in parted if part != "building"}
+        add(FACADES, {"cloud": at(VOXEL, "cloud", "building")} | beside_it | rays | shown, voxel=size, **cell)
+        made["building"] = {"made": at(FACADES, "made")}
     for group in groups:
-        cloud, size = at(f"voxel.{group}", "cloud"), settings.params(VOXEL, group).size
+        cloud, size = at(VOXEL, "cloud", group), settings.params(VOXEL, group).size
         borne = {"cloud": cloud, **made.get(group, {})}
         add(POISSON, borne, group, voxel=size, aligned=bool(cell))
-        add(TRIM, {"mesh": at(f"poisson.{group}", "mesh"), **borne}, group, voxel=size)
-        surface = at(f"trim.{group}", "mesh")
+        add(TRIM, {"mesh": at(POISSON, "mesh", group), **borne}, group, voxel=size)
+        surface = at(TRIM, "mesh", group)
         when = settings.params(PLANES).when
         if group == "building" and (when == "always" or (when == "auto" and path)):
-            others = {f"other.{part}": at(f"voxel.{part}", "cloud") for part in parted if part != group}
-            points = {"cloud": cloud, "points": at("split", group)}
+            others = {f"other.{part}": at(VOXEL, "cloud", part) for part in parted if part != group}
+            points = {"cloud": cloud, "points": at(SPLIT, group)}
             add(PLANES, {"mesh": surface, **points, **others, **made.get(group, {})}, voxel=size, **cell)
-            surface = at("planes", "mesh")
+            surface = at(PLANES, "mesh")
         add(ISLANDS, {"mesh": surface}, group)
-        surface = at(f"islands.{group}", "mesh")
+        surface = at(ISLANDS, "mesh", group)
         if cell:
             add(CLIP, {"mesh": surface}, group, **cell)
-            clipped = {"mesh": at(f"clip.{group}", "mesh"), "on": at(f"clip.{group}", "on")}
+            clipped = {"mesh": at(CLIP, "mesh", group), "on": at(CLIP, "on", group)}
             surface = clipped["mesh"]
         if met:
-            others = {f"{k}.{name}": at(f"clip.{group}", k, name) for name in first for k in clipped}
+            others = {f"{k}.{name}": at(CLIP, k, group, name) for name in first for k in clipped}
             add(JOIN, clipped | others, group, name=tile.name, **cell)
-            surface = at(f"join.{group}", "mesh")
+            surface = at(JOIN, "mesh", group)
         things = {"furniture": standing[group]} if group in standing else {}
         add(DECIMATE, {"mesh": surface, **things}, group, keep_border=bool(cell))
-    surfaces: dict[str, Path | Output] = {g: at(f"decimate.{g}", "mesh") for g in groups}
+    surfaces: dict[str, Path | Output] = {g: at(DECIMATE, "mesh", g) for g in groups}
     meshes = {f"mesh.{g}": surfaces[g] for g in groups}
-    clouds = {f"cloud.{part}": at(f"voxel.{part}", "cloud") for part in parted}
-    own = {"cloud.furniture": at("split", "furniture")} if standing else {}
+    clouds = {f"cloud.{part}": at(VOXEL, "cloud", part) for part in parted}
+    own = {"cloud.furniture": at(SPLIT, "furniture")} if standing else {}
     invented = {f"made.{group}": points["made"] for group, points in made.items()}
     lists: dict[str, Path | Output] = {}
     if standing:
         lists = {"furniture": standing["geojson"], "furniture_csv": standing["csv"]}
     if vegetation != "mesh":
-        add(PLANTS, {name: at(f"voxel.{name}", "cloud") for name in ("vegetation", "terrain")}, **cell)
-        lists |= {"plants": at("plants", "geojson"), "plants_csv": at("plants", "csv")}
+        add(PLANTS, {name: at(VOXEL, "cloud", name) for name in ("vegetation", "terrain")}, **cell)
+        lists |= {"plants": at(PLANTS, "geojson"), "plants_csv": at(PLANTS, "csv")}
 
     if photographed and settings.params(REFINE).when == "auto":
         add(REFINE, meshes | {"cloud.rest": clouds["cloud.rest"]} | moving | seen)
-        seen = {"views": at("refine", "views")}
+        seen = {"views": at(REFINE, "views")}
     if photographed and standing and settings.params(SIGNS).when == "auto":
         plates = {name: standing[name] for name in ("plates", "geojson")}
-        add(SIGNS, meshes | plates | seen | {"labels": at("label", "labels")}, **cell)
-        surfaces |= {g: at("signs", g) for g in groups if g in ("building", "vegetation")}
+        add(SIGNS, meshes | plates | seen | {"labels": at(LABEL, "labels")}, **cell)
+        surfaces |= {g: at(SIGNS, g) for g in groups if g in ("building", "vegetation")}
         meshes = {f"mesh.{g}": surfaces[g] for g in groups}
-        lists |= {"furniture": at("signs", "geojson"), "furniture_csv": at("signs", "csv")}
+        lists |= {"furniture": at(SIGNS, "geojson"), "furniture_csv": at(SIGNS, "csv")}
     add(VISIBILITY, meshes | clouds | moving | seen)
-    seen = seen | {"depth": at("visibility", "depth")}
+    seen = seen | {"depth": at(VISIBILITY, "depth")}
     prior = settings.params(EXPOSURE).prior
     add(EXPOSURE, seen | ({"prior": Path(prior)} if prior else {}))
-    seen = seen | {"exposures": at("exposure", "exposures")}
+    seen = seen | {"exposures": at(EXPOSURE, "exposures")}
     add(AGREEMENT, seen)
-    seen = seen | {"agreement": at("agreement", "agreement")}
+    seen = seen | {"agreement": at(AGREEMENT, "agreement")}
     for group in groups:
         mesh = {"mesh": surfaces[group]}
         add(CHOOSE, mesh | seen, group)
-        choice = {"choice": at(f"choose.{group}", "choice")}
+        choice = {"choice": at(CHOOSE, "choice", group)}
         by_photo = {**choice, **seen} if settings.params(UNWRAP, group).backend == "photo" else {}
         add(UNWRAP, mesh | by_photo, group)
-        unwrapped = {name: at(f"unwrap.{group}", name) for name in ("mesh", "pages")}
+        unwrapped = {name: at(UNWRAP, name, group) for name in ("mesh", "pages")}
         stood = listed if group == "terrain" and not kept else {}
         add(TEXTURE, {**unwrapped, **choice, **clouds, **own, **invented, **seen, **stood}, group)
-    textured: dict[str, Path | Output] = {g: at(f"texture.{g}", "textured") for g in groups}
+    textured: dict[str, Path | Output] = {g: at(TEXTURE, "textured", g) for g in groups}
     for group in groups if met else ():
-        others = {f"neighbour.{name}": at(f"texture.{group}", "textured", name) for name in met}
+        others = {f"neighbour.{name}": at(TEXTURE, "textured", group, name) for name in met}
         add(LEVEL, {"textured": textured[group]} | others, group)
-        textured[group] = at(f"level.{group}", "textured")
+        textured[group] = at(LEVEL, "textured", group)
     add(COLLISION, surfaces, keep_border=bool(cell))
-    add(EXPORT, textured | lists | listed | {"collision": at("collision", "mesh")}, name=tile.name)
+    add(EXPORT, textured | lists | listed | {"collision": at(COLLISION, "mesh")}, name=tile.name)
     if settings.params(EXPORT).rasters:
         add(RASTERS, textured, name=tile.name, **_fineness(settings))
 
@@ -261,10 +236,10 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
         truth = {"truth.mesh": tile.truth_mesh, "truth.points": tile.truth_points}
     add(GEOMETRY, meshes | clouds | invented | truth, **cell)
     add(SCORE, textured | {name: seen[name] for name in ("views", "depth")} | listed | truth)
-    stages = {f"decimate.{g}": at(f"decimate.{g}", "mesh") for g in groups}
+    stages = {f"decimate.{g}": at(DECIMATE, "mesh", g) for g in groups}
     if met:
-        mine = {f"textured.{g}": at(f"level.{g}", "textured") for g in groups}
-        theirs = {f"textured.{g}.{n}": at(f"level.{g}", "textured", n) for g in groups for n in first}
+        mine = {f"textured.{g}": at(LEVEL, "textured", g) for g in groups}
+        theirs = {f"textured.{g}.{n}": at(LEVEL, "textured", g, n) for g in groups for n in first}
         add(BORDERS, mine | theirs, **cell)
     add(PREVIEW, textured | scanner)
     add(PICTURES, textured | stages | clouds | {"views": seen["views"]} | scanner)
@@ -278,7 +253,7 @@ def check_here(settings: Settings) -> None:
         SettingError: as `recipe`.
         ScanError: of a step that can't run here.
     """
-    settings.check(STEPS, PER_CLASS)
+    settings.check(STEPS)
     for step in STEPS:
         if step.check:
             step.check(settings.params(step))
@@ -293,14 +268,14 @@ def survey_recipe(tiles: Sequence[Tile], settings: Settings) -> list[Node]:
         SettingError: as `recipe`.
     """
     names = [tile.name for tile in tiles]
-    nodes = {node.label: node for tile in tiles for node in recipe(tile, settings, names)}
-    ordered: dict[str, Node] = {}
+    nodes = {node.id: node for tile in tiles for node in recipe(tile, settings, names)}
+    ordered: dict[NodeId, Node] = {}
 
     def add(node: Node) -> None:
         for source in node.inputs.values():
             if isinstance(source, Output) and source.node not in ordered:
                 add(nodes[source.node])
-        ordered.setdefault(node.label, node)
+        ordered.setdefault(node.id, node)
 
     for node in nodes.values():
         add(node)

@@ -34,7 +34,7 @@ def write_report(
     """Write both reports into `out`; returns the page's path."""
     body = figures(tile, done) | {"seconds_this_run": round(seconds, 2)}
     write_whole(out / "report.json", json.dumps(body, indent=1))
-    keys = {p.node.label: p.key for p in planned}
+    keys = {p.node.id.name: p.key for p in planned}
     pictures: list[Picture] = []
     for label, name in (("pictures", "pictures"), ("score", "error")):
         if label in done:

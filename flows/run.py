@@ -12,11 +12,12 @@ from pathlib import Path
 
 from scan2sim.flows import gazebo
 from scan2sim.flows.display import RunDisplay, console, warn
-from scan2sim.flows.execute import Event, Executor, execute, locked, versions
+from scan2sim.flows.execute import Event, Executor, Outcome, execute, locked, versions
 from scan2sim.flows.findings import findings
+from scan2sim.flows.graph import Node
 from scan2sim.flows.planning import Planned, check, drop_damaged, plan
 from scan2sim.flows.publish import publish, to_read
-from scan2sim.flows.recipe import Node, recipe
+from scan2sim.flows.recipe import recipe
 from scan2sim.flows.report import write_report
 from scan2sim.flows.settings import Settings
 from scan2sim.pipeline.errors import ScanError, SettingError, from_os_error
@@ -60,13 +61,12 @@ def run_tile(
         log.write(f"tile {tile.path}, settings {json.dumps(settings.values)}, versions {json.dumps(versions())}")
         missing = sum(p.reason is not None for p in planned)
         with log.errors(out):
-            failures: dict[str, ScanError] = {}
-            done = run(planned, store, failures) if run else execute_shown(planned, store, log, jobs)
-            for error in failures.values():
-                raise error
+            outcome = run(planned, store) if run else execute_shown(planned, store, log, jobs)
+            outcome.check()
+            done = outcome.of_tile()
             changed = publish(store, planned, done, out, tile, settings)
             report = write_report(tile, planned, done, store, out, seconds=time.perf_counter() - began)
-        store.sweep({p.node.label: p.key for p in planned})
+        store.sweep({p.node.id.name: p.key for p in planned})
     for warning in changed:
         warn(warning)
     show_findings(done)
@@ -83,9 +83,9 @@ def execute_shown(
     store: Store,
     log: Log,
     jobs: int = 0,
-    failures: dict[str, ScanError] | None = None,
+    to_the_end: bool = False,
     memory: float | None = None,
-) -> dict[str, Manifest]:
+) -> Outcome:
     """`execute`, with bars on the screen and lines in the log."""
     with RunDisplay(len(planned)) as display:
 
@@ -95,12 +95,12 @@ def execute_shown(
                 log.write(f"{node.label}: {event}{': ' if message else ''}{message}")
 
         jobs = jobs or default_jobs()
-        done = execute(planned, store, jobs=jobs, watch=watch, failures=failures, memory=memory)
-    for label, manifest in done.items():
+        outcome = execute(planned, store, jobs=jobs, watch=watch, to_the_end=to_the_end, memory=memory)
+    for node, manifest in outcome.done.items():
         told = [manifest.facts["told"]] if "told" in manifest.facts else []
         for line in told + [f"warning: {text}" for text in manifest.warnings]:
-            log.write(f"{label}: {line}")
-    return done
+            log.write(f"{node}: {line}")
+    return outcome
 
 
 def show_results(world: Path, report: Path) -> None:
@@ -139,7 +139,7 @@ def show_plan(path: Path, out: Path, settings: Settings, *, force: bool = False,
     check(planned)
     table = Table("step", "would run", "why", box=None, header_style="bold")
     for item in planned:
-        runs, why = ("yes", item.reason) if item.reason else ("no", "kept: same input, settings and version")
+        runs, why = ("yes", item.reason.value) if item.reason else ("no", "kept: same input, settings and version")
         table.add_row(item.node.label, runs, why, style=None if item.reason else "dim")
     console.print(table)
 

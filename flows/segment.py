@@ -9,8 +9,9 @@ import numpy as np
 
 from scan2sim.flows.display import console, progress
 from scan2sim.flows.execute import locked
+from scan2sim.flows.graph import NodeId, needed
 from scan2sim.flows.planning import drop_damaged, plan
-from scan2sim.flows.recipe import Node, Output, recipe
+from scan2sim.flows.recipe import recipe
 from scan2sim.flows.run import STORE, Log, execute_shown, show_warnings
 from scan2sim.flows.settings import Settings
 from scan2sim.pipeline.errors import DataError, SettingError
@@ -23,6 +24,7 @@ from scan2sim.pipeline.store import Store
 from scan2sim.pipeline.types import U8, PointCloud, Tile
 from scan2sim.segmentation.score import confusion
 from scan2sim.segmentation.segment import OWN, SHAPE
+from scan2sim.segmentation.things import THINGS
 
 CLOUDS = (".las", ".laz", ".copc")
 
@@ -39,16 +41,18 @@ def segment_tile(path: Path, out: Path, settings: Settings) -> None:
     with locked(out):
         store = Store(out / STORE)
         nodes = recipe(tile, settings)
-        last = "things" if any(node.label == "things" for node in nodes) else "segment"
-        nodes = up_to(last, nodes)
+        last = "things" if any(node.step is THINGS for node in nodes) else "segment"
+        nodes = needed(nodes, [NodeId(last)])
         planned = plan(nodes, store)
         if drop_damaged(planned, store, {"ingest", "carve", "views", "label", "segment", "things"}):
             planned = plan(nodes, store)
         log = Log(out / "run.log")
         log.write(f"segment {tile.path}, settings {json.dumps(settings.values)}")
         with log.errors(out):
-            done = execute_shown(planned, store, log)
-        keys = {p.node.label: p.key for p in planned}
+            outcome = execute_shown(planned, store, log)
+            outcome.check()
+        done = outcome.of_tile()
+        keys = {p.node.id.name: p.key for p in planned}
         files = {
             (label, name): store.folder(label, keys[label]) / file
             for label, manifest in done.items()
@@ -71,15 +75,6 @@ def segment_tile(path: Path, out: Path, settings: Settings) -> None:
     if own is not None and done["segment"].facts["source"] != "cloud" and done["segment"].facts["own_classes"] > 0:
         console.print(confusion(own, told).table(), highlight=False, markup=False, soft_wrap=True)
     console.print(f"Clouds: {out / 'classified'}", highlight=False, soft_wrap=True, markup=False)
-
-
-def up_to(last: str, nodes: list[Node]) -> list[Node]:
-    """The nodes that one needs, and itself, in order."""
-    wanted = {last}
-    for node in reversed(nodes):
-        if node.label in wanted:
-            wanted |= {source.node for source in node.inputs.values() if isinstance(source, Output)}
-    return [node for node in nodes if node.label in wanted]
 
 
 def _of_all(dropped: U8, own: U8 | None, told: U8, sure: U8, source: U8) -> tuple[U8, U8, U8]:

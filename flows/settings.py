@@ -51,13 +51,13 @@ class Settings:
             table[parts[-1]] = _value(value.strip())
         return cls(values)
 
-    def check(self, steps: Iterable[Step], per_class: Iterable[Step]) -> None:
+    def check(self, steps: Iterable[Step]) -> None:
         """Refuse names that no step knows, and classes where a step is not run per class.
 
         Raises:
             SettingError: naming the nearest name that exists.
         """
-        known, by_class = {step.name: step for step in steps}, {step.name for step in per_class}
+        known = {step.name: step for step in steps}
         for name, table in self.values.items():
             if name not in known:
                 raise SettingError(name, "there is no such step", _nearest(name, known))
@@ -66,13 +66,13 @@ class Settings:
             fields = known[name].params.model_fields
             for key, value in table.items():
                 special = key in SURFACES and isinstance(value, Mapping)
-                if special and name not in by_class:
+                if special and not known[name].per_class:
                     raise SettingError(f"{name}.{key}", "this step is not run per class", f"Set {name}.param instead")
                 for param in value if special else (key,):
                     if param not in fields:
                         raise SettingError(f"{name}.{param}", "there is no such parameter", _nearest(param, fields))
 
-    def params(self, step: Step, group: str | None = None, **given: Any) -> Any:
+    def params(self, step: Step, group: str = "", **given: Any) -> Any:
         """The step's parameters: `given` by the recipe, defaults of the class, what the user set.
 
         Raises:
@@ -83,10 +83,10 @@ class Settings:
             k: v for k, v in table.items() if k in SURFACES and isinstance(v, Mapping)
         }
         general = {k: v for k, v in table.items() if k not in classes}
-        special = classes.get(group or "", {})
+        special = classes.get(group, {})
         for name in {*general, *special} & set(given):
             raise SettingError(f"{step.name}.{name}", "follows from the tile or other settings", "Leave it out")
-        merged = {**given, **step.per_class.get(group or "", {}), **general, **special}
+        merged = {**given, **step.class_defaults.get(group, {}), **general, **special}
         return step.params.of(step.name, merged)
 
 

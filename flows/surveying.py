@@ -10,10 +10,11 @@ from pathlib import Path
 
 from scan2sim.flows import workers
 from scan2sim.flows.display import console, progress, warn
-from scan2sim.flows.execute import Executor, limit_cores, locked, versions
+from scan2sim.flows.execute import Executor, Outcome, limit_cores, locked, versions
 from scan2sim.flows.finish import TILES, Made, finish, is_finished
+from scan2sim.flows.graph import NodeId
 from scan2sim.flows.memory import parse
-from scan2sim.flows.planning import Planned, drop_damaged, plan
+from scan2sim.flows.planning import Planned, Reason, drop_damaged, plan
 from scan2sim.flows.prepare import survey_of
 from scan2sim.flows.publish import to_read
 from scan2sim.flows.recipe import check_here, survey_recipe
@@ -65,8 +66,8 @@ def run_source(
         path = survey_of(source, target, length=length, buffer=buffer, say=warn, report=report)
     log = Log(likeness(target) / "run.log")
 
-    def run(planned: list[Planned], store: Store, failures: dict[str, ScanError]) -> dict[str, Manifest]:
-        return execute_shown(planned, store, log, jobs, failures, gigabytes)
+    def run(planned: list[Planned], store: Store) -> Outcome:
+        return execute_shown(planned, store, log, jobs, to_the_end=True, memory=gigabytes)
 
     make_survey(path, target, settings, run)
 
@@ -139,55 +140,43 @@ def _make(survey: Survey, settings: Settings, store: Store, run: Executor, diges
     """Run all tiles; without those that fail, until none does."""
     tiles, failed = read_tiles(survey)
     unread = set(failed)
-    ran: dict[tuple[str, str], str] = {}  # why, of what an earlier round of this run has made
-    before: dict[str, set[str]] = {}  # what there was, of all that is run
+    ran: dict[tuple[NodeId, str], Reason] = {}  # why, of what an earlier round of this run has made
+    before: dict[NodeId, set[str]] = {}  # what there was, of all that is run
     first = plan_survey(tiles, store, settings, digests)
     for name in tiles:
-        own = _own(name, first)
+        own = [item for item in first if item.node.tile == name]
         if not is_finished(store.within(name), own, out / TILES / name):
-            drop_damaged(own, store.within(name), to_read(store.within(name), own, out / TILES / name))
+            drop_damaged(own, store, to_read(store.within(name), own, out / TILES / name))
     while True:
         planned = plan_survey(tiles, store, settings, digests)
-        planned = [replace(item, reason=item.reason or ran.get((item.node.label, item.key))) for item in planned]
-        ran |= {(item.node.label, item.key): item.reason for item in planned if item.reason is not None}
-        for label in {item.node.label for item in planned if item.reason is not None} - before.keys():
-            before[label] = store.contents(label)
-        failures: dict[str, ScanError] = {}
-        done = run(planned, store, failures)
-        for error in failures.values():
+        planned = [replace(item, reason=item.reason or ran.get((item.node.id, item.key))) for item in planned]
+        ran |= {(item.node.id, item.key): item.reason for item in planned if item.reason is not None}
+        for node in {item.node.id for item in planned if item.reason is not None} - before.keys():
+            before[node] = store.contents(node.label)
+        outcome = run(planned, store)
+        for error in outcome.failed.values():
             if isinstance(error, (SpaceError, SettingError)):  # no tile's fault
                 raise error
-        if not failures:
+        if not outcome.failed:
             break
-        for label, error in failures.items():
-            name = label.split("/")[0]
-            failed.setdefault(name, error)
+        for node, error in outcome.failed.items():
+            failed.setdefault(node.tile, error)
         tiles = {name: tile for name, tile in tiles.items() if name not in failed}
     return [
         Made(name, None if name in unread else read_tile(path), error=failed[name])
         if name in failed
-        else Made(name, tiles[name], *_of_tile(name, planned, done, before))
+        else Made(name, tiles[name], *_of_tile(name, planned, outcome, before))
         for name, path in survey.tiles.items()
     ]
 
 
 def _of_tile(
-    name: str, planned: Sequence[Planned], done: Mapping[str, Manifest], before: Mapping[str, set[str]]
+    name: str, planned: Sequence[Planned], outcome: Outcome, before: Mapping[NodeId, set[str]]
 ) -> tuple[tuple[Planned, ...], dict[str, Manifest], bool]:
-    """A tile's own nodes and results, without its name before their labels; whether any isn't as `before`."""
-    own = _own(name, planned)
-    labels = {f"{name}/{item.node.label}" for item in own}
-    return (
-        tuple(own),
-        {item.node.label: done[f"{name}/{item.node.label}"] for item in own},
-        any(done[label].content not in before[label] for label in before.keys() & labels),
-    )
-
-
-def _own(name: str, planned: Sequence[Planned]) -> list[Planned]:
-    """A tile's nodes, without its name before their labels."""
-    mine = [item for item in planned if item.node.label.startswith(f"{name}/")]
-    return [replace(item, node=replace(item.node, label=item.node.label.removeprefix(f"{name}/"))) for item in mine]
+    """A tile's own nodes, and results by their names within it; whether any isn't as `before`."""
+    own = tuple(item for item in planned if item.node.tile == name)
+    ran = before.keys() & {item.node.id for item in own}
+    return own, outcome.of_tile(name), any(outcome.done[node].content not in before[node] for node in ran)
 
 
 def changes(place: str | Path, target: str | Path, settings: Settings) -> dict[str, str]:
@@ -202,7 +191,7 @@ def changes(place: str | Path, target: str | Path, settings: Settings) -> dict[s
     found = {name: str(error) for name, error in failed.items()}
     for item in plan_survey(tiles, store, settings, digests):
         if item.reason is not None:
-            found.setdefault(item.node.label.split("/")[0], f"{item.node.step.name}: {item.reason}")
+            found.setdefault(item.node.tile, f"{item.node.step.name}: {item.reason.value}")
     return found
 
 

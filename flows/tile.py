@@ -13,13 +13,12 @@ from prefect.artifacts import create_progress_artifact, update_progress_artifact
 from prefect.cache_policies import NO_CACHE
 
 from scan2sim.flows.dispatch import dispatch
-from scan2sim.flows.execute import Executor, run_on_worker, versions
+from scan2sim.flows.execute import Executor, Outcome, run_on_worker, versions
 from scan2sim.flows.memory import parse
 from scan2sim.flows.planning import Planned, check
 from scan2sim.flows.run import run_tile
 from scan2sim.flows.settings import Settings
 from scan2sim.flows.workers import workers
-from scan2sim.pipeline.errors import ScanError
 from scan2sim.pipeline.store import Manifest, Store
 
 
@@ -51,7 +50,7 @@ def by_tasks(
     gigabytes, version = parse(memory), versions()
     workers(runner, count, address)  # tells early of what there isn't
 
-    def run(planned: list[Planned], store: Store, failures: dict[str, ScanError]) -> dict[str, Manifest]:
+    def run(planned: list[Planned], store: Store) -> Outcome:
         if address is None:
             check(planned)  # workers elsewhere may have what is missing here
         missing = any(item.reason is not None for item in planned)
@@ -64,7 +63,7 @@ def by_tasks(
 
             # those of a cluster find their next step waiting
             at_once = count if runner == "threads" else 2 * count
-            return dispatch(planned, store, failures, submit, at_once, _progress())
+            return dispatch(planned, store, submit, at_once, _progress())
 
     return run
 

@@ -67,9 +67,9 @@ def verify(out: Path) -> None:
 
 def _published(out: Path, folder: Path, manifest: Manifest) -> Iterator[Path]:
     """Files that were published of a result, if any were, and are missing or others."""
-    tile, _, label = manifest.label.rpartition("/")
-    output, place = PLACES.get(label, ("", ""))
-    shown = (out / TILES / tile if tile else out) / place
+    *tile, name, _ = folder.relative_to(out / STORE).parts
+    output, place = PLACES.get(name, ("", ""))
+    shown = (out / TILES / tile[0] if tile else out) / place
     if output not in manifest.files or not (shown / STAMP).is_file():
         return
     if (shown / STAMP).read_text(errors="replace") != folder.name:

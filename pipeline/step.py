@@ -89,14 +89,19 @@ class Step:
         run: the function; must be importable by name (it may run in another process), and
             import what is heavy inside.
         params: its parameters; defaults are the mission's numbers.
-        per_class: defaults that differ between terrain, building and vegetation.
+        class_defaults: by class, defaults that differ between terrain, building and vegetation.
         check: given parameters, which then need defaults, raises a ScanError if the step can't run with them on this
             machine (a package is missing, say); called before any step runs, and quick. None: it always can.
+        per_class: whether it is run for each class apart.
+        memory: GB at least, and GB for every GB that it reads (photos not counted), as measured on generated streets
+            (docs/scale.md).
     """
 
     name: str
     version: int
     run: Run
     params: type[Params] = Params
-    per_class: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    class_defaults: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     check: Callable[[Any], None] | None = None
+    per_class: bool = False
+    memory: tuple[float, float] = (0.5, 6)

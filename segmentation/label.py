@@ -115,4 +115,4 @@ def can_label(params: LabelParams) -> None:
         check(params.network, params.weights)
 
 
-LABEL = Step("label", 5, label, LabelParams, check=can_label)
+LABEL = Step("label", 5, label, LabelParams, check=can_label, memory=(1.5, 3))

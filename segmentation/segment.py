@@ -156,4 +156,4 @@ def _from_photos(
     return code_of_index()[best], np.round(255 * sure).astype(np.uint8), seen.astype(np.uint8), told
 
 
-SEGMENT = Step("segment", 8, segment, SegmentParams)
+SEGMENT = Step("segment", 8, segment, SegmentParams, memory=(0.5, 6))

@@ -191,4 +191,4 @@ def seams(mesh: Mesh, smoothness: float) -> tuple[I32, F32, F32]:
     return pairs, length, (smoothness * np.minimum(length / median, 4)).astype(np.float32)
 
 
-CHOOSE = Step("choose", 4, choose, ChooseParams)
+CHOOSE = Step("choose", 4, choose, ChooseParams, per_class=True)

@@ -189,4 +189,4 @@ def _seen_from_near(inputs: Inputs, places: F32, normals: F32, near: float) -> n
     return seen
 
 
-SCORE = Step("score", 3, score, ScoreParams)
+SCORE = Step("score", 3, score, ScoreParams, memory=(1.3, 3))

@@ -504,4 +504,13 @@ def can_texture(params: TextureParams) -> None:
         need(f"texture.device {params.device}", "torch")
 
 
-TEXTURE = Step("texture", 6, texture, TextureParams, {"terrain": {"continued": True}}, can_texture)
+TEXTURE = Step(
+    "texture",
+    6,
+    texture,
+    TextureParams,
+    class_defaults={"terrain": {"continued": True}},
+    check=can_texture,
+    per_class=True,
+    memory=(1.2, 3),
+)

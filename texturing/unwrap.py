@@ -357,5 +357,7 @@ UNWRAP = Step(
     3,
     unwrap,
     UnwrapParams,
-    {"vegetation": {"texel": 0.03, "gutter": 2}},
+    class_defaults={"vegetation": {"texel": 0.03, "gutter": 2}},
+    per_class=True,
+    memory=(0.5, 10),
 )

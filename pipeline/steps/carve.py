@@ -188,4 +188,4 @@ def _moved(cloud: PointCloud, origins: F64, path: Trajectory | None, params: Car
     return out, told
 
 
-CARVE = Step("carve", 3, carve, CarveParams)
+CARVE = Step("carve", 3, carve, CarveParams, memory=(0.5, 6))

@@ -46,4 +46,4 @@ def clip(inputs: Inputs, params: CellParams, out: Path, report: Report) -> Done:
     return Done({"mesh": out / "mesh.npz", "on": out / "on.npz"}, facts)
 
 
-CLIP = Step("clip", 1, clip, CellParams)
+CLIP = Step("clip", 1, clip, CellParams, per_class=True)

@@ -85,5 +85,11 @@ def simplify(mesh: Mesh, target: int, *, preserve_border: bool = True) -> Mesh:
 
 
 DECIMATE = Step(
-    "decimate", 2, decimate, DecimateParams, {"vegetation": {"target": 300_000}, "vehicle": {"target": 50_000}}
+    "decimate",
+    2,
+    decimate,
+    DecimateParams,
+    class_defaults={"vegetation": {"target": 300_000}, "vehicle": {"target": 50_000}},
+    per_class=True,
+    memory=(0.4, 30),
 )

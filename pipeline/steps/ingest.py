@@ -83,4 +83,4 @@ def ingest(inputs: Inputs, params: IngestParams, out: Path, report: Report) -> D
     return Done({"cloud": out / "cloud.npz"}, facts, warnings)
 
 
-INGEST = Step("ingest", 2, ingest, IngestParams)
+INGEST = Step("ingest", 2, ingest, IngestParams, memory=(0.4, 12))

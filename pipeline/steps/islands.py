@@ -47,4 +47,4 @@ def islands(inputs: Inputs, params: IslandsParams, out: Path, report: Report) ->
     return Done({"mesh": out / "mesh.npz"}, facts)
 
 
-ISLANDS = Step("islands", 1, islands, IslandsParams, {"terrain": {"min_area": 2.0}})
+ISLANDS = Step("islands", 1, islands, IslandsParams, class_defaults={"terrain": {"min_area": 2.0}}, per_class=True)

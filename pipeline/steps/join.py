@@ -44,4 +44,4 @@ def join(inputs: Inputs, params: JoinParams, out: Path, report: Report) -> Done:
     return Done({"mesh": out / "mesh.npz"}, facts | {"borders": joined.facts, "missing": missing})
 
 
-JOIN = Step("join", 1, join, JoinParams)
+JOIN = Step("join", 1, join, JoinParams, per_class=True)

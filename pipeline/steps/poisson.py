@@ -124,4 +124,4 @@ def reconstruct(
     return vertices, faces, np.asarray(density, np.float32)
 
 
-POISSON = Step("poisson", 1, poisson, PoissonParams)
+POISSON = Step("poisson", 1, poisson, PoissonParams, per_class=True, memory=(0.4, 70))

@@ -84,4 +84,12 @@ def _spacing(tree: cKDTree, xyz: F32) -> float:
     return float(np.median(distance[:, 1:].mean(axis=1)))
 
 
-TRIM = Step("trim", 2, trim, TrimParams, {"terrain": {"max_edge": 0.5, "max_distance": 0.5, "max_spacing": 1.6}})
+TRIM = Step(
+    "trim",
+    2,
+    trim,
+    TrimParams,
+    class_defaults={"terrain": {"max_edge": 0.5, "max_distance": 0.5, "max_spacing": 1.6}},
+    per_class=True,
+    memory=(0.4, 12),
+)

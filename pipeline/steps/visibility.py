@@ -51,4 +51,4 @@ def visibility(inputs: Inputs, params: VisibilityParams, out: Path, report: Repo
     return Done({"depth": folder}, {"views": len(views), "triangles": hides.triangles, "discs": len(hides.centres)})
 
 
-VISIBILITY = Step("visibility", 4, visibility, VisibilityParams)
+VISIBILITY = Step("visibility", 4, visibility, VisibilityParams, memory=(0.7, 3))

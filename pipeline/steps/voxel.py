@@ -106,4 +106,4 @@ def voxel_groups(xyz: F32, size: float) -> tuple[np.ndarray, np.ndarray]:  # typ
     return order, starts
 
 
-VOXEL = Step("voxel", 3, voxel, VoxelParams)
+VOXEL = Step("voxel", 3, voxel, VoxelParams, per_class=True)

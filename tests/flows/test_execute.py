@@ -18,7 +18,8 @@ import pytest
 
 import scan2sim
 from scan2sim.flows.execute import check_version, execute, locked, versions
-from scan2sim.flows.planning import plan
+from scan2sim.flows.graph import NodeId
+from scan2sim.flows.planning import Reason, plan
 from scan2sim.pipeline.errors import BusyError, DataError, StepError, UnavailableError
 from scan2sim.pipeline.extras import EXTRA_OF
 from scan2sim.pipeline.store import Digests, Manifest, Store, _seal, digest
@@ -42,7 +43,9 @@ def run(tmp_path: Path, source: Path) -> Run:
     def go(force: bool = False, start: str | None = None, **changes: dict[str, object]) -> dict[str, Manifest]:
         store = Store(tmp_path / "store")
         nodes = chain(source, tmp_path / "log", **changes)
-        return execute(plan(nodes, store, force=force, start=start), store, jobs=2, watch=lambda *_: None)
+        outcome = execute(plan(nodes, store, force=force, start=start), store, jobs=2, watch=lambda *_: None)
+        outcome.check()
+        return outcome.of_tile()
 
     return go
 
@@ -108,10 +111,10 @@ def test_digests_are_remembered_until_a_file_changes(tmp_path: Path, source: Pat
 
 
 def test_a_failure_is_noted_and_the_rest_goes_on(tmp_path: Path, source: Path, ran: Callable[[], str]) -> None:
-    store, failures = Store(tmp_path / "store"), {}
+    store = Store(tmp_path / "store")
     nodes = chain(source, tmp_path / "log", b={"does": "fail"})
-    done = execute(plan(nodes, store), store, jobs=1, watch=lambda *_: None, failures=failures)
-    assert set(done) == {"a", "c"} and set(failures) == {"b"}
+    outcome = execute(plan(nodes, store), store, jobs=1, watch=lambda *_: None, to_the_end=True)
+    assert set(outcome.of_tile()) == {"a", "c"} and set(outcome.failed) == {NodeId("b")}
     assert ran() == "abc"
 
 
@@ -220,7 +223,7 @@ def test_whatever_ends_a_run_nothing_but_its_message_is_shown(tmp_path: Path, so
         f"p, does = Path({str(tmp_path)!r}), {'hang' if how == 'SIGINT' else how!r}\n"
         "store = Store(p / 'store')\n"
         "nodes = chain(p / 'source.txt', p / 'log', b={'does': does}, c={'does': 'hang'})\n"
-        "try: execute(plan(nodes, store), store, jobs=2, watch=lambda *_: None)\n"
+        "try: execute(plan(nodes, store), store, jobs=2, watch=lambda *_: None).check()\n"
         "except ScanError as error: sys.exit(str(error))\n"
         "except KeyboardInterrupt: sys.exit('interrupted')\n"
     )
@@ -255,13 +258,13 @@ def test_plan_says_why(tmp_path: Path, source: Path, run: Run) -> None:
     run()
     store = Store(tmp_path / "store")
 
-    def reasons(**changes: dict[str, object]) -> dict[str, str | None]:
+    def reasons(**changes: dict[str, object]) -> dict[str, Reason | None]:
         return {p.node.label: p.reason for p in plan(chain(source, tmp_path / "log", **changes), store)}
 
     assert set(reasons().values()) == {None}
     changed = reasons(b={"value": 1})
     assert changed["a"] is None and changed["c"] is None
-    assert "changed" in (changed["b"] or "")
+    assert changed["b"] is Reason.CHANGED
 
 
 def test_two_runs_do_not_share_a_folder(tmp_path: Path) -> None:

@@ -115,5 +115,5 @@ def test_steps_that_do_not_fit_together_run_one_after_the_other(
 
     store = Store(tmp_path / "store")
     planned = plan(chain(tmp_path / "source.txt", tmp_path / "log"), store)
-    done = execute(planned, store, jobs=4, watch=watch, memory=5.0)
-    assert set(done) == set("abcd") and max(most) == 1
+    outcome = execute(planned, store, jobs=4, watch=watch, memory=5.0)
+    assert set(outcome.of_tile()) == set("abcd") and max(most) == 1

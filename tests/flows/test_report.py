@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from scan2sim.flows.graph import Node
 from scan2sim.flows.planning import Planned
-from scan2sim.flows.recipe import Node
 from scan2sim.flows.report import telling, write_report
 from scan2sim.pipeline.io import image
 from scan2sim.pipeline.step import Done, Params, Step
@@ -56,7 +56,7 @@ def report(tmp_path: Path) -> Any:
             files = {"error": album(folder, list(scored["photos"]))} if label == "score" else {}
             about = {"version": 1, "params": {}, "inputs": {}, "fed": "", "seconds": 1.0, "peak_mb": 100.0}
             done[label] = store.commit(label, "key", folder, Done(files, facts), about)
-            planned.append(Planned(Node(label, Step(label, 1, no_step), Params(), {}), "key", {}, None))
+            planned.append(Planned(Node(Step(label, 1, no_step), Params(), {}), "key", {}, None))
         tile = Tile(tmp_path / "tile.toml", "made_up", Frame(), ())
         page = write_report(tile, planned, done, store, tmp_path, seconds=1.0).read_text()
         return json.loads((tmp_path / "report.json").read_text()), page

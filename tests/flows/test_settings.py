@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from scan2sim.flows.cli import app
 from scan2sim.flows.numbers import Numbers
-from scan2sim.flows.recipe import PER_CLASS, STEPS
+from scan2sim.flows.recipe import STEPS
 from scan2sim.flows.settings import Settings
 from scan2sim.pipeline.errors import SettingError
 from scan2sim.pipeline.ranges import told
@@ -58,7 +58,7 @@ def test_a_class_wins_over_all_classes_and_the_command_line_over_the_file(tmp_pa
 )
 def test_unknown_names_are_refused_with_the_nearest(text: str, message: str) -> None:
     with pytest.raises(SettingError) as caught:
-        Settings.read(None, [text]).check(STEPS, PER_CLASS)
+        Settings.read(None, [text]).check(STEPS)
     assert message in str(caught.value)
 
 

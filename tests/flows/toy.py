@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 from typing import Literal
 
-from scan2sim.flows.recipe import Node, Output
+from scan2sim.flows.graph import Node, NodeId, Output
 from scan2sim.pipeline.errors import DataError
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
@@ -55,11 +55,11 @@ def chain(source: Path, log: Path, **changes: dict[str, object]) -> list[Node]:
     """source -> a -> b -> d, a -> c -> d; `changes` by node name."""
 
     def node(name: str, inputs: dict[str, Path | Output]) -> Node:
-        return Node(name, Step(name, 1, toy, ToyParams), ToyParams(log=log, name=name, **changes.get(name, {})), inputs)  # type: ignore[arg-type]
+        return Node(Step(name, 1, toy, ToyParams), ToyParams(log=log, name=name, **changes.get(name, {})), inputs)  # type: ignore[arg-type]
 
     return [
         node("a", {"source": source}),
-        node("b", {"a": Output("a", "number")}),
-        node("c", {"a": Output("a", "number")}),
-        node("d", {"b": Output("b", "number"), "c": Output("c", "number")}),
+        node("b", {"a": Output(NodeId("a"), "number")}),
+        node("c", {"a": Output(NodeId("a"), "number")}),
+        node("d", {"b": Output(NodeId("b"), "number"), "c": Output(NodeId("c"), "number")}),
     ]

@@ -11,7 +11,7 @@ import numpy as np
 import tomli_w
 
 from scan2sim.flows.prepare import read_drive
-from scan2sim.flows.recipe import PER_CLASS, STEPS
+from scan2sim.flows.recipe import STEPS
 from scan2sim.flows.settings import Settings
 from scan2sim.pipeline.io import gps as gps_io
 from scan2sim.pipeline.io import sweeps
@@ -87,7 +87,7 @@ def assignments(folder: Path) -> object:
 
 
 def _params(found: Settings) -> object:
-    found.check(STEPS, PER_CLASS)
+    found.check(STEPS)
     whole = [step for step in STEPS if not any(f.is_required() for f in step.params.model_fields.values())]
     return [found.params(step, group) for step in whole for group in ("terrain", "building")]
 

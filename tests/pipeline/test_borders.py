@@ -416,7 +416,7 @@ def test_a_real_reconstruction_cut_in_two_meets_again(tmp_path: Path) -> None:
         points = go(OVERLAP, out / "0", {"cloud": raw[name], f"cloud.{other}": raw[other]}, **known).files["cloud"]
         thin = go(VOXEL, out / "1", {"cloud": points}).files["cloud"]
         surface = go(POISSON, out / "2", {"cloud": thin}).files["mesh"]
-        surface = go(TRIM, out / "3", {"mesh": surface, "cloud": thin}, **TRIM.per_class["terrain"]).files["mesh"]
+        surface = go(TRIM, out / "3", {"mesh": surface, "cloud": thin}, **TRIM.class_defaults["terrain"]).files["mesh"]
         meshes[name] = Mesh.load(go(ISLANDS, out / "4", {"mesh": surface}).files["mesh"])
     clips, joined = met(meshes, where)
     before = gap(clips["a"].mesh, clips["b"].mesh, where["a"], "b")

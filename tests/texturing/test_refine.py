@@ -7,7 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from scan2sim.flows.recipe import Output, recipe
+from scan2sim.flows.graph import NodeId, Output
+from scan2sim.flows.recipe import recipe
 from scan2sim.flows.settings import Settings
 from scan2sim.pipeline.cameras import inside, project
 from scan2sim.pipeline.io import views as views_io
@@ -155,8 +156,8 @@ def test_photos_that_cannot_be_compared_stay(tmp_path):
 
 def test_tiles_without_photos_have_no_such_node():
     tile = read_tile(ROOT / "data_samples" / "tile" / "tile.toml")
-    nodes = {node.label: node for node in recipe(tile, Settings())}
-    assert nodes["visibility"].inputs["views"] == nodes["score"].inputs["views"] == Output("refine", "views")
-    assert nodes["segment"].inputs["views"] == Output("views", "views")
+    nodes = {node.id.name: node for node in recipe(tile, Settings())}
+    assert nodes["visibility"].inputs["views"] == nodes["score"].inputs["views"] == Output(NodeId("refine"), "views")
+    assert nodes["segment"].inputs["views"] == Output(NodeId("views"), "views")
     for other, settings in ((replace(tile, views=()), {}), (tile, {"refine": {"when": "never"}})):
         assert "refine" not in {node.step.name for node in recipe(other, Settings(settings))}

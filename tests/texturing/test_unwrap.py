@@ -119,7 +119,7 @@ def test_the_same_again(tmp_path):
 
 
 def test_vegetation_is_textured_at_three_centimetres():
-    assert UnwrapParams(**UNWRAP.per_class["vegetation"]).texel == 0.03
+    assert UnwrapParams(**UNWRAP.class_defaults["vegetation"]).texel == 0.03
 
 
 def test_what_an_orthophoto_drapes_is_laid_flat_at_half_its_pixels(tmp_path):

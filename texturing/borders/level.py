@@ -141,4 +141,4 @@ def _link_others(source: Path, folder: Path) -> None:
         pass_on(path, place)
 
 
-LEVEL = Step("level", 1, level, LevelParams)
+LEVEL = Step("level", 1, level, LevelParams, per_class=True, memory=(1.0, 3))

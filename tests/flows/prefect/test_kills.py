@@ -15,6 +15,7 @@ import pytest
 
 from scan2sim.flows.dispatch import dispatch
 from scan2sim.flows.execute import run_apart
+from scan2sim.flows.graph import NodeId
 from scan2sim.flows.planning import Planned
 from scan2sim.pipeline.store import Store
 from tests.conftest import ROOT
@@ -196,11 +197,11 @@ class Finished(GivenUp):
 
 
 def test_a_step_that_takes_its_workers_along_fails_alone(folder: Path) -> None:
-    store, failures = Store(folder / "steps"), {}
+    store, second = Store(folder / "steps"), NodeId("second", tile="0")
 
     def submit(item: Planned) -> GivenUp:
-        return GivenUp() if item.node.label == "0/second" else Finished(item, store)
+        return GivenUp() if item.node.id == second else Finished(item, store)
 
-    done = dispatch(planned(folder, 2), store, failures, submit, 2, lambda *_: None)
-    assert set(done) == {"0/first", *(f"1/{step}" for step in STEPS)}
-    assert "three workers died of it" in str(failures.pop("0/second")) and not failures
+    outcome = dispatch(planned(folder, 2), store, submit, 2, lambda *_: None)
+    assert set(outcome.of_tile("0")) == {"first"} and set(outcome.of_tile("1")) == set(STEPS)
+    assert set(outcome.failed) == {second} and "three workers died of it" in str(outcome.failed[second])

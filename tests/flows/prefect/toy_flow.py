@@ -19,13 +19,11 @@ from tests.flows.prefect.toy_steps import STEPS, planned
 
 def toy_tiles(folder: str, tiles: int, gate: str | None, runner: str, pretend: str | None) -> int:
     """All tiles; returns the sum of what came out."""
-    failures: dict = {}
     with patch("scan2sim.flows.tile.versions", lambda: versions() | ({"scan2sim": pretend} if pretend else {})):
         run = by_tasks(runner, 2)
-    done = run(planned(Path(folder), tiles, gate and Path(gate)), Store(Path(folder) / "steps"), failures)
-    for error in failures.values():
-        raise error
-    return sum(done[f"{tile}/{STEPS[-1]}"].facts["total"] for tile in range(tiles))
+    outcome = run(planned(Path(folder), tiles, gate and Path(gate)), Store(Path(folder) / "steps"))
+    outcome.check()
+    return sum(outcome.of_tile(str(tile))[STEPS[-1]].facts["total"] for tile in range(tiles))
 
 
 @flow(name="toy")

@@ -7,8 +7,8 @@ import os
 import time
 from pathlib import Path
 
+from scan2sim.flows.graph import Node, Output
 from scan2sim.flows.planning import Planned, plan
-from scan2sim.flows.recipe import Node, Output
 from scan2sim.pipeline.step import Done, Inputs, Report, Step
 from scan2sim.pipeline.store import Store
 from tests.flows.toy import ToyParams, toy
@@ -41,8 +41,7 @@ def planned(folder: Path, tiles: int, gate: Path | None = None) -> list[Planned]
     for tile in range(tiles):
         before: Path | Output = folder / "source.txt"
         for name in STEPS:
-            label = f"{tile}/{name}"
-            params = SlowParams(log=folder / "log", name=label.replace("/", "-"), value=1, gate=gate)
-            nodes.append(Node(label, Step(name, 1, slow, SlowParams), params, {"before": before}))
-            before = Output(label, "number")
+            params = SlowParams(log=folder / "log", name=f"{tile}-{name}", value=1, gate=gate)
+            nodes.append(Node(Step(name, 1, slow, SlowParams), params, {"before": before}, tile=str(tile)))
+            before = Output(nodes[-1].id, "number")
     return plan(nodes, Store(folder / "steps"))
