@@ -26,7 +26,7 @@ import numpy as np
 from scan2sim.data_samples import SMALL
 from scan2sim.data_samples.layout import FRAME, lay_out
 from scan2sim.pipeline.classes import CODE
-from scan2sim.pipeline.io import las
+from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.render import Renderer, textured
 from scan2sim.pipeline.step import silent

@@ -75,7 +75,7 @@ def street(out: Path, seed: int) -> Path:
 
 def told(tile: Path, out: Path, *settings: str) -> tuple[Confusion, float]:
     """Run `scan2sim segment` anew on a tile whose cloud has classes; what it told, and seconds."""
-    from scan2sim.pipeline.io import las
+    from scan2sim.pipeline.io.clouds import las
     from scan2sim.pipeline.io.tile import read_tile
 
     shutil.rmtree(out, ignore_errors=True)

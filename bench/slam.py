@@ -175,7 +175,7 @@ def pano() -> None:
     from scan2sim.slam.charts import Charts
     from scan2sim.slam.geometry import log_so3, relative_pose
     from scan2sim.slam.relocalise import describe, matches
-    from scan2sim.slam.tracking import Tracker
+    from scan2sim.slam.trackers import named
 
     folder = DATA / "pano360"
     numbers = (folder / "dense_transformation.dat").read_text().splitlines()[1].split()[1:]
@@ -190,7 +190,7 @@ def pano() -> None:
     charts, rng = Charts(Camera("equirectangular", 1024, 512)), np.random.default_rng(0)
     a, b = (describe(charts, charts.pictures(grey)) for grey in (first, second))  # type: ignore[arg-type]
     pairs = matches(a.descriptor, b.descriptor)
-    tracker = Tracker(charts, None, 600)
+    tracker = named("corners", charts, None, 600)
     tracker.look(first)  # type: ignore[arg-type]
     tracker.refill()
     before = tracker.tracks

@@ -12,7 +12,8 @@ import numpy.typing as npt
 from bench.texture_baselines import MAX_DISTANCE, MIN_COS
 from bench.texture_scenes import Scene
 from scan2sim.pipeline.classes import CODE
-from scan2sim.pipeline.io import image, las
+from scan2sim.pipeline.io import image
+from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.render import Body, Renderer, textured
 from scan2sim.pipeline.types import F32, U8, Mesh, PointCloud, View

@@ -62,7 +62,7 @@ def generate(
     ):
         if not (np.isfinite(value) and value >= least):
             raise SettingError(key, f"{value} is less than {least:g}", f"Give {least:g} or more")
-    from scan2sim.pipeline.io import las
+    from scan2sim.pipeline.io.clouds import las
     from scan2sim.pipeline.io.tile import read_tile, write_tile
 
     effects = effects or Effects()
@@ -143,7 +143,7 @@ def _take_photos(
 
 
 def _write_truth(folder: Path, scene: Scene, density: float, scale: float) -> None:
-    from scan2sim.pipeline.io import las
+    from scan2sim.pipeline.io.clouds import las
 
     mesh = scene.truth_mesh()
     assert mesh.label is not None

@@ -430,7 +430,7 @@ def _import_model(kind: str, about: str) -> None:
     ) -> None:
         from scan2sim.flows.display import progress
         from scan2sim.pipeline.classes import parse
-        from scan2sim.pipeline.io.models import import_model
+        from scan2sim.pipeline.io.import_model import import_model
 
         told: list[str] = []
         with progress("import") as report:

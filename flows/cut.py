@@ -20,8 +20,9 @@ from scan2sim.pipeline.cells import Cell, Seed, cells
 from scan2sim.pipeline.classes import strangers
 from scan2sim.pipeline.cutting import dense, members, seeds, sees
 from scan2sim.pipeline.errors import DataError, InputError, SettingError
-from scan2sim.pipeline.io import clouds, las, orthophoto
+from scan2sim.pipeline.io import clouds, orthophoto
 from scan2sim.pipeline.io import trajectory as trajectory_io
+from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.importing import place, tile_folder
 from scan2sim.pipeline.io.spool import QUANTUM, Spool
 from scan2sim.pipeline.io.survey import read_survey, write_survey

@@ -48,7 +48,7 @@ def _reader(path: Path) -> Callable[[Path], tuple[str, Facts]]:
         )
     files.check(path, "Mend the name")
     readers = {
-        **dict.fromkeys(clouds.FORMATS, _cloud), ".toml": _tile, ".sdf": _world, ".npz": _result,
+        **dict.fromkeys(clouds.formats(), _cloud), ".toml": _tile, ".sdf": _world, ".npz": _result,
         ".obj": _mesh, ".dae": _mesh, ".glb": _mesh, ".ply": _ply,
     }  # fmt: skip
     if path.name in readers:

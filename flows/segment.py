@@ -16,8 +16,9 @@ from scan2sim.flows.run import STORE, Log, execute_shown, show_warnings
 from scan2sim.flows.settings import Settings
 from scan2sim.pipeline.errors import DataError, SettingError
 from scan2sim.pipeline.extras import need
-from scan2sim.pipeline.io import image, las
+from scan2sim.pipeline.io import image
 from scan2sim.pipeline.io import views as views_io
+from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.las_classes import write_classified
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.store import Store

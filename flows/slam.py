@@ -23,7 +23,7 @@ from scan2sim.pipeline.io.image import read_rgb
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.store import contents
 from scan2sim.pipeline.types import Camera, GpsTrack, Trajectory
-from scan2sim.slam import output
+from scan2sim.slam import output, solvers
 from scan2sim.slam.adjust import adjust
 from scan2sim.slam.charts import Charts
 from scan2sim.slam.evaluate import AlignmentKind, Evaluation, evaluate, plot
@@ -33,7 +33,7 @@ from scan2sim.slam.loops import close as close_loops
 from scan2sim.slam.odometry import Odometry, OdometryParams
 from scan2sim.slam.sparse import sparse_map
 from scan2sim.slam.track import VERSION, Tracked, camera_of, track
-from scan2sim.slam.tracking import Tracker
+from scan2sim.slam.trackers import Tracker, named
 from scan2sim.slam.video import Video, open_video
 
 T = TypeVar("T", int, float)
@@ -56,7 +56,7 @@ class Options:
         fps, times: of a folder of pictures.
         every: take every so manieth frame.
         until: seconds of the video to take; None: all.
-        backend: of `slam.graph`.
+        backend: of `slam.solvers`.
         features: "corners", or a backend of `slam.features`, with
         matcher: one of `slam.matchers`, and
         weights, matcher_weights: files of theirs, where they need any.
@@ -146,8 +146,7 @@ def _need(options: Options) -> None:
     """
     if options.adjust:
         need("--adjust", "pycolmap")
-    if options.backend == "adam":
-        need("--backend adam", "torch", instead="or use the backend lm")
+    solvers.named(options.backend)
     if options.view:
         need("--view", "av")
 
@@ -178,16 +177,15 @@ def odometry_params(settings: Settings) -> OdometryParams:
 def _tracker(camera: Camera, mask: np.ndarray | None, count: int, options: Options) -> Tracker:
     """What follows features: corners by Lucas-Kanade, or descriptors from frame to frame (D3.2)."""
     if options.features == "corners":
-        return Tracker(Charts(camera), mask, count)
+        return named("corners", Charts(camera), mask, count)
     from scan2sim.slam import features, matchers
-    from scan2sim.slam.matching import MatchingTracker
 
     detector = features.named(options.features, options.weights)
     matcher = matchers.named(options.matcher, options.matcher_weights)
     matchers.check(detector, matcher)
     for part in (detector, matcher):
         console.print(part.describe(), highlight=False, markup=False, soft_wrap=True)
-    return MatchingTracker(Charts(camera), mask, count, detector, matcher)
+    return named("descriptors", Charts(camera), mask, count, detector, matcher)
 
 
 def _camera(video: Video, options: Options) -> Camera:

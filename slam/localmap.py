@@ -13,10 +13,9 @@ from pydantic import Field
 from scan2sim.pipeline.ranges import Reach
 from scan2sim.pipeline.step import Params
 from scan2sim.pipeline.types import F64, I32, Camera, GpsTrack
-from scan2sim.slam import shared
+from scan2sim.slam import shared, solvers
 from scan2sim.slam.geometry import triangulate
-from scan2sim.slam.graph import backend_named
-from scan2sim.slam.graph.problem import Chord, Graph, errors
+from scan2sim.slam.graph import Chord, Graph, errors
 
 I64 = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
@@ -126,7 +125,7 @@ class LocalMap:
     def __init__(
         self, camera: Camera, params: MapParams, pixel: float, *, gps: GpsTrack | None, backend: str, keep: bool
     ) -> None:
-        """`pixel`: radians; `backend`: name of one of `slam.graph`; `keep`: remember what has left the window."""
+        """`pixel`: radians; `backend`: name of one of `slam.solvers`; `keep`: remember what has left the window."""
         self.camera, self.params, self.gps, self.backend, self.keep = camera, params, gps, backend, keep
         self.sigma = params.sigma * pixel
         self.gate = 4 * self.sigma
@@ -261,7 +260,7 @@ class LocalMap:
             length = max(float(np.linalg.norm(end - start)), 1e-6)
             chords = (Chord(0, 1, length, 1e-3 * length),)
         xyz = self.landmarks.xyz[self.landmarks.find(names)[0]]
-        solved = backend_named(self.backend).solve(self.graph(window, seen, names, xyz, fixed, chords))
+        solved = solvers.named(self.backend).solve(self.graph(window, seen, names, xyz, fixed, chords))
         for k, pose in zip(window, solved.poses, strict=True):
             self.keyframes[k].T_world_cam = pose
         self.landmarks.put(names, solved.points)

@@ -11,20 +11,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from pydantic import Field
 
 from scan2sim.pipeline.ranges import Seed
 from scan2sim.pipeline.types import F64, U8, Camera, GpsTrack
+from scan2sim.slam import solvers
 from scan2sim.slam.charts import Charts
 from scan2sim.slam.geometry import angles, exp_so3, inverse, log_so3, relative_pose, rigid
-from scan2sim.slam.graph import backend_named
-from scan2sim.slam.graph.problem import Graph
+from scan2sim.slam.graph import Graph
 from scan2sim.slam.localmap import Keyframe, LocalMap, MapParams, gps_distance
 from scan2sim.slam.relocalise import Remembered, describe, relocalise
-from scan2sim.slam.tracking import Tracker, Tracks
+from scan2sim.slam.trackers import Tracker, Tracks
+from scan2sim.slam.trackers import named as tracker_named
 
 LOST = 0.4
 """Seconds after which a new map is begun."""
@@ -80,7 +80,7 @@ class Odometry:
         mask: U8 | None = None,
         gps: GpsTrack | None = None,
         backend: str = "lm",
-        tracker: Any = None,
+        tracker: Tracker | None = None,
         keep: bool = False,
         remember: Callable[[int, list[U8]], None] | None = None,
         warn: Callable[[str], None] = lambda _: None,
@@ -92,15 +92,15 @@ class Odometry:
             params: see there.
             mask: (H, W), 0 where the car itself is seen.
             gps: the track, in the frames' times, smoothed; its distances are used.
-            backend: name of one of `slam.graph`.
-            tracker: what follows features; default: `slam.tracking.Tracker`.
+            backend: name of one of `slam.solvers`.
+            tracker: what follows features; default: corners.
             keep: keep all points and what keyframes see of them, for loops, adjustment and COLMAP.
             remember: is shown every keyframe: its number and charts (`slam.loops.Places`).
             warn: receives what went wrong, and when.
         """
         self.params, self.gps, self.warn, self.remember = params, gps, warn, remember
         self.charts = Charts(camera)
-        self.tracker = tracker or Tracker(self.charts, mask, params.features)
+        self.tracker = tracker or tracker_named("corners", self.charts, mask, params.features)
         self.map = LocalMap(camera, params, self.charts.pixel, gps=gps, backend=backend, keep=keep)
         self.placed: list[Placed] = []
         self._backend, self._rng = backend, np.random.default_rng(params.seed)
@@ -191,7 +191,7 @@ class Odometry:
             bend=self.map.bend(guess[None], self._velocity[None], one, bearing), shared=self.map.shared,
             shared_sigma=np.full(len(self.map.shared), 1e-9),
         )  # fmt: skip
-        pose = backend_named(self._backend).solve(graph, points=False).poses[0]
+        pose = solvers.named(self._backend).solve(graph, points=False).poses[0]
         error = angles(pose, xyz, bearing)
         self.tracker.drop(tracks.ids[known][error > 3 * self.map.gate])
         return pose, int((error < self.map.gate).sum()), n

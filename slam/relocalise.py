@@ -12,8 +12,8 @@ import numpy as np
 from scan2sim.pipeline.types import F64, U8
 from scan2sim.slam.charts import Charts
 from scan2sim.slam.geometry import angles, epipolar_errors, essential, inverse, relative_pose, rigid, triangulate
-from scan2sim.slam.graph import lm
-from scan2sim.slam.graph.problem import Graph
+from scan2sim.slam.graph import Graph
+from scan2sim.slam.solvers import lm
 
 FEATURES = 2500
 RATIO = 0.8

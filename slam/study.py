@@ -32,6 +32,7 @@ from scan2sim.pipeline.io.video import Encoder
 from scan2sim.pipeline.step import Report, silent
 from scan2sim.pipeline.store import contents
 from scan2sim.pipeline.types import U8, Camera, GpsTrack, Trajectory
+from scan2sim.slam import solvers
 from scan2sim.slam.evaluate import SEGMENT, evaluate, way
 from scan2sim.slam.gps import smooth
 from scan2sim.slam.odometry import Odometry, OdometryParams
@@ -78,7 +79,7 @@ class Source:
         gps: that ties the scale, or None.
         mask: (H, W), 0 where the car itself is seen, or None.
         params: of the odometry.
-        backend: of `slam.graph`.
+        backend: of `slam.solvers`.
         segment: metres, of the local error.
         keep: keep the cells' videos.
     """
@@ -132,7 +133,7 @@ def study(
         bitrates: Mbit/s.
         rates: frames a second.
         camera: of the source; by default a 360-degree one.
-        backend: of `slam.graph`.
+        backend: of `slam.solvers`.
         jobs: cells at a time.
         keep: keep the cells' videos beside their results.
         report: progress.
@@ -143,7 +144,8 @@ def study(
         InputError: the source can't be read, or has another size than its mask.
         SpaceError: the disk is full or may not be written to.
     """
-    need("slam study", "av", "matplotlib", *(["torch"] if backend == "adam" else []))
+    need("slam study", "av", "matplotlib")
+    solvers.named(backend)
     _check(heights, bitrates, rates, jobs)
     video = _open(source)
     if mask is not None and mask.shape != (video.height, video.width):

@@ -16,11 +16,11 @@ from scan2sim.pipeline.types import U8, Camera, Frame, GpsTrack, Trajectory
 from scan2sim.slam.features import Found
 from scan2sim.slam.finish import Placing, finish
 from scan2sim.slam.localmap import Keyframe, Landmarks
-from scan2sim.slam.matching import SeenInChart
 from scan2sim.slam.odometry import Odometry, Placed
 from scan2sim.slam.relocalise import Remembered, Seen
 from scan2sim.slam.state import WrongState, load, save
-from scan2sim.slam.tracking import Tracks
+from scan2sim.slam.trackers import Tracks
+from scan2sim.slam.trackers.descriptors import SeenInChart
 from scan2sim.slam.video import Video
 
 VERSION = 1

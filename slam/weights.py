@@ -13,11 +13,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from scan2sim.pipeline import extras
 from scan2sim.pipeline.errors import InputError, SettingError
 
 Shape = tuple[int, ...]
 
+NEEDS = ("torch", "safetensors")
+"""Packages that networks of SLAM need."""
 SIGNS = {
     r"convPa\.weight": "SuperPoint",
     r"bin_score": "SuperGlue",
@@ -68,11 +69,6 @@ class Weights:
         known = self.model.published.get(self.sha256)
         told = f"as published ({known})" if known else "not a file known to the project"
         return f"{self.path.name}: {self.model.name}, SHA-256 {self.sha256}, {told}; licence: {self.model.licence}"
-
-
-def missing() -> str | None:
-    """What to install for networks, or None."""
-    return extras.missing("torch", "safetensors")
 
 
 def torch_device(device: str) -> str:

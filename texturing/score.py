@@ -153,7 +153,7 @@ def _truth(inputs: Inputs, world: Renderer, params: ScoreParams) -> dict[str, fl
     """
     import numpy as np
 
-    from scan2sim.pipeline.io import las
+    from scan2sim.pipeline.io.clouds import las
     from scan2sim.texturing.evaluate import psnr
 
     truth = las.read(inputs["truth.points"], world.bodies[0].mesh.frame)

@@ -23,7 +23,8 @@ import numpy as np
 
 from scan2sim.pipeline.errors import InputError, SettingError
 from scan2sim.pipeline.io import crs as crs_io
-from scan2sim.pipeline.io import files, las
+from scan2sim.pipeline.io import files
+from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.importing import place, tile_folder
 from scan2sim.pipeline.io.merging import GREY as GREY
 from scan2sim.pipeline.io.merging import borrow_colours, colour, phase_of, read_bin

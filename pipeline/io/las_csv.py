@@ -32,8 +32,9 @@ import numpy as np
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.io import clouds as cloud_io
 from scan2sim.pipeline.io import crs as crs_io
-from scan2sim.pipeline.io import files, las
+from scan2sim.pipeline.io import files
 from scan2sim.pipeline.io import orthophoto as orthophoto_io
+from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.importing import place, tile_folder, without_parents
 from scan2sim.pipeline.io.tile import read_tile, tile_name, write_tile
 from scan2sim.pipeline.step import Report, silent

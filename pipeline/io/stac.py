@@ -21,8 +21,8 @@ import numpy as np
 
 from scan2sim import __version__
 from scan2sim.pipeline.errors import DataError, from_os_error
-from scan2sim.pipeline.io import geotiff, las
-from scan2sim.pipeline.io.clouds import Header
+from scan2sim.pipeline.io import geotiff
+from scan2sim.pipeline.io.clouds import Header, las
 from scan2sim.pipeline.io.crs import LOCAL, _horizontal, _parsed
 from scan2sim.pipeline.io.worlds import swap
 from scan2sim.pipeline.types import F64, Frame

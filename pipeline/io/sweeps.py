@@ -23,8 +23,9 @@ from pydantic import ValidationError
 from scan2sim.pipeline.errors import DataError, InputError, SettingError
 from scan2sim.pipeline.io import clouds as cloud_io
 from scan2sim.pipeline.io import crs as crs_io
-from scan2sim.pipeline.io import files, las, toml
+from scan2sim.pipeline.io import files, toml
 from scan2sim.pipeline.io import trajectory as trajectory_io
+from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.image import read_rgb
 from scan2sim.pipeline.io.importing import place, tile_folder
 from scan2sim.pipeline.io.merging import borrow_colours, colour, phase_of, read_bin, thin

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field
 
+from scan2sim.pipeline.backends import find
 from scan2sim.pipeline.classes import SURFACES
 from scan2sim.pipeline.errors import DataError, SettingError
 from scan2sim.pipeline.extras import need
@@ -23,6 +25,10 @@ LISTS = {
 }  # fmt: skip  # input to file in the world's folder
 
 
+SHOWN = ("obj", "collada")
+"""Formats that Gazebo's model shows, the better one first."""
+
+
 def _pixel(size: bool | float) -> bool | float:
     if not (size in (False, True) or 0.001 <= size <= 100):
         raise ValueError("give metres a pixel from 0.001 to 100, or true or false")
@@ -34,10 +40,11 @@ class ExportParams(Params):
 
     Attributes:
         name: of the tile, its world and its model; set by the recipe.
-        obj, collada, glb, gazebo: formats; Gazebo's model shows the OBJ, which it reads several times
-            faster than Collada, or Collada where OBJ is off.
+        formats: of meshes, files of `pipeline/io/meshes`.
+        gazebo: whether to make a world for it; its model shows the OBJ, which it reads several times faster than
+            Collada, or Collada where there is no OBJ.
         friction: Coulomb friction coefficient of the ground; 0.9 is rubber on dry asphalt.
-        max_visual_triangles: of one OBJ or Collada file; larger groups are written in parts.
+        max_visual_triangles: of one file of the model; larger groups are written in parts.
         pages: "png", lossless, or "jpeg", a sixth or so of its size, for the texture pages of OBJ and Collada.
         jpeg_quality: of the GLB's textures, and of JPEG pages.
         world_origin: metres in the CRS; several tiles with the same one share their georeference.
@@ -47,9 +54,7 @@ class ExportParams(Params):
     """
 
     name: Name = "tile"
-    obj: bool = True
-    collada: bool = True
-    glb: bool = True
+    formats: tuple[str, ...] = Field(("obj", "collada", "glb"), json_schema_extra={"range": "a list of formats"})
     gazebo: bool = True
     friction: float = Field(0.9, ge=0, le=10)
     max_visual_triangles: int = Field(200_000, ge=1_000, le=10_000_000)
@@ -72,17 +77,21 @@ def export(inputs: Inputs, params: ExportParams, out: Path, report: Report) -> D
 
     Raises:
         DataError: no group has a face.
-        SettingError: Gazebo's world is wanted, but neither OBJ nor Collada.
+        SettingError: there is no such format; Gazebo's world is wanted, but no mesh that it shows.
+        UnavailableError: a format can't be written here.
         InputError: a textured mesh is incomplete, or in another frame than the others.
     """
     import json
     import shutil
 
-    from scan2sim.pipeline.io import gltf, obj, textured
+    from scan2sim.pipeline.io import textured
+    from scan2sim.pipeline.io.meshes import obj
     from scan2sim.pipeline.types import Mesh
 
-    if params.gazebo and not (params.obj or params.collada):
-        raise SettingError("export", "gazebo needs a mesh format", "Set export.obj=true or export.collada=true")
+    formats = _formats(params)
+    shown = next((formats[name].SUFFIX for name in SHOWN if name in formats), None)
+    if params.gazebo and shown is None:
+        raise SettingError("export.formats", f"has nothing that Gazebo shows ({' or '.join(SHOWN)})", "Name one, too")
     read = {group: textured.read(inputs[group]) for group in SURFACES if group in inputs}
     surfaces: dict[str, Textured] = {group: surface for group, surface in read.items() if surface is not None}
     if not surfaces:
@@ -98,10 +107,9 @@ def export(inputs: Inputs, params: ExportParams, out: Path, report: Report) -> D
     visuals: dict[str, str] = {}
     for i, (group, surface) in enumerate(surfaces.items()):
         report(0.6 * i / len(surfaces), group)
-        written = _write_group(meshes, group, surface, params)
+        written = _write_group(meshes, group, surface, params, formats.values())
         counts |= written
-        suffix = ".obj" if params.obj else ".dae"
-        visuals |= {f"meshes/{file}": group for file in written if file.endswith(suffix)}
+        visuals |= {f"meshes/{file}": group for file in written if Path(file).suffix == shown}
     obj.write_plain(meshes / "collision.obj", solid)
     counts["collision.obj"] = len(solid)
     for key, file in LISTS.items():
@@ -109,9 +117,10 @@ def export(inputs: Inputs, params: ExportParams, out: Path, report: Report) -> D
             shutil.copyfile(inputs[key], world / file)
     if params.gazebo:
         _write_gazebo(world, model, visuals, frame, params)
-    if params.glb:
-        report(0.7, "GLB")
-        gltf.write(world / f"{params.name}.glb", surfaces, params.jpeg_quality)
+    report(0.7, "world")
+    for form in formats.values():
+        if hasattr(form, "write_world"):
+            form.write_world(world / f"{params.name}{form.SUFFIX}", surfaces, params.jpeg_quality)
     metadata = _metadata(params, frame, surfaces, {f"models/{params.name}/meshes/{f}": n for f, n in counts.items()})
     (world / "metadata.json").write_text(json.dumps(metadata, indent=2) + "\n", encoding="utf-8")
     facts = {
@@ -138,33 +147,42 @@ def _common_frame(inputs: Inputs, surfaces: dict[str, Textured], solid: Any) -> 
     return frame
 
 
-def _write_group(folder: Path, group: str, surface: Textured, params: ExportParams) -> dict[str, int]:
-    """Write a group's OBJ and Collada files and their images; triangles of every mesh file."""
+def _formats(params: ExportParams) -> dict[str, Any]:
+    """The modules of the formats that are wanted, by name.
+
+    Raises:
+        SettingError: there is no such format. UnavailableError: one can't be written here.
+    """
+    return {name: find("scan2sim.pipeline.io.meshes", name, "export.formats") for name in params.formats}
+
+
+def _write_group(
+    folder: Path, group: str, surface: Textured, params: ExportParams, formats: Iterable[Any]
+) -> dict[str, int]:
+    """Write a group's files in the formats that have some for each, and their images; triangles of every mesh file."""
     import shutil
 
-    from scan2sim.pipeline.io import collada, image, obj
+    from scan2sim.pipeline.io import image
+    from scan2sim.pipeline.io.meshes import Look
 
-    if not (params.obj or params.collada):
+    formats = [form for form in formats if hasattr(form, "write")]
+    if not formats:
         return {}
-    materials = [f"{group}_{page}" for page in range(len(surface.pages))]
-    images = [f"{name}.{'png' if params.pages == 'png' else 'jpg'}" for name in materials]
+    materials = tuple(f"{group}_{page}" for page in range(len(surface.pages)))
+    images = tuple(f"{name}.{'png' if params.pages == 'png' else 'jpg'}" for name in materials)
     for page in surface.used_pages:
         if params.pages == "png":
             shutil.copyfile(surface.pages[page], folder / images[page])
         else:
             image.copy(surface.pages[page], folder / images[page], quality=params.jpeg_quality)
-    if params.obj:
-        obj.write_mtl(folder / f"{group}.mtl", {materials[p]: images[p] for p in surface.used_pages})
+    look = Look(group, materials, images, tuple(surface.used_pages))
     counts = {}
     parts = surface.parts(params.max_visual_triangles)
     for i, part in enumerate(parts, start=1):
         stem = group if len(parts) == 1 else f"{group}_part{i}"
-        if params.obj:
-            obj.write(folder / f"{stem}.obj", part, materials, f"{group}.mtl")
-            counts[f"{stem}.obj"] = len(part)
-        if params.collada:
-            collada.write(folder / f"{stem}.dae", part, materials, images)
-            counts[f"{stem}.dae"] = len(part)
+        for form in formats:
+            form.write(folder / f"{stem}{form.SUFFIX}", part, look)
+            counts[f"{stem}{form.SUFFIX}"] = len(part)
     return counts
 
 
@@ -212,11 +230,13 @@ def _metadata(
 
 
 def can_export(params: ExportParams) -> None:
-    """Refuse to begin if rasters are wanted without what writes them.
+    """Refuse to begin if formats or rasters are wanted that can't be written here.
 
     Raises:
-        UnavailableError: rasterio isn't installed.
+        SettingError: there is no such format.
+        UnavailableError: a package isn't installed.
     """
+    _formats(params)
     if params.rasters:
         need("export.rasters", "rasterio")
 

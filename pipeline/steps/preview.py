@@ -42,7 +42,8 @@ def preview(inputs: Inputs, params: PreviewParams, out: Path, report: Report) ->
     import numpy as np
 
     from scan2sim.pipeline import render
-    from scan2sim.pipeline.io import gltf, textured
+    from scan2sim.pipeline.io import textured
+    from scan2sim.pipeline.io.meshes.glb import write_world
     from scan2sim.pipeline.steps.pictures import bird_pose, bounds, driver_pose, whole_pose
     from scan2sim.pipeline.types import Trajectory
 
@@ -55,7 +56,7 @@ def preview(inputs: Inputs, params: PreviewParams, out: Path, report: Report) ->
     folder = out / "preview"
     folder.mkdir()
     glb = out / "world.glb"
-    gltf.write(glb, surfaces, params.jpeg_quality, scale=scale, normals=False)
+    write_world(glb, surfaces, params.jpeg_quality, scale=scale, normals=False)
     report(0.7, "eyes")
     script = folder / "world.js"
     script.write_bytes(CALL + b'("' + base64.b64encode(glb.read_bytes()) + b'");\n')

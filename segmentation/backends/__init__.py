@@ -1,22 +1,15 @@
-"""Segmentation networks behind one protocol: a file a backend, found by its name.
-
-A backend's module has `missing(weights) -> str | None` (the packages it lacks to run those weights here) and
-`load(weights, device) -> Network`.
-"""
+"""Segmentation networks behind one protocol: a file a backend (`pipeline.backends`), found by its name."""
 
 from __future__ import annotations
 
-import importlib
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
+from scan2sim.pipeline import backends
 from scan2sim.pipeline.errors import InputError, SettingError
-from scan2sim.pipeline.extras import unavailable
 from scan2sim.pipeline.types import F32, U8
-
-NAMES = ("street", "segformer", "onnx")
 
 
 @dataclass(frozen=True)
@@ -56,6 +49,20 @@ class Network(Protocol):
         """
 
 
+class Backend(Protocol):
+    """What a backend's module has."""
+
+    def check(self, weights: Path | None) -> None:
+        """Refuse weights that it can't run here; nothing heavy is loaded.
+
+        Raises:
+            ScanError: as `check`.
+        """
+
+    def load(self, weights: Path | None, device: str) -> Network:
+        """The network with these weights, which were checked."""
+
+
 def load(name: str, weights: Path | None, device: str = "auto") -> Network:
     """The network of a backend, with the user's weights or, for "street", the project's own.
 
@@ -64,11 +71,10 @@ def load(name: str, weights: Path | None, device: str = "auto") -> Network:
         InputError: the weights are damaged, of another architecture, or unsafe to read.
         ScanError: as `check`.
     """
-    network: Network = check(name, weights).load(weights, device)
-    return network
+    return check(name, weights).load(weights, device)
 
 
-def check(name: str, weights: Path | None) -> Any:
+def check(name: str, weights: Path | None) -> Backend:
     """The module of a backend that can run here; nothing heavy is loaded.
 
     Raises:
@@ -76,17 +82,23 @@ def check(name: str, weights: Path | None) -> Any:
         UnavailableError: a package is missing.
         InputError: the weights aren't there.
     """
-    if name not in NAMES:
-        raise SettingError("label.network", f"there is no {name!r}", f"Choose one of: {', '.join(NAMES)}")
-    backend = importlib.import_module(f"scan2sim.segmentation.backends.{name}")
-    lacking = backend.missing(weights)
-    if lacking:
-        raise unavailable(f"label.network {name}", lacking)
-    if weights is None and name != "street":
-        raise SettingError("label.weights", f"{name!r} comes without weights", "Name yours: --set label.weights=PATH")
-    if weights is not None and not weights.exists():
-        raise InputError(weights, "is no file or folder", "Give one on this disk; nothing is downloaded")
+    backend: Backend = backends.find(__name__, name, "label.network")
+    backend.check(weights)
     return backend
+
+
+def given(name: str, weights: Path | None) -> Path:
+    """Weights of the user's, for a backend that comes without.
+
+    Raises:
+        SettingError: there are none.
+        InputError: they aren't there.
+    """
+    if weights is None:
+        raise SettingError("label.weights", f"{name!r} comes without weights", "Name yours: --set label.weights=PATH")
+    if not weights.exists():
+        raise InputError(weights, "is no file or folder", "Give one on this disk; nothing is downloaded")
+    return weights
 
 
 def torch_device(device: str) -> str:

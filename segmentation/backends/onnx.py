@@ -17,31 +17,31 @@ from typing import Any
 
 import numpy as np
 
-from scan2sim.pipeline import extras
 from scan2sim.pipeline.channels import COUNT
 from scan2sim.pipeline.errors import InputError, SettingError
 from scan2sim.pipeline.types import F32, U8
-from scan2sim.segmentation.backends import Facts
+from scan2sim.segmentation.backends import Facts, given
 from scan2sim.segmentation.backends.segformer import MEAN, STD, numbers
 
+NEEDS = ("onnxruntime",)
 FLOATS = {"tensor(float)": "float32", "tensor(float16)": "float16"}
 CUDA = "CUDAExecutionProvider"
 REMEDY = "Export the network with one input (1, 3, H, W) of floats and one output (1, C, h, w)"
 
 
-def missing(weights: Path | None) -> str | None:
-    """Packages that aren't installed, or None."""
-    return extras.missing("onnxruntime")
+def check(weights: Path | None) -> None:
+    """See `segmentation.backends.Backend`."""
+    given("onnx", weights)
 
 
-def load(weights: Path, device: str) -> Network:
+def load(weights: Path | None, device: str) -> Network:
     """The network of an ONNX file.
 
     Raises:
         SettingError: onnxruntime can't use the device.
         InputError: it is missing, damaged, has other inputs or outputs, or doesn't name its labels.
     """
-    return Network(weights, device)
+    return Network(given("onnx", weights), device)
 
 
 class Network:

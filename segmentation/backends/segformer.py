@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from scan2sim.pipeline import extras
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.types import F32, U8
-from scan2sim.segmentation.backends import Facts, torch_device
+from scan2sim.segmentation.backends import Facts, given, torch_device
 
+NEEDS = ("torch", "safetensors", "transformers")
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 """Of ImageNet's red, green and blue, 1 for white: what nearly all networks were trained with."""
 FILES = ("model.safetensors", "pytorch_model.bin")
@@ -25,19 +25,19 @@ SMALLEST = 32
 REMEDY = f"Give a folder on this disk with config.json and {FILES[0]} of a {ARCHITECTURE}; nothing is downloaded"
 
 
-def missing(weights: Path | None) -> str | None:
-    """Packages that aren't installed, or None."""
-    return extras.missing("torch", "safetensors", "transformers")
+def check(weights: Path | None) -> None:
+    """See `segmentation.backends.Backend`."""
+    given("segformer", weights)
 
 
-def load(weights: Path, device: str) -> Network:
+def load(weights: Path | None, device: str) -> Network:
     """The network of a folder (config.json, model.safetensors or pytorch_model.bin), or of a file beside config.json.
 
     Raises:
         SettingError: torch can't use the device.
         InputError: they are missing, damaged, of another architecture, or a pickle with more than tensors.
     """
-    return Network(weights, torch_device(device))
+    return Network(given("segformer", weights), torch_device(device))
 
 
 class Network:

@@ -15,22 +15,24 @@ from scan2sim.pipeline import extras
 from scan2sim.pipeline.channels import COUNT
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.types import F32, U8
-from scan2sim.segmentation.backends import Facts, onnx, torch_device
+from scan2sim.segmentation.backends import Facts, given, onnx, torch_device
 from scan2sim.segmentation.backends import Network as AnyNetwork
 
 if TYPE_CHECKING:
     from scan2sim.segmentation.network import StreetNet
 
+NEEDS = onnx.NEEDS
 OWN = Path(__file__).resolve().parent.parent / "weights" / "street.onnx"
 LICENCE = "as the project's"
 OPSET = 17
 
 
-def missing(weights: Path | None) -> str | None:
-    """Packages that aren't installed, or None."""
+def check(weights: Path | None) -> None:
+    """See `segmentation.backends.Backend`; without weights, the project's own are used."""
     if weights is not None and _is_torchs(weights):
-        return extras.missing("torch", "safetensors")
-    return onnx.missing(weights)
+        extras.need("label.network street", "torch", "safetensors")
+    if weights is not None:
+        given("street", weights)
 
 
 def load(weights: Path | None, device: str) -> AnyNetwork:

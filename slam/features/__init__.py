@@ -1,23 +1,20 @@
-"""Features: places in a picture that are found again in another, each with a descriptor. A file a backend, found by
-its name.
+"""Features: places in a picture that are found again in another, each with a descriptor. A file a backend
+(`pipeline.backends`), found by its name.
 
-A backend's module has `available() -> str | None` (what to install, if it can't run here) and
-`load(weights, count, upsample, device) -> Features`. Backends see pictures, never the sphere: `slam.matching` shows
-them the charts and makes bearings of what they find.
+Backends see pictures, never the sphere: `slam.trackers.descriptors` shows them the charts and makes bearings of what
+they find.
 """
 
 from __future__ import annotations
 
-import importlib
-import pkgutil
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
+from scan2sim.pipeline import backends
 from scan2sim.pipeline.errors import SettingError
-from scan2sim.pipeline.extras import unavailable
 from scan2sim.pipeline.types import F32, U8
 
 
@@ -55,15 +52,11 @@ class Features(Protocol):
         """What this is, for logs: with the hash and licence of weights."""
 
 
-def names() -> list[str]:
-    """Of the backends that there are."""
-    return sorted(module.name for module in pkgutil.iter_modules(__path__))
+class Backend(Protocol):
+    """What a backend's module has."""
 
-
-def missing(name: str) -> str | None:
-    """What to install so that a backend can run here, or None."""
-    found: str | None = _module(name).available()
-    return found
+    def load(self, weights: Path | None, count: int, upsample: int, device: str) -> Features:
+        """See `named`."""
 
 
 def named(
@@ -72,7 +65,7 @@ def named(
     """A backend.
 
     Args:
-        name: one of `names()`.
+        name: of its file here.
         weights: the user's file, for networks.
         count: features a picture at most.
         upsample: how many times pictures are enlarged before; 2 lets RootSIFT match a tenth more, in twice the time.
@@ -83,18 +76,8 @@ def named(
         UnavailableError: it can't run here.
         InputError: the weights are damaged, of another network, or unsafe to read.
     """
-    module = _module(name)
-    lacking = module.available()
-    if lacking:
-        raise unavailable(f"slam.features {name}", lacking)
-    backend: Features = module.load(weights, count, upsample, device)
-    return backend
-
-
-def _module(name: str) -> Any:
-    if name not in names():
-        raise SettingError("slam.features", f"there is no {name!r}", f"Choose one of: {', '.join(names())}")
-    return importlib.import_module(f"scan2sim.slam.features.{name}")
+    backend: Backend = backends.find(__name__, name, "slam.features")
+    return backend.load(weights, count, upsample, device)
 
 
 def no_weights(name: str, weights: Path | None) -> None:

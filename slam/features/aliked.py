@@ -16,6 +16,7 @@ THRESHOLD, RADIUS, TEMPERATURE = 0.2, 2, 0.1
 """Least score, pixels between features, and how sharply a peak's place is averaged: as published."""
 STEP = 32
 """Pictures are as many times this wide and high."""
+NEEDS = files.NEEDS
 HINT = "Give one of ALIKED's aliked-t16.pth, aliked-n16.pth, aliked-n16rot.pth, aliked-n32.pth"
 
 
@@ -62,11 +63,6 @@ MODELS = [
         ("ALIKED-n32", (16, 32, 64, 128), 32),
     )
 ]
-
-
-def available() -> str | None:
-    """What to install, or None."""
-    return files.missing()
 
 
 def load(weights: Path | None, count: int, upsample: int, device: str) -> Aliked:

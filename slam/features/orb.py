@@ -16,11 +16,6 @@ SPREAD, CELL = 4, 40
 """So many times the features are found, and shared out between cells of so many pixels: else most are in few places."""
 
 
-def available() -> str | None:
-    """What to install, or None."""
-    return None
-
-
 def load(weights: Path | None, count: int, upsample: int, device: str) -> Orb:
     """See `slam.features.named`."""
     no_weights("orb", weights)

@@ -13,11 +13,6 @@ CONTRAST = 0.02
 """Half of Lowe's: walls and roads have little."""
 
 
-def available() -> str | None:
-    """What to install, or None."""
-    return None
-
-
 def load(weights: Path | None, count: int, upsample: int, device: str) -> RootSift:
     """See `slam.features.named`."""
     no_weights("rootsift", weights)

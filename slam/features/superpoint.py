@@ -15,6 +15,7 @@ CELL = 8
 """Pixels a side, of the squares that a row of the network's output is about."""
 SUPPRESS, THRESHOLD, BORDER = 4, 0.005, 4
 """Pixels between features, least probability, pixels at the frame's edge without any: as published."""
+NEEDS = files.NEEDS
 HINT = "Give Magic Leap's superpoint_v1.pth"
 _LAYERS = {
     "conv1a": (64, 1, 3, 3), "conv1b": (64, 64, 3, 3),
@@ -31,11 +32,6 @@ MODEL = files.Model(
     "Magic Leap's, for academic or non-profit noncommercial research only",
     {"52b6708629640ca883673b5d5c097c4ddad37d8048b33f09c8ca0d69db12c40e": "superpoint_v1.pth"},
 )
-
-
-def available() -> str | None:
-    """What to install, or None."""
-    return files.missing()
 
 
 def load(weights: Path | None, count: int, upsample: int, device: str) -> SuperPoint:

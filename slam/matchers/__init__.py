@@ -1,21 +1,15 @@
-"""Matchers: which features of two pictures are the same. A file a backend, found by its name.
-
-A backend's module has `available() -> str | None` (what to install, if it can't run here) and
-`load(weights, device) -> Matcher`.
-"""
+"""Matchers: which features of two pictures are the same. A file a backend (`pipeline.backends`), found by its name."""
 
 from __future__ import annotations
 
-import importlib
-import pkgutil
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
+from scan2sim.pipeline import backends
 from scan2sim.pipeline.errors import SettingError
-from scan2sim.pipeline.extras import unavailable
 from scan2sim.slam.features import Features, Found
 
 I64 = npt.NDArray[np.int64]
@@ -47,22 +41,18 @@ class Matcher(Protocol):
         """What this is, for logs: with the hash and licence of weights."""
 
 
-def names() -> list[str]:
-    """Of the backends that there are."""
-    return sorted(module.name for module in pkgutil.iter_modules(__path__))
+class Backend(Protocol):
+    """What a backend's module has."""
 
-
-def missing(name: str) -> str | None:
-    """What to install so that a backend can run here, or None."""
-    found: str | None = _module(name).available()
-    return found
+    def load(self, weights: Path | None, device: str) -> Matcher:
+        """See `named`."""
 
 
 def named(name: str, weights: Path | None = None, *, device: str = "auto") -> Matcher:
     """A backend.
 
     Args:
-        name: one of `names()`.
+        name: of its file here.
         weights: the user's file, for networks.
         device: of torch, for networks.
 
@@ -71,12 +61,8 @@ def named(name: str, weights: Path | None = None, *, device: str = "auto") -> Ma
         UnavailableError: it can't run here.
         InputError: the weights are damaged, of another network, or unsafe to read.
     """
-    module = _module(name)
-    lacking = module.available()
-    if lacking:
-        raise unavailable(f"slam.matchers {name}", lacking)
-    backend: Matcher = module.load(weights, device)
-    return backend
+    backend: Backend = backends.find(__name__, name, "slam.matchers")
+    return backend.load(weights, device)
 
 
 def check(features: Features, matcher: Matcher) -> None:
@@ -89,12 +75,6 @@ def check(features: Features, matcher: Matcher) -> None:
             "slam.matcher", f"{matcher.name!r} was made for {made_for}, not for {given}",
             "Choose others, or `nearest`, which takes any",
         )  # fmt: skip
-
-
-def _module(name: str) -> Any:
-    if name not in names():
-        raise SettingError("slam.matcher", f"there is no {name!r}", f"Choose one of: {', '.join(names())}")
-    return importlib.import_module(f"scan2sim.slam.matchers.{name}")
 
 
 def mutual(scores: Any, least: float) -> I64:

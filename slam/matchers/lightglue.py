@@ -18,6 +18,7 @@ from scan2sim.slam.matchers import I64, Sizes, mutual
 LAYERS, HEADS, DIM = 9, 4, 256
 THRESHOLD = 0.1
 """Least probability of a match: as published."""
+NEEDS = files.NEEDS
 HINT = "Give LightGlue's superpoint_lightglue.pth or aliked_lightglue.pth"
 
 
@@ -64,11 +65,6 @@ _ALIKED = _model(
     {"d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503": "aliked_lightglue.pth, v0.1"},
     "Apache 2.0, ETH Zurich",
 )
-
-
-def available() -> str | None:
-    """What to install, or None."""
-    return files.missing()
 
 
 def load(weights: Path | None, device: str) -> LightGlue:

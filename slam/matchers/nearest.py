@@ -17,11 +17,6 @@ ROWS = 2048
 """Descriptors that are compared at a time."""
 
 
-def available() -> str | None:
-    """What to install, or None."""
-    return None
-
-
 def load(weights: Path | None, device: str) -> Nearest:
     """See `slam.matchers.named`."""
     no_weights("nearest", weights)

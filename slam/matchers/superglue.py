@@ -20,6 +20,7 @@ LAYERS, HEADS, DIM = 18, 4, 256
 """Layers look in turn within a picture and across."""
 ROUNDS, THRESHOLD = 100, 0.2
 """Of Sinkhorn's normalisation, and least probability of a match: as published."""
+NEEDS = files.NEEDS
 HINT = "Give Magic Leap's superglue_outdoor.pth (or superglue_indoor.pth)"
 
 
@@ -55,11 +56,6 @@ MODEL = files.Model(
         "0e710469be25ebe1e2ccf68edcae8b2945b0617c8e7e68412251d9d47f5052b1": "superglue_indoor.pth",
     },
 )
-
-
-def available() -> str | None:
-    """What to install, or None."""
-    return files.missing()
 
 
 def load(weights: Path | None, device: str) -> SuperGlue:

@@ -16,7 +16,8 @@ import pytest
 from PIL import Image
 
 from scan2sim.pipeline.classes import GROUPS, group_of
-from scan2sim.pipeline.io import geotiff, las
+from scan2sim.pipeline.io import geotiff
+from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.types import Frame, Mesh, PointCloud
 from tests.browser import chromium

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.io import las
+from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.segmentation.score import confusion
 from tests.flows.test_cli import bad, good, scan2sim

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from scan2sim.flows.cut import Options, cut_survey
 from scan2sim.pipeline.classes import GROUPS, group_of
-from scan2sim.pipeline.io import las
+from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.types import Mesh
 from tests.flows.test_cli import SMALL, bad, good, scan2sim

@@ -11,10 +11,10 @@ import numpy as np
 from scan2sim.flows.inspect import inspect_path
 from scan2sim.pipeline.errors import DataError
 from scan2sim.pipeline.io import image
+from scan2sim.pipeline.io.import_model import import_model
 from scan2sim.pipeline.io.kitti import import_kitti_raw
 from scan2sim.pipeline.io.kitti_odometry import import_kitti_odometry
 from scan2sim.pipeline.io.merging import read_bin
-from scan2sim.pipeline.io.models import import_model
 from scan2sim.pipeline.io.sweeps import Pictures, import_sweeps, read_sweep
 from scan2sim.pipeline.steps.views import _problem
 from scan2sim.pipeline.types import Camera, View

@@ -16,7 +16,7 @@ from scan2sim.pipeline.borders.grid import GRID, world
 from scan2sim.pipeline.borders.join import join
 from scan2sim.pipeline.cells import Cell
 from scan2sim.pipeline.classes import CODE, GROUPS, group_of
-from scan2sim.pipeline.io import las
+from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.step import Done, Step, silent
 from scan2sim.pipeline.steps.clip import CLIP
 from scan2sim.pipeline.steps.collision import COLLISION

@@ -12,7 +12,8 @@ from laspy.vlrs.known import ClassificationLookupVlr
 from scan2sim.flows.cut import Options, cut_survey
 from scan2sim.pipeline.classes import CODE, code_of, parse
 from scan2sim.pipeline.errors import InputError, SettingError
-from scan2sim.pipeline.io import clouds, las
+from scan2sim.pipeline.io import clouds
+from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.las_classes import write_classified
 from scan2sim.pipeline.io.las_csv import import_las
 from scan2sim.pipeline.io.survey import read_survey

@@ -20,7 +20,8 @@ from scan2sim.flows import cut as cutting
 from scan2sim.flows.cut import Options, cut_survey
 from scan2sim.pipeline.cutting import members, seeds
 from scan2sim.pipeline.errors import DataError, InputError, SettingError
-from scan2sim.pipeline.io import clouds, las
+from scan2sim.pipeline.io import clouds
+from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.survey import Survey, read_survey
 from scan2sim.pipeline.io.tile import read_tile, write_tile
 from scan2sim.pipeline.types import Camera, Frame, PointCloud, Tile, Trajectory

@@ -14,7 +14,8 @@ import pytest
 from pystac.validation.stac_validator import JsonSchemaSTACValidator
 
 from scan2sim.pipeline.errors import DataError, InputError
-from scan2sim.pipeline.io import clouds, crs, las, stac
+from scan2sim.pipeline.io import clouds, crs, stac
+from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.stac import Cloud, TileItem
 from scan2sim.pipeline.store import digest
 from scan2sim.pipeline.types import Frame, PointCloud

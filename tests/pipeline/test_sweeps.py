@@ -16,8 +16,9 @@ from typer.testing import CliRunner
 from scan2sim.flows.cli import app
 from scan2sim.pipeline.cameras import pixel_rays
 from scan2sim.pipeline.errors import DataError, InputError, ScanError, SettingError
-from scan2sim.pipeline.io import clouds, las
+from scan2sim.pipeline.io import clouds
 from scan2sim.pipeline.io import trajectory as trajectory_io
+from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.sweeps import (
     Pictures,
     camera_of_photos,

@@ -8,8 +8,8 @@ import pytest
 
 from scan2sim.pipeline.classes import CODE
 from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.io import las
 from scan2sim.pipeline.io import views as views_io
+from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.step import silent
 from scan2sim.segmentation.label import LABEL

@@ -9,7 +9,7 @@ import numpy as np
 from scan2sim.pipeline.types import GpsTrack
 from scan2sim.slam.geometry import exp_so3, rigid
 from scan2sim.slam.odometry import Odometry, OdometryParams
-from scan2sim.slam.tracking import Tracks
+from scan2sim.slam.trackers import Tracks
 
 CAMERA_TO_WORLD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # looks along +x, z up
 

@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.errors import InputError, SettingError, UnavailableError
+from scan2sim.pipeline import backends
+from scan2sim.pipeline.errors import InputError, SettingError
+from scan2sim.pipeline.extras import missing
 from scan2sim.slam import features, matchers, weights
 from scan2sim.slam.features import Found
 
@@ -20,7 +22,7 @@ SIZE = (240, 320)
 @pytest.fixture(autouse=True)
 def one_thread_and_seed() -> None:
     """Tests run side by side; threads of torch that wait for each other would only slow them down."""
-    if weights.missing() is None:
+    if not missing(*weights.NEEDS):
         import torch
 
         torch.set_num_threads(1)
@@ -61,8 +63,9 @@ def saved(path: Path, model: weights.Model) -> Path:
 
 def loaded(name: str, folder: Path, real_data: Path | None) -> features.Features:
     """A backend that can run here: with real weights where there are any, else random ones."""
-    if features.missing(name):
-        pytest.skip(f"{name} needs {features.missing(name)}")
+    lacking = backends.missing(features.__name__, name)
+    if lacking:
+        pytest.skip(f"{name} needs {lacking}")
     if name == "superpoint":
         from scan2sim.slam.features.superpoint import MODEL
 
@@ -84,7 +87,7 @@ def data() -> Path | None:
     return DATA if DATA.is_dir() else None
 
 
-@pytest.mark.parametrize("name", features.names())
+@pytest.mark.parametrize("name", backends.names(features.__name__))
 def test_features_move_with_the_picture(name: str, tmp_path: Path, data: Path | None) -> None:
     backend = loaded(name, tmp_path, data)
     large = picture()
@@ -107,7 +110,7 @@ def test_features_move_with_the_picture(name: str, tmp_path: Path, data: Path | 
     assert name in backend.describe().lower()
 
 
-@pytest.mark.parametrize("name", features.names())
+@pytest.mark.parametrize("name", backends.names(features.__name__))
 def test_masks_and_flat_pictures(name: str, tmp_path: Path, data: Path | None) -> None:
     backend = loaded(name, tmp_path, data)
     a = picture()[: SIZE[0], : SIZE[1]]
@@ -131,24 +134,11 @@ def test_enlarging_does_not_move_features() -> None:
     assert near.sum() > 50 and np.abs(np.median(moved[near], axis=0)).max() < 0.15
 
 
-def test_unknown_names_and_needless_weights() -> None:
-    for module in (features, matchers):
-        with pytest.raises(SettingError, match="Choose one of"):
-            module.named("surf")
+def test_needless_weights() -> None:
     with pytest.raises(SettingError, match="takes no weights"):
         features.named("orb", Path("superpoint_v1.pth"))
     with pytest.raises(SettingError, match="takes no weights"):
         matchers.named("nearest", Path("superglue_outdoor.pth"))
-    assert features.names() == ["aliked", "orb", "rootsift", "superpoint"]
-    assert matchers.names() == ["lightglue", "nearest", "superglue"]
-
-
-def test_what_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(weights, "missing", lambda: "torch, safetensors")
-    for module, name in ((features, "aliked"), (features, "superpoint"), (matchers, "superglue")):
-        assert module.missing(name) == "torch, safetensors"
-        with pytest.raises(UnavailableError, match=r"pip install 'scan2sim\[segmentation\]'"):
-            module.named(name)
 
 
 def test_aliked_with_real_weights_sees_a_turned_picture(real_data: Path) -> None:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from scan2sim.pipeline.cameras import inside, project
 from scan2sim.pipeline.errors import DataError
 from scan2sim.pipeline.io import trajectory as trajectory_io
-from scan2sim.pipeline.io.colmap import camera_of
+from scan2sim.pipeline.io.models.colmap import camera_of
 from scan2sim.pipeline.types import Camera, Frame, Trajectory
 from scan2sim.slam.output import SparseMap, write, write_colmap
 

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.io import image, las
+from scan2sim.pipeline.io import image
+from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.render import look_at
 from scan2sim.pipeline.step import silent
 from scan2sim.pipeline.types import Frame, PointCloud

@@ -13,7 +13,8 @@ import pytest
 
 from scan2sim.flows.inspect import inspect_path
 from scan2sim.pipeline.errors import DataError, InputError
-from scan2sim.pipeline.io import clouds, image, las
+from scan2sim.pipeline.io import clouds, image
+from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.step import silent
 from scan2sim.pipeline.steps.ingest import IngestParams, ingest

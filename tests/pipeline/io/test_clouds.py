@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.io import clouds, las
+from scan2sim.pipeline.io import clouds
+from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.types import Frame, PointCloud
 
 FRAME = Frame("EPSG:32632", (458_852.0, 5_428_637.0, 100.0))

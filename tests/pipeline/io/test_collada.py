@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.io import collada as dae
 from scan2sim.pipeline.io import textured
+from scan2sim.pipeline.io.meshes import Look
+from scan2sim.pipeline.io.meshes import collada as dae
 from tests.pipeline import made_up
 
 
@@ -18,7 +19,7 @@ def test_triangles_uv_and_pages_survive(tmp_path: Path, make) -> None:
 
     mesh = make()
     surface = textured.read(made_up.textured(tmp_path / "in", mesh))
-    dae.write(tmp_path / "a.dae", surface, ["m_0", "m_1"], ["m_0.png", "m_1.png"])
+    dae.write(tmp_path / "a.dae", surface, Look("a", ("m_0", "m_1"), ("m_0.png", "m_1.png"), (0, 1)))
     read = collada.Collada(str(tmp_path / "a.dae"))
     assert read.assetInfo.upaxis == "Z_UP" and read.assetInfo.unitmeter == 1.0
     for page, (corners, uv) in made_up.by_page(mesh).items():

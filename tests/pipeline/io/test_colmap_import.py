@@ -10,9 +10,11 @@ import pytest
 
 from scan2sim.pipeline.cameras import project
 from scan2sim.pipeline.errors import InputError, SettingError
-from scan2sim.pipeline.io import clouds, las
-from scan2sim.pipeline.io.colmap import camera_of, read
-from scan2sim.pipeline.io.models import Photos, import_model
+from scan2sim.pipeline.io import clouds
+from scan2sim.pipeline.io.clouds import las
+from scan2sim.pipeline.io.import_model import import_model
+from scan2sim.pipeline.io.models import Photos
+from scan2sim.pipeline.io.models.colmap import camera_of, read
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.types import Frame, PointCloud
 

@@ -14,7 +14,8 @@ from pyproj import CRS
 
 from scan2sim.pipeline.classes import CLASSES
 from scan2sim.pipeline.errors import DataError, InputError, SpaceError, UnavailableError
-from scan2sim.pipeline.io import las, las_classes
+from scan2sim.pipeline.io import las_classes
+from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.las_classes import write_classified
 from scan2sim.pipeline.types import U8, Frame
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from scan2sim.pipeline.errors import InputError, SettingError
-from scan2sim.pipeline.io import clouds, las
+from scan2sim.pipeline.io import clouds
+from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.las_csv import import_las
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.types import Frame, PointCloud

@@ -14,10 +14,13 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from scan2sim.flows.cli import app
+from scan2sim.pipeline import backends
 from scan2sim.pipeline.cameras import project
 from scan2sim.pipeline.errors import InputError, SettingError
-from scan2sim.pipeline.io import clouds, las
-from scan2sim.pipeline.io.models import FORMATS, Model, import_model, read
+from scan2sim.pipeline.io import clouds, models
+from scan2sim.pipeline.io.clouds import las
+from scan2sim.pipeline.io.import_model import import_model
+from scan2sim.pipeline.io.models import Model, read
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.types import F64, Frame, PointCloud
 from tests.conftest import ROOT
@@ -436,7 +439,7 @@ def test_a_damaged_file_is_refused_and_leaves_nothing(tmp_path: Path, kind: str)
 
 
 def test_every_program_has_its_help() -> None:
-    for kind in FORMATS:
+    for kind in backends.names(models.__name__):
         assert CliRunner().invoke(app, ["import", kind, "--help"]).exit_code == 0
 
 

@@ -7,8 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.io import obj, textured
+from scan2sim.pipeline.io import textured
+from scan2sim.pipeline.io.meshes import Look, obj
 from tests.pipeline import made_up
+
+LOOK = Look("a", ("m_0", "m_1"), ("m_0.png", "m_1.png"), (0, 1))
 
 
 @pytest.mark.parametrize("make", [made_up.ground, made_up.house])
@@ -17,8 +20,7 @@ def test_triangles_uv_and_pages_survive(tmp_path: Path, make) -> None:
 
     mesh = make()
     surface = textured.read(made_up.textured(tmp_path / "in", mesh))
-    obj.write(tmp_path / "a.obj", surface, ["m_0", "m_1"], "a.mtl")
-    obj.write_mtl(tmp_path / "a.mtl", {"m_0": "m_0.png", "m_1": "m_1.png"})
+    obj.write(tmp_path / "a.obj", surface, LOOK)
     for page in (0, 1):
         (tmp_path / f"m_{page}.png").write_bytes(surface.pages[page].read_bytes())
     read = trimesh.load(tmp_path / "a.obj", process=False, force="scene")
@@ -31,7 +33,7 @@ def test_triangles_uv_and_pages_survive(tmp_path: Path, make) -> None:
 
 def test_texture_coordinates_are_said_once_and_v_goes_up(tmp_path: Path) -> None:
     surface = textured.read(made_up.textured(tmp_path / "in", made_up.house()))
-    obj.write(tmp_path / "a.obj", surface, ["m_0", "m_1"], "a.mtl")
+    obj.write(tmp_path / "a.obj", surface, LOOK)
     lines = (tmp_path / "a.obj").read_text().splitlines()
     vt = [line for line in lines if line.startswith("vt ")]
     assert len(vt) == len(set(vt)) == 10

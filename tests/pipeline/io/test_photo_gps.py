@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from scan2sim.flows.cli import app
 from scan2sim.pipeline.errors import DataError, SettingError
 from scan2sim.pipeline.io import clouds, exif
-from scan2sim.pipeline.io.models import import_model
+from scan2sim.pipeline.io.import_model import import_model
 from scan2sim.pipeline.io.photo_gps import by_photos
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.types import F64

@@ -9,7 +9,8 @@ import pytest
 import tomli_w
 
 from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.io import clouds, las
+from scan2sim.pipeline.io import clouds
+from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.tile import read_tile, write_tile
 from scan2sim.pipeline.types import Camera, Frame, PointCloud
 

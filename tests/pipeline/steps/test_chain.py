@@ -12,7 +12,7 @@ import pytest
 from scan2sim.pipeline import isolate
 from scan2sim.pipeline.classes import CODE
 from scan2sim.pipeline.errors import DataError, StepError
-from scan2sim.pipeline.io import las
+from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.step import Done, Step, silent
 from scan2sim.pipeline.steps.decimate import DECIMATE, simplify
 from scan2sim.pipeline.steps.geometry import distances

@@ -107,11 +107,11 @@ def test_a_local_tile_has_no_georeference(tmp_path: Path) -> None:
 
 
 def test_formats_are_chosen(tmp_path: Path) -> None:
-    world = made_up.world(tmp_path, obj=False, glb=False).files["world"]
+    world = made_up.world(tmp_path, formats=("collada",)).files["world"]
     assert not list(world.rglob("*.glb")) and [p.name for p in world.rglob("*.obj")] == ["collision.obj"]
     assert "terrain.dae" in (world / "models/street/model.sdf").read_text()
-    with pytest.raises(SettingError, match=r"export.obj=true"):
-        EXPORT.run({}, ExportParams(obj=False, collada=False), tmp_path, silent)
+    with pytest.raises(SettingError, match=r"export.formats: has nothing that Gazebo shows"):
+        EXPORT.run({}, ExportParams(formats=("glb",)), tmp_path, silent)
 
 
 def test_an_empty_group_is_left_out_and_nothing_at_all_is_refused(tmp_path: Path) -> None:

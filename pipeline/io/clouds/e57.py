@@ -1,0 +1,159 @@
+"""E57 clouds (ASTM E2807), through pye57: all scans of a file, each moved by its own pose.
+
+Cartesian and spherical coordinates; colours and intensities by the limits that the scan names; times from
+`acquisitionStart` on; a field `classification`, where a writer has added one. The CRS is the file's
+`coordinateMetadata`, where that is one. Points that a scan marks as invalid are left out.
+
+Source: ASTM E2807-11, tables 1 to 20 (as in libE57Format's documentation, https://github.com/asmaloney/libE57Format).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.io import points
+from scan2sim.pipeline.io.points import PART, Points
+from scan2sim.pipeline.types import F64, Frame, PointCloud
+
+SUFFIXES = (".e57",)
+NEEDS = ("pye57",)
+CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
+SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
+COLOURS = ("colorRed", "colorGreen", "colorBlue")
+INVALID = ("cartesianInvalidState", "sphericalInvalidState")
+OTHERS = ("intensity", "timeStamp", "classification")
+
+
+def read_header(path: Path) -> tuple[int, F64, F64, str | None]:
+    """Number of valid points of all scans, low and high corner, CRS as WKT or None."""
+    found = points.summary(path, _parts(path))
+    return found.count, found.low, found.high, _crs(path)
+
+
+def read(path: Path, frame: Frame) -> PointCloud:
+    """All scans' points in local coordinates."""
+    return points.whole(path, _parts(path), frame)
+
+
+def chunks(path: Path, frame: Frame, size: int) -> Iterator[PointCloud]:
+    """The points in their order, `size` at a time at most."""
+    return points.local(path, _parts(path), points.summary(path, _parts(path)), frame, size)
+
+
+def _parts(path: Path) -> Iterator[Points]:
+    with closing(_open(path)) as file:
+        try:
+            scans = file.root()["data3D"]
+            for i in range(len(scans)):
+                yield from _scan(file, scans[i])
+        except InputError:
+            raise
+        except Exception as error:  # pye57's own kind, and whatever its bindings make of the damage
+            raise _unreadable(path, error) from None
+
+
+def _open(path: Path) -> Any:
+    from pye57 import libe57  # its own class E57 deletes what it can't open
+
+    if not path.is_file():
+        raise InputError(path, "is missing, or no file", "Put it there, or mend the name")
+    try:
+        return libe57.ImageFile(str(path), "r")
+    except Exception as error:  # pye57's own kind, and whatever its bindings make of the damage
+        raise _unreadable(path, error) from None
+
+
+def _scan(file: Any, node: Any) -> Iterator[Points]:
+    from pye57 import libe57
+    from pye57.scan_header import ScanHeader
+
+    header = ScanHeader(node)
+    there = set(header.point_fields)
+    places = next((names for names in (CARTESIAN, SPHERICAL) if set(names) <= there), None)
+    if places is None:
+        raise ValueError(f"a scan has neither {', '.join(CARTESIAN)} nor {', '.join(SPHERICAL)}")
+    wanted = [*places, *(name for name in (*COLOURS, *INVALID, *OTHERS) if name in there)]
+    values = {name: np.empty(PART) for name in wanted}
+    buffers = libe57.VectorSourceDestBuffer()
+    for name, array in values.items():
+        buffers.append(libe57.SourceDestBuffer(file, name, array, PART, True, True))
+    pose = _pose(node)
+    done = 0
+    with closing(header.points.reader(buffers)) as reader:
+        while n := reader.read():
+            done += n
+            yield _points({name: array[:n].copy() for name, array in values.items()}, places, pose, node)
+    if done != header.point_count:
+        raise ValueError(f"{done:,} of {header.point_count:,} points can be read")
+
+
+def _points(values: dict[str, F64], places: tuple[str, ...], pose: F64, node: Any) -> Points:
+    xyz = np.column_stack([values[name] for name in places])
+    if places is SPHERICAL:
+        distance, azimuth, elevation = xyz.T
+        flat = distance * np.cos(elevation)
+        xyz = np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), distance * np.sin(elevation)])
+    for name in INVALID:
+        if name in values:
+            xyz[values[name] != 0] = np.nan
+    rgb: npt.NDArray[Any] | None = None
+    if set(COLOURS) <= set(values):
+        rgb = np.column_stack([_fraction(values[name], node, "colorLimits", name) for name in COLOURS])
+    intensity = values.get("intensity")
+    if intensity is not None:
+        intensity = _fraction(intensity, node, "intensityLimits", "intensity")
+    time = values.get("timeStamp")
+    if time is not None and node.isDefined("acquisitionStart/dateTimeValue"):
+        time = time + node["acquisitionStart"]["dateTimeValue"].value()
+    return Points(
+        xyz @ pose[:3, :3].T + pose[:3, 3], rgb, label=values.get("classification"), time=time, intensity=intensity
+    )
+
+
+def _fraction(values: F64, node: Any, limits: str, name: str) -> F64:
+    """Values from 0 to 1 between the limits that a scan names; as they are where it names none."""
+    if not node.isDefined(f"{limits}/{name}Maximum") or not node.isDefined(f"{limits}/{name}Minimum"):
+        return values
+    low, high = (float(node[limits][f"{name}{end}"].value()) for end in ("Minimum", "Maximum"))
+    return (values - low) / (high - low) if high > low else values
+
+
+def _pose(node: Any) -> F64:
+    """(4, 4) scan to file coordinates; the identity where the scan has none."""
+    from scipy.spatial.transform import Rotation
+
+    pose = np.eye(4)
+    if node.isDefined("pose/rotation"):
+        w, x, y, z = (float(node["pose"]["rotation"][key].value()) for key in "wxyz")
+        pose[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
+    if node.isDefined("pose/translation"):
+        pose[:3, 3] = [float(node["pose"]["translation"][key].value()) for key in "xyz"]
+    if not np.isfinite(pose).all():
+        raise ValueError("the pose of a scan is not finite")
+    return pose
+
+
+def _crs(path: Path) -> str | None:
+    """Many writers put remarks, or nothing, where the standard wants WKT: that is no CRS."""
+    from pyproj import CRS
+    from pyproj.exceptions import CRSError
+
+    with closing(_open(path)) as file:
+        root = file.root()
+        told = str(root["coordinateMetadata"].value()) if root.isDefined("coordinateMetadata") else ""
+    try:
+        return CRS.from_user_input(told).to_wkt() if told.strip() else None
+    except CRSError:
+        return None
+
+
+def _unreadable(path: Path, error: Exception) -> InputError:
+    cause = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+    return InputError(path, f"is no readable E57 file ({cause[:160]})", "Export it again, or as LAZ")

@@ -1,0 +1,186 @@
+"""EPT clouds (Entwine Point Tiles 1.1) in a local folder: `ept.json`, `ept-hierarchy/`, `ept-data/`.
+
+The octree's nodes are read one after the other, coarse ones first, whatever their dataType: laszip, binary
+(the schema's dimensions, packed) or zstandard (the same, by zstd). A cloud is many files, so a tile can't name it:
+`scan2sim import clouds` makes one LAZ file of it.
+
+Source: https://entwine.io/en/latest/entwine-point-tile.html
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.extras import need
+from scan2sim.pipeline.io import files, points
+from scan2sim.pipeline.io.clouds import las
+from scan2sim.pipeline.io.points import PART, Points
+from scan2sim.pipeline.types import F64, Frame, PointCloud
+
+Schema = tuple[np.dtype[Any], dict[str, tuple[float, float]]]
+"""A packed point, and scale and offset of each of its dimensions."""
+SUFFIXES = ("ept.json",)
+REMEDY = "Copy the whole folder again, or build it anew"
+PARTS = {"laszip": ".laz", "binary": ".bin", "zstandard": ".zst"}
+KINDS = {"signed": "i", "unsigned": "u", "float": "f"}
+LARGEST = 100 << 20
+"""Bytes of a JSON file; Entwine splits its hierarchy far below."""
+KEY = re.compile(r"\d{1,3}-\d{1,10}-\d{1,10}-\d{1,10}")
+
+
+def read_header(path: Path) -> tuple[int, F64, F64, str | None]:
+    """Number of points, low and high corner, of the points themselves; CRS as WKT or None."""
+    found = points.summary(path, _parts(path))
+    return found.count, found.low, found.high, _crs(path, _json(path))
+
+
+def read(path: Path, frame: Frame) -> PointCloud:
+    """All nodes' points in local coordinates."""
+    return points.whole(path, _parts(path), frame)
+
+
+def chunks(path: Path, frame: Frame, size: int) -> Iterator[PointCloud]:
+    """The points, coarse nodes first, `size` at a time at most."""
+    return points.local(path, _parts(path), points.summary(path, _parts(path)), frame, size)
+
+
+def _parts(path: Path) -> Iterator[Points]:
+    info = _json(path)
+    kind = info.get("dataType")
+    if kind not in PARTS:
+        raise InputError(path, f"has the dataType {str(kind)[:40]!r}", f"Build it with {', '.join(PARTS)}")
+    if kind == "zstandard":
+        need(str(path), "zstandard")
+    schema = None if kind == "laszip" else _schema(path, info)
+    for key, count in _nodes(path.parent):
+        tile = path.parent / "ept-data" / f"{key}{PARTS[kind]}"
+        if not tile.is_file():
+            raise InputError(tile, f"is missing ({count:,} points of {path.parent.name})", REMEDY)
+        done = 0
+        for part in _laszip(tile) if schema is None else _packed(tile, schema, count):
+            done += len(part)
+            yield part
+        if done != count:
+            raise InputError(tile, f"is truncated or damaged: {done:,} of {count:,} points can be read", REMEDY)
+
+
+def _nodes(folder: Path) -> Iterator[tuple[str, int]]:
+    """Keys (depth-x-y-z) and numbers of points of all nodes that have some, file after file of the hierarchy."""
+    waiting, seen = ["0-0-0-0"], set[str]()
+    while waiting:
+        file = folder / "ept-hierarchy" / f"{waiting.pop(0)}.json"
+        entries = _json(file)
+        for key, count in entries.items():
+            if not KEY.fullmatch(key) or not isinstance(count, int) or count < -1:
+                raise InputError(file, f"its entry {key[:40]!r} is no node of an octree", REMEDY)
+        for key in sorted(entries, key=lambda key: [int(part) for part in key.split("-")]):
+            count = entries[key]
+            if count == -1:
+                if key in seen:
+                    raise InputError(file, f"leads to {key} a second time", REMEDY)
+                seen.add(key)
+                waiting.append(key)
+            elif count > 0:
+                yield key, count
+
+
+def _laszip(tile: Path) -> Iterator[Points]:
+    for part in las.records(tile, PART):
+        names = set(part.point_format.dimension_names)
+        yield Points(
+            np.column_stack([part.x, part.y, part.z]),
+            np.column_stack([part.red, part.green, part.blue]) if "red" in names else None,
+            label=np.array(part.classification),
+            time=np.array(part.gps_time) if "gps_time" in names else None,
+            intensity=np.array(part.intensity),
+        )
+
+
+def _packed(tile: Path, schema: Schema, count: int) -> Iterator[Points]:
+    row, scales = schema
+    if tile.suffix == ".bin" and tile.stat().st_size != count * row.itemsize:
+        raise InputError(tile, f"is of {tile.stat().st_size:,} bytes, not {count * row.itemsize:,}", REMEDY)
+
+    def column(rows: npt.NDArray[Any], name: str) -> Any:
+        if name not in scales:
+            return None
+        scale, offset = scales[name]
+        return rows[name] if (scale, offset) == (1, 0) else rows[name] * scale + offset
+
+    for rows in _records(tile, row):
+        rgb = [column(rows, name) for name in ("Red", "Green", "Blue")]
+        yield Points(
+            np.column_stack([np.asarray(column(rows, axis), np.float64) for axis in "XYZ"]),
+            None if any(values is None for values in rgb) else np.column_stack(rgb),
+            label=column(rows, "Classification"),
+            time=column(rows, "GpsTime"),
+            intensity=column(rows, "Intensity"),
+        )
+
+
+def _records(tile: Path, row: np.dtype[Any]) -> Iterator[npt.NDArray[Any]]:
+    if tile.suffix == ".bin":
+        with open(tile, "rb") as file:
+            while data := file.read(PART * row.itemsize):
+                yield np.frombuffer(data, row)
+        return
+    import zstandard
+
+    rest = b""
+    try:
+        with open(tile, "rb") as file, zstandard.ZstdDecompressor().stream_reader(file) as reader:
+            while data := reader.read(PART * row.itemsize):
+                rest += data
+                n = len(rest) // row.itemsize
+                yield np.frombuffer(rest, row, n)
+                rest = rest[n * row.itemsize :]
+    except zstandard.ZstdError as error:
+        raise InputError(tile, f"is no readable zstd file ({error})", REMEDY) from None
+
+
+def _schema(path: Path, info: dict[str, Any]) -> Schema:
+    try:
+        entries = [(str(entry["name"]), entry) for entry in info["schema"]]
+        row = np.dtype([(name, f"<{KINDS[entry['type']]}{int(entry['size'])}") for name, entry in entries])
+        scales = {name: (float(entry.get("scale", 1)), float(entry.get("offset", 0))) for name, entry in entries}
+        good = {"X", "Y", "Z"} <= scales.keys() and np.isfinite(list(scales.values())).all()
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError):
+        good = False
+    if not good:
+        raise InputError(path, "its schema describes no points with X, Y and Z", REMEDY)
+    return row, scales
+
+
+def _json(path: Path) -> dict[str, Any]:
+    files.check(path, REMEDY)
+    try:
+        if path.stat().st_size > LARGEST:
+            raise ValueError(f"{path.stat().st_size:,} bytes")
+        body = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(body, dict):
+            raise ValueError("no object")
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(path, f"is no readable JSON ({str(error)[:100]})", REMEDY) from None
+    return body
+
+
+def _crs(path: Path, info: dict[str, Any]) -> str | None:
+    from pyproj import CRS
+    from pyproj.exceptions import CRSError
+
+    srs = info.get("srs")
+    if not isinstance(srs, dict) or not srs:
+        return None
+    told = srs.get("wkt") or f"{srs.get('authority')}:{srs.get('horizontal')}"
+    try:
+        return CRS.from_user_input(told).to_wkt()
+    except CRSError as error:
+        raise InputError(path, f"its CRS can't be read ({str(error)[:100]})", "Mend `srs` in ept.json") from None

@@ -1,0 +1,221 @@
+"""PCD clouds (Point Cloud Library, file format 0.6 and 0.7): ascii, binary and binary_compressed.
+
+A header of lines (VERSION, FIELDS, SIZE, TYPE, COUNT, WIDTH, HEIGHT, VIEWPOINT, POINTS, DATA), then the points.
+`binary_compressed` holds two sizes (uint32) and LZF data, in which each field's values stand together. VIEWPOINT, where
+the scanner stood, moves no points: PCL's readers give them as they are, too.
+
+Source: https://pointclouds.org/documentation/tutorials/pcd_file_format.html; `rgb` is 0x00RRGGBB, in the bits of a
+float32 or as uint32.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.io import points, text
+from scan2sim.pipeline.io.points import PART, Points
+from scan2sim.pipeline.types import F64, Frame, PointCloud
+
+SUFFIXES = (".pcd",)
+REMEDY = "Copy it again, or write it as binary PCD or LAZ"
+KINDS = {"F": "f", "U": "u", "I": "i"}
+LONGEST = 10_000
+"""Bytes of a header's line."""
+LZF_RATIO = 100
+"""LZF packs 264 bytes into 3 at best: what claims to be packed more is damaged."""
+CLASSES = ("classification", "class", "label")
+INTENSITIES = ("intensity", "intensities", "reflectivity")
+TIMES = ("gps_time", "time", "timestamp")
+
+
+@dataclass(frozen=True)
+class _Header:
+    row: np.dtype[Any]
+    count: int
+    data: str
+    start: int  # of the points, bytes
+
+
+def read_header(path: Path) -> tuple[int, F64, F64, str | None]:
+    """Number of points that are finite, low and high corner; PCD has no CRS."""
+    found = points.summary(path, _parts(path))
+    return found.count, found.low, found.high, None
+
+
+def read(path: Path, frame: Frame) -> PointCloud:
+    """All points in local coordinates, with `rgb`, `intensity`, a class and times where there are fields of them."""
+    return points.whole(path, _parts(path), frame)
+
+
+def chunks(path: Path, frame: Frame, size: int) -> Iterator[PointCloud]:
+    """The points in their order, `size` at a time at most."""
+    return points.local(path, _parts(path), points.summary(path, _parts(path)), frame, size)
+
+
+def _parts(path: Path) -> Iterator[Points]:
+    for rows in _rows(path):
+        yield _points(path, rows)
+
+
+def _rows(path: Path) -> Iterator[npt.NDArray[Any]]:
+    """All points as records; fewer than the header says is an error, and nothing is allocated on its word alone."""
+    try:
+        with open(path, "rb") as file:
+            header = _header(path, file)
+            left = path.stat().st_size - header.start
+            if header.data == "ascii":
+                yield from _ascii(path, file, header)
+            elif header.data == "binary":
+                if left < header.count * header.row.itemsize:
+                    raise _short(path, left // header.row.itemsize, header.count)
+                for at in range(0, header.count, PART):
+                    n = min(PART, header.count - at)
+                    yield np.frombuffer(file.read(n * header.row.itemsize), header.row, n)
+            else:
+                yield _compressed(path, file, header, left)
+    except FileNotFoundError:
+        raise InputError(path, "is missing", "Put it there, or mend the name") from None
+    except (OSError, ValueError) as error:
+        raise InputError(path, f"is no readable PCD cloud ({error})", REMEDY) from None
+
+
+def _header(path: Path, file: BinaryIO) -> _Header:
+    entries: dict[str, list[str]] = {}
+    while "DATA" not in entries:
+        line = file.readline(LONGEST)
+        if not line.endswith(b"\n") or len(entries) > 20:
+            raise ValueError("its header has no DATA line")
+        key, *values = line.decode("ascii", "replace").partition("#")[0].split() or [""]
+        if key:
+            entries[key.upper()] = values
+    try:
+        names, kinds = entries["FIELDS"], entries["TYPE"]
+        sizes = [int(value) for value in entries["SIZE"]]
+        counts = [int(value) for value in entries.get("COUNT", ["1"] * len(names))]
+        width, height = int(entries["WIDTH"][0]), int(entries["HEIGHT"][0])
+        count = int(entries["POINTS"][0]) if "POINTS" in entries else width * height
+        data = entries["DATA"][0].lower()
+        shaped = [
+            # PCL names all its padding "_"
+            (f"_{i}" if name == "_" else name, f"<{KINDS[kind]}{size}", (n,) if n != 1 else ())
+            for i, (name, kind, size, n) in enumerate(zip(names, kinds, sizes, counts, strict=True))
+        ]
+        row = np.dtype(shaped)
+    except (KeyError, IndexError, TypeError) as error:
+        raise ValueError(f"its header lacks or misstates {error}") from None
+    if min(counts) < 1 or count < 1 or row.itemsize > LONGEST:
+        raise ValueError(f"its header says {count} points of {row.itemsize} bytes")
+    if data not in ("ascii", "binary", "binary_compressed"):
+        raise ValueError(f"its DATA is {data[:40]!r}")
+    if not {"x", "y", "z"} <= set(names):
+        raise ValueError(f"it has no x, y, z (its fields are {', '.join(names)})")
+    return _Header(row, count, data, file.tell())
+
+
+def _ascii(path: Path, file: BinaryIO, header: _Header) -> Iterator[npt.NDArray[Any]]:
+    wide = sum(int(np.prod(header.row[name].shape)) for name in header.row.names or ())
+    done = 0
+    for block in text.blocks(path, file):
+        values = text.numbers(block, None, wide)
+        yield _records(values, header.row)
+        done += len(values)
+    if done < header.count:
+        raise _short(path, done, header.count)
+    if done > header.count:
+        raise ValueError(f"it has {done:,} points, its header says {header.count:,}")
+
+
+def _records(values: F64, row: np.dtype[Any]) -> npt.NDArray[Any]:
+    out = np.zeros(len(values), row)
+    at = 0
+    for name in row.names or ():
+        n = int(np.prod(row[name].shape))
+        column = values[:, at : at + n].reshape(len(values), *row[name].shape)
+        packed = name in ("rgb", "rgba") and row[name].kind == "f" and bool((column > 1).any())
+        # newer writers print packed colours as whole numbers, older ones as the floats that their bits are
+        out[name] = column.astype(np.uint32).view(np.float32) if packed else column
+        at += n
+    return out
+
+
+def _compressed(path: Path, file: BinaryIO, header: _Header, left: int) -> npt.NDArray[Any]:
+    packed, size = (int(value) for value in np.frombuffer(file.read(8), "<u4", 2))
+    if size != header.count * header.row.itemsize:
+        raise ValueError(f"it unpacks to {size:,} bytes, its header says {header.count * header.row.itemsize:,}")
+    if packed > left - 8:
+        raise InputError(path, f"is truncated: {left - 8:,} of {packed:,} bytes are there", REMEDY)
+    if size > packed * LZF_RATIO:
+        raise ValueError(f"it claims to unpack {packed:,} bytes to {size:,}")
+    plain = np.empty(size, np.uint8)
+    if _unpack(np.frombuffer(file.read(packed), np.uint8), plain) != size:
+        raise ValueError("its packed data is damaged")
+    rows, at = np.empty(header.count, header.row), 0
+    for name in header.row.names or ():
+        kind = header.row[name]
+        end = at + header.count * kind.itemsize
+        rows[name] = plain[at:end].view(kind.base).reshape(header.count, *kind.shape)
+        at = end
+    return rows
+
+
+@njit(cache=True)
+def _unpack(packed, plain):  # type: ignore[no-untyped-def]
+    """LZF (Lehmann's liblzf): a byte below 32 says how many follow as they are, others point back; -1: damaged."""
+    i, o, n, size = 0, 0, len(packed), len(plain)
+    while i < n:
+        control = packed[i]
+        i += 1
+        if control < 32:
+            length = control + 1
+            if i + length > n or o + length > size:
+                return -1
+            plain[o : o + length] = packed[i : i + length]
+            i += length
+        else:
+            length = control >> 5
+            if length == 7:
+                if i >= n:
+                    return -1
+                length += packed[i]
+                i += 1
+            length += 2
+            if i >= n:
+                return -1
+            back = o - ((control & 31) << 8) - packed[i] - 1
+            i += 1
+            if back < 0 or o + length > size:
+                return -1
+            for k in range(length):  # byte by byte: it may overlap itself
+                plain[o + k] = plain[back + k]
+        o += length
+    return o
+
+
+def _points(path: Path, rows: npt.NDArray[Any]) -> Points:
+    names = rows.dtype.names or ()
+
+    def first(wanted: tuple[str, ...]) -> Any:
+        return next((rows[name] for name in wanted if name in names and rows[name].ndim == 1), None)
+
+    xyz = np.column_stack([np.asarray(rows[axis], np.float64) for axis in "xyz"])
+    rgb = first(("rgb", "rgba"))
+    if rgb is not None and rgb.dtype.itemsize == 4:
+        bits = np.ascontiguousarray(rgb).view(np.uint32)
+        rgb = np.stack([bits >> 16 & 255, bits >> 8 & 255, bits & 255], axis=1).astype(np.uint8)
+    elif {"r", "g", "b"} <= set(names):
+        rgb = np.column_stack([rows[name] for name in "rgb"])
+    else:
+        rgb = None
+    return Points(xyz, rgb, label=first(CLASSES), time=first(TIMES), intensity=first(INTENSITIES))
+
+
+def _short(path: Path, there: int, count: int) -> InputError:
+    return InputError(path, f"is truncated or damaged: {there:,} of {count:,} points can be read", REMEDY)

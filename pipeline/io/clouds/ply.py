@@ -1,0 +1,191 @@
+"""PLY clouds (Turk 1994): the vertices of an ASCII or binary file, float64 coordinates kept.
+
+A file must hold as many vertices as its header says: what a broken copy or a lying header leaves is no cloud.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.io import files, points, text
+from scan2sim.pipeline.io.points import PART, Points
+from scan2sim.pipeline.types import F64, Frame, PointCloud
+
+SUFFIXES = (".ply",)
+AGAIN = "Export it again, or as LAZ"
+TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
+    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
+    "double": "f8", "float64": "f8",
+}  # fmt: skip
+ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+COLOURS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
+CLASSES = ("classification", "class", "label", "scalar_classification", "scalar_label")
+INTENSITIES = ("intensity", "intensities", "reflectivity", "scalar_intensity")
+TIMES = ("gps_time", "time", "timestamp", "scalar_gpstime")
+LONGEST = 100_000
+"""Bytes of a header that are looked at."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where the vertices are.
+
+    Attributes:
+        form: "ascii", "binary_little_endian" or "binary_big_endian".
+        count: of vertices, as the header says.
+        row: a vertex's properties, names in lower case.
+        start: byte of the first element behind the header.
+        before: of elements before the vertices: lines (ASCII) or bytes.
+        last: whether nothing follows the vertices.
+    """
+
+    form: str
+    count: int
+    row: np.dtype[Any]
+    start: int
+    before: int
+    last: bool
+
+
+def read_header(path: Path) -> tuple[int, F64, F64, str | None, tuple[str, ...]]:
+    """Number of points that are finite, low and high corner (CRS units), no CRS, and how many aren't finite."""
+    found = points.summary(path, _parts(path))
+    lost = layout(path).count - found.count
+    notes = (f"{lost:,} points with NaN coordinates left out",) if lost else ()
+    return found.count, found.low, found.high, None, notes
+
+
+def read(path: Path, frame: Frame) -> PointCloud:
+    """All points in local coordinates, with colours, intensities and a class (`CLASSES`) where they have them."""
+    return points.whole(path, _parts(path), frame)
+
+
+def chunks(path: Path, frame: Frame, size: int) -> Iterator[PointCloud]:
+    """The points in their order, `size` at a time at most, each part in a frame with its origin near its points."""
+    return points.local(path, _parts(path), points.summary(path, _parts(path)), frame, size)
+
+
+def layout(path: Path) -> Layout:
+    """What the header says.
+
+    Raises:
+        InputError: it is none, has no vertices with x, y and z, or ones of varying length.
+    """
+    with files.check(path).open("rb") as file:
+        head, found, _ = file.read(LONGEST).partition(b"end_header")
+        lines = [line.split() for line in head.decode("latin-1").splitlines()]
+        if not head.startswith(b"ply") or not found:
+            raise _bad(path, "it has no header")
+        file.seek(len(head) + len(found))
+        start = file.tell() + len(file.readline(3))  # \n or \r\n
+    form = next((words[1] for words in lines if words[:1] == ["format"] and len(words) > 1), "")
+    if form not in ORDERS:
+        raise _bad(path, f"its format is {form[:40]!r}")
+    before, elements = 0, _elements(path, lines)
+    for i, (name, count, properties) in enumerate(elements):
+        fixed = all(kind in TYPES for kind, _ in properties)
+        if name != "vertex" and (fixed or form == "ascii"):
+            size = sum(int(TYPES[kind][1]) for kind, _ in properties) if form != "ascii" else 1
+            before += count * size
+            continue
+        names = [name.lower() for _, name in properties]
+        if not fixed or name != "vertex" or not {"x", "y", "z"} <= set(names) or len(set(names)) < len(names):
+            raise _bad(path, f"its {name[:40]} elements have {', '.join(names)[:80] or 'nothing'}, some as lists")
+        row = np.dtype([(n, ORDERS[form] + TYPES[kind]) for (kind, _), n in zip(properties, names, strict=True)])
+        if count == 0:
+            raise InputError(path, "holds no points", "Leave it out of the tile")
+        return Layout(form, count, row, start, before, i == len(elements) - 1)
+    raise _bad(path, "no vertices")
+
+
+def _elements(path: Path, lines: list[list[str]]) -> list[tuple[str, int, list[tuple[str, str]]]]:
+    """Name, number and properties (type, name; of a list "list") of each element."""
+    found: list[tuple[str, int, list[tuple[str, str]]]] = []
+    for words in lines:
+        try:
+            if words[:1] == ["element"]:
+                found.append((words[1], int(words[2]), []))
+            elif words[:1] == ["property"]:
+                found[-1][2].append((words[1], words[-1]))
+        except (IndexError, ValueError):
+            raise _bad(path, f"its header says {' '.join(words)[:80]!r}") from None
+    if any(count < 0 for _, count, _ in found):
+        raise _bad(path, "a number of elements below 0")
+    return found
+
+
+def _parts(path: Path) -> Iterator[Points]:
+    """The vertices, as many as the header says.
+
+    Raises:
+        InputError: there are fewer, or more, or something else.
+    """
+    told = layout(path)
+    for rows in _of_text(path, told) if told.form == "ascii" else _of_bytes(path, told):
+        names = rows.dtype.names or ()
+
+        def first(wanted: Sequence[str], rows: Any = rows, names: Sequence[str] = names) -> Any:
+            return next((rows[name] for name in wanted if name in names), None)
+
+        three = next((three for three in COLOURS if set(three) <= set(names)), None)
+        yield Points(
+            np.column_stack([rows[axis].astype(np.float64) for axis in "xyz"]),
+            None if three is None else np.column_stack([rows[name] for name in three]),
+            label=first(CLASSES),
+            time=first(TIMES),
+            intensity=first(INTENSITIES),
+        )
+
+
+def _of_bytes(path: Path, told: Layout) -> Iterator[npt.NDArray[Any]]:
+    first = told.start + told.before
+    there = max(0, path.stat().st_size - first) // told.row.itemsize
+    if there < told.count or (told.last and there > told.count):
+        raise _other_count(path, told.count, there)
+    with path.open("rb") as file:
+        file.seek(first)
+        for at in range(0, told.count, PART):
+            yield np.fromfile(file, told.row, min(PART, told.count - at))
+
+
+def _of_text(path: Path, told: Layout) -> Iterator[npt.NDArray[Any]]:
+    skip, at, names = told.before, 0, told.row.names or ()
+    with path.open("rb") as file:
+        file.seek(told.start)
+        for block in text.blocks(path, file):
+            lines = block[skip:]
+            skip = max(0, skip - len(block))
+            if told.last and at + len(lines) > told.count:
+                raise _other_count(path, told.count, at + len(lines))
+            lines = lines[: told.count - at]
+            try:
+                table = text.numbers(lines, None, len(names))
+            except ValueError as error:
+                if lines and len(lines[-1].split()) < len(names):  # the last line of a broken copy
+                    raise _other_count(path, told.count, at + len(lines) - 1) from None
+                raise _bad(path, f"vertices {at + 1:,} to {at + len(lines):,}: {error}") from None
+            rows = np.empty(len(table), told.row)
+            with np.errstate(invalid="ignore", over="ignore"):  # numbers that their type can't hold
+                for k, name in enumerate(names):
+                    rows[name] = table[:, k]
+            yield rows
+            at += len(rows)
+    if at < told.count:
+        raise _other_count(path, told.count, at)
+
+
+def _other_count(path: Path, told: int, there: int) -> InputError:
+    some = f"{there:,}" if there < told else f"{there:,} or more"
+    return InputError(path, f"is truncated or damaged: its header says {told:,} vertices, there are {some}", AGAIN)
+
+
+def _bad(path: Path, cause: str) -> InputError:
+    return InputError(path, f"is no readable PLY cloud ({cause})", AGAIN)

@@ -1,0 +1,50 @@
+"""GPS tracks: a file a format (`pipeline.backends`), found by the track's suffix.
+
+A format's module has `SUFFIXES` and `read(path) -> GpsTrack`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Protocol
+
+from scan2sim.pipeline import backends
+from scan2sim.pipeline.errors import InputError, from_os_error
+from scan2sim.pipeline.extras import need
+from scan2sim.pipeline.io import files
+from scan2sim.pipeline.types import GpsTrack
+
+
+class Format(Protocol):
+    """What a format's module has.
+
+    Attributes:
+        SUFFIXES: of its files.
+    """
+
+    SUFFIXES: tuple[str, ...]
+
+    def read(self, path: Path) -> GpsTrack:
+        """See `read`."""
+
+
+def read(path: Path) -> GpsTrack:
+    """Read and tidy a track: sorted, each time once, without bad fixes and jumps.
+
+    Times are UNIX seconds for GPX and NMEA, as the file says for CSV, and for a GoPro video seconds of the video.
+
+    Raises:
+        InputError: unknown suffix, unreadable, or no fix in it.
+        UnavailableError: a video, and PyAV isn't installed.
+    """
+    formats = backends.by_suffix(__name__)
+    name = formats.get(path.suffix.lower())
+    if name is None:
+        raise InputError(path, "is no known GPS format", f"Give one of {', '.join(formats)}")
+    files.check(path)
+    reader: Format = backends.module(__name__, name)
+    need(str(path), *backends.needs(reader))
+    try:
+        return reader.read(path)
+    except OSError as error:
+        raise from_os_error(error, path) from error

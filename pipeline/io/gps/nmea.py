@@ -1,0 +1,76 @@
+"""NMEA 0183: GGA and RMC."""
+
+from __future__ import annotations
+
+import math
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.io.fixes import RANGE_ERROR, located, number, sigma_of
+from scan2sim.pipeline.types import GpsTrack
+
+SUFFIXES = (".nmea", ".txt", ".log")
+QUALITY_ERROR = {2: 0.8, 4: 0.02, 5: 0.3}
+"""Metres of error for each unit of dilution of precision, by GGA's quality: differential, RTK fixed, RTK float."""
+
+
+def read(path: Path) -> GpsTrack:
+    """GGA sentences (position, quality, HDOP), dated by the RMC nearest in time; a wrong checksum drops a sentence."""
+    fixes: list[list[float]] = []  # the time still a time of day
+    clocks: list[float] = []  # the last RMC's UNIX time at each fix, NaN before the first
+    clock, sentences = math.nan, 0
+    for line in path.read_text(encoding="ascii", errors="replace").splitlines():
+        fields = _sentence(line)
+        sentences += bool(fields)
+        kind = fields[0][-3:] if fields else ""
+        if kind == "RMC" and len(fields) > 9 and fields[2] == "A":
+            clock = _nmea_date(fields[9]) + _nmea_clock(fields[1])
+        elif kind == "GGA" and len(fields) > 9 and fields[6].isdigit() and int(fields[6]) in (1, 2, 3, 4, 5):
+            sigma = sigma_of(number(fields[8]), QUALITY_ERROR.get(int(fields[6]), RANGE_ERROR))
+            place = _nmea_angle(fields[2], fields[3]), _nmea_angle(fields[4], fields[5])
+            fixes.append([_nmea_clock(fields[1]), *place, number(fields[9]), sigma])
+            clocks.append(clock)
+    if not sentences:
+        raise InputError(path, "holds no NMEA sentence with a right checksum", "Give the receiver's log as it was")
+    if fixes and np.isnan(clocks).all():
+        if math.isnan(clock):
+            raise InputError(path, "has fixes, but no date (no valid RMC sentence)", "Log RMC beside GGA")
+        clocks[-1] = clock  # a single RMC, after all fixes
+    rows, near = np.array(fixes).reshape(-1, 5), np.array(clocks)
+    if len(rows):
+        known = np.flatnonzero(~np.isnan(near))
+        near = near[known[np.maximum(np.searchsorted(known, np.arange(len(near)), side="right") - 1, 0)]]
+        rows[:, 0] += np.round((near - rows[:, 0]) / 86400) * 86400  # the day that brings it next to that RMC
+    return located(path, rows.tolist())
+
+
+def _sentence(line: str) -> list[str]:
+    """The fields of an NMEA sentence; none if its checksum is absent or wrong."""
+    body, star, given = line.strip().partition("$")[2].partition("*")
+    total = 0
+    for character in body:
+        total ^= ord(character)
+    return body.split(",") if star and given[:2].upper() == f"{total:02X}" else []
+
+
+def _nmea_angle(text: str, side: str) -> float:
+    """Degrees of (d)ddmm.mmmm."""
+    value = number(text)
+    degrees = value // 100
+    return (degrees + (value - 100 * degrees) / 60) * (-1 if side in ("S", "W") else 1)
+
+
+def _nmea_clock(text: str) -> float:
+    """Seconds of the day of hhmmss.ss."""
+    return 3600 * number(text[:2]) + 60 * number(text[2:4]) + number(text[4:])
+
+
+def _nmea_date(text: str) -> float:
+    """UNIX time of the beginning of ddmmyy."""
+    try:
+        return datetime.strptime(text, "%d%m%y").replace(tzinfo=UTC).timestamp()
+    except ValueError:
+        return math.nan

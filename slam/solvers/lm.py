@@ -1,0 +1,359 @@
+"""Levenberg-Marquardt with the Schur complement: points are eliminated, cameras and shared parameters solved densely.
+
+The residual is the cross product of seen and estimated direction, in its two components across the seen one, so that
+there is neither seam nor pole; since it vanishes behind the camera, too, points there don't count. Cauchy's weights
+make outliers count little. The kernels run on one thread: problems are small, and frames are read beside them.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from scan2sim.pipeline.types import F64
+from scan2sim.slam.geometry import exp_so3
+from scan2sim.slam.graph import Graph, Solution
+
+ITERATIONS = 8
+ENOUGH = 1e-4
+"""Relative fall of the cost below which no further iteration is made."""
+
+
+def solve(graph: Graph, *, iterations: int | None = None, points: bool = True, covariance: bool = False) -> Solution:
+    """See `slam.solvers.Solver`; `covariance` gives that of the cameras, (C, 6, 6), at the solution."""
+    poses, xyz, shared = graph.poses.copy(), graph.points.copy(), graph.shared.copy()
+    free = np.cumsum(~graph.fixed).astype(np.int64) - 1
+    free[graph.fixed] = -1
+    starts = np.searchsorted(graph.point_of, np.arange(len(xyz) + 1))
+    size = 6 * int((~graph.fixed).sum()) + len(shared)
+    if not size and not points:
+        return Solution(poses, xyz, shared)
+    damping, cost = 1e-4, _cost(graph, poses, xyz, shared)
+    for _ in range(ITERATIONS if iterations is None else iterations):
+        H, g, V, gp, W = _normal(graph, poses, xyz, shared, free, starts, size, points)
+        better = False
+        for _ in range(6):
+            step, moved = _step(H, g, V, gp, W, graph, free, starts, size, damping, points)
+            new_poses, new_shared = _moved(poses, shared, step, graph.fixed)
+            new_xyz = xyz + moved
+            new_cost = _cost(graph, new_poses, new_xyz, new_shared)
+            if new_cost <= cost:
+                better = True
+                break
+            damping *= 10
+        if not better:
+            break
+        fell = (cost - new_cost) / max(cost, 1e-30)
+        poses, xyz, shared, cost = new_poses, new_xyz, new_shared, new_cost
+        damping = max(damping / 10, 1e-9)
+        if fell < ENOUGH:
+            break
+    known = _covariance(graph, poses, xyz, shared, free, starts, size) if covariance else None
+    return Solution(poses, xyz, shared, known)
+
+
+def _covariance(graph: Graph, poses: F64, xyz: F64, shared: F64, free, starts, size: int) -> F64:  # type: ignore[no-untyped-def]
+    H, g, V, gp, W = _normal(graph, poses, xyz, shared, free, starts, size, True)
+    out = np.zeros((len(poses), 6, 6))
+    if not size:
+        return out
+    reduced, _ = _reduce(H, g, V, gp, W, starts, graph.camera_of, free, graph.bend.shape[1], 1e-9)
+    inverse = np.linalg.pinv(reduced, hermitian=True)
+    for c in np.flatnonzero(~graph.fixed):
+        at = slice(6 * free[c], 6 * free[c] + 6)
+        out[c] = inverse[at, at]
+    return out
+
+
+def _moved(poses: F64, shared: F64, step: F64, fixed) -> tuple[F64, F64]:  # type: ignore[no-untyped-def]
+    out = poses.copy()
+    n = int((~fixed).sum())
+    by = step[: 6 * n].reshape(n, 6)
+    out[~fixed, :3, 3] += by[:, :3]
+    out[~fixed, :3, :3] = exp_so3(by[:, 3:]) @ out[~fixed, :3, :3]
+    return out, shared + step[6 * n :]
+
+
+def _cost(graph: Graph, poses: F64, xyz: F64, shared: F64) -> float:
+    total = _robust_cost(
+        poses, xyz, graph.point_of, graph.camera_of, graph.bearing, graph.bend, shared, graph.sigma
+    ).sum()
+    for chord in graph.chords:
+        r = (np.linalg.norm(poses[chord.second, :3, 3] - poses[chord.first, :3, 3]) - chord.distance) / chord.sigma
+        total += math.log1p(r * r)
+    total += float((((shared - graph.shared) / graph.shared_sigma) ** 2).sum())
+    for factor in graph.factors:
+        residual = np.asarray(factor.residual(*(poses[c] for c in factor.cameras), factor.measured))
+        total += float((residual**2).sum())
+    return float(total)
+
+
+def _normal(graph, poses, xyz, shared, free, starts, size, points):  # type: ignore[no-untyped-def]
+    """Normal equations: H, g of cameras and shared parameters; V, gp of points; W between."""
+    H, g, V, gp, W = _accumulate(
+        poses, xyz, starts, graph.camera_of, graph.bearing, graph.bend, shared, free, size, graph.sigma
+    )
+    last = np.arange(size - len(shared), size)
+    H[last, last] += 1 / graph.shared_sigma**2
+    g[last] += (shared - graph.shared) / graph.shared_sigma**2
+    for chord in graph.chords:
+        between = poses[chord.second, :3, 3] - poses[chord.first, :3, 3]
+        length = max(float(np.linalg.norm(between)), 1e-9)
+        r = (length - chord.distance) / chord.sigma
+        J = np.zeros((1, size))
+        for camera, sign in ((chord.second, 1), (chord.first, -1)):
+            if free[camera] >= 0:
+                J[0, 6 * free[camera] : 6 * free[camera] + 3] = sign * between / length / chord.sigma
+        w = 1 / (1 + r * r)
+        H += w * J.T @ J
+        g += w * J[0] * r
+    for factor in graph.factors:
+        J, residual = _numeric(factor, poses, free, size)
+        H += J.T @ J
+        g += J.T @ residual
+    return H, g, V, gp, W
+
+
+def _numeric(factor, poses, free, size):  # type: ignore[no-untyped-def]
+    """Jacobian of a user's factor by central differences, and its residual."""
+    mine = [poses[c] for c in factor.cameras]
+    residual = np.atleast_1d(np.asarray(factor.residual(*mine, factor.measured), np.float64))
+    J = np.zeros((len(residual), size))
+    for k, camera in enumerate(factor.cameras):
+        if free[camera] < 0:
+            continue
+        for d in range(6):
+            ends = []
+            for h in (1e-6, -1e-6):
+                step = np.zeros((1, 6))
+                step[0, d] = h
+                moved, _ = _moved(mine[k][None], np.zeros(0), step.ravel(), np.zeros(1, bool))
+                ends.append(np.asarray(factor.residual(*mine[:k], moved[0], *mine[k + 1 :], factor.measured)))
+            J[:, 6 * free[camera] + d] = (ends[0] - ends[1]) / 2e-6
+    return J, residual
+
+
+def _step(H, g, V, gp, W, graph, free, starts, size, damping, points):  # type: ignore[no-untyped-def]
+    """Change of cameras and shared parameters (size,), and of points (P, 3)."""
+    from scipy.linalg import LinAlgError, cho_factor, cho_solve
+
+    still = np.zeros((len(V), 3))
+    if points:
+        reduced, right = _reduce(H, g, V, gp, W, starts, graph.camera_of, free, graph.bend.shape[1], damping)
+    else:
+        reduced, right = H.copy(), g.copy()
+    if not size:
+        return np.zeros(0), _back(np.zeros(0), V, gp, W, starts, graph.camera_of, free, graph.bend.shape[1], damping)
+    diagonal = np.diag_indices(size)
+    reduced[diagonal] += damping * H[diagonal] + 1e-12
+    try:
+        step = -cho_solve(cho_factor(reduced), right)
+    except (LinAlgError, ValueError):
+        return np.zeros(size), still
+    if not points:
+        return step, still
+    return step, _back(step, V, gp, W, starts, graph.camera_of, free, graph.bend.shape[1], damping)
+
+
+def _reduce(H, g, V, gp, W, starts, camera_of, free, n_shared, damping):  # type: ignore[no-untyped-def]
+    less, less_g = _schur(V, gp, W, starts, camera_of, free, n_shared, len(g), damping)
+    return H - less, g - less_g
+
+
+@njit(cache=True, inline="always")
+def _look(T, X, bend, shared, R):  # type: ignore[no-untyped-def]
+    """Point in the camera's axes; `R` (3, 3) receives the camera's rotation, bent by the shared parameters."""
+    tx, ty, tz = T[0, 3], T[1, 3], T[2, 3]
+    for r in range(3):
+        for c in range(3):
+            R[r, c] = T[r, c]
+    if shared.shape[0] > 0:
+        wx, wy, wz = 0.0, 0.0, 0.0
+        for s in range(shared.shape[0]):
+            tx += shared[s] * bend[s, 0]
+            ty += shared[s] * bend[s, 1]
+            tz += shared[s] * bend[s, 2]
+            wx += shared[s] * bend[s, 3]
+            wy += shared[s] * bend[s, 4]
+            wz += shared[s] * bend[s, 5]
+        for c in range(3):  # first order: such turns are small
+            a, b, d = T[0, c], T[1, c], T[2, c]
+            R[0, c] = a + wy * d - wz * b
+            R[1, c] = b + wz * a - wx * d
+            R[2, c] = d + wx * b - wy * a
+    dx, dy, dz = X[0] - tx, X[1] - ty, X[2] - tz
+    return (
+        R[0, 0] * dx + R[1, 0] * dy + R[2, 0] * dz,
+        R[0, 1] * dx + R[1, 1] * dy + R[2, 1] * dz,
+        R[0, 2] * dx + R[1, 2] * dy + R[2, 2] * dz,
+        dx,
+        dy,
+        dz,
+    )
+
+
+@njit(cache=True, nogil=True)
+def _robust_cost(poses, xyz, point_of, camera_of, bearing, bend, shared, sigma):  # type: ignore[no-untyped-def]
+    """(O,) Cauchy's cost of every observation; of those behind the camera, that of a right angle."""
+    out = np.empty(len(point_of))
+    none = np.zeros((0, 6))
+    for o in range(len(point_of)):
+        R = np.empty((3, 3))
+        b = bend[o] if shared.shape[0] > 0 else none
+        x, y, z, _, _, _ = _look(poses[camera_of[o]], xyz[point_of[o]], b, shared, R)
+        p, q, s = bearing[o, 0], bearing[o, 1], bearing[o, 2]
+        cx, cy, cz = q * z - s * y, s * x - p * z, p * y - q * x
+        r2 = x * x + y * y + z * z
+        sine2 = (cx * cx + cy * cy + cz * cz) / max(r2, 1e-18)
+        if p * x + q * y + s * z < 0:
+            sine2 = 1.0
+        out[o] = math.log1p(sine2 / (sigma * sigma))
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _accumulate(poses, xyz, starts, camera_of, bearing, bend, shared, free, size, sigma):  # type: ignore[no-untyped-def]
+    S = shared.shape[0]
+    D = 6 + S
+    n = len(starts) - 1
+    H = np.zeros((size, size))
+    g = np.zeros(size)
+    V = np.zeros((n, 3, 3))
+    gp = np.zeros((n, 3))
+    W = np.zeros((len(camera_of), D, 3))
+    none = np.zeros((0, 6))
+    R = np.empty((3, 3))
+    J = np.empty((2, D))
+    Jp = np.empty((2, 3))
+    r = np.empty(2)
+    for p in range(n):
+        for o in range(starts[p], starts[p + 1]):
+            camera = camera_of[o]
+            b = bend[o] if S > 0 else none
+            x, y, z, dx, dy, dz = _look(poses[camera], xyz[p], b, shared, R)
+            length = math.sqrt(x * x + y * y + z * z)
+            bx, by, bz = bearing[o, 0], bearing[o, 1], bearing[o, 2]
+            if length < 1e-9 or bx * x + by * y + bz * z <= 0:
+                continue
+            ux, uy, uz = x / length, y / length, z / length
+            # two directions across the bearing
+            if abs(bx) < 0.6:
+                e1x, e1y, e1z = 0.0, bz, -by
+            else:
+                e1x, e1y, e1z = -bz, 0.0, bx
+            norm = math.sqrt(e1x * e1x + e1y * e1y + e1z * e1z)
+            e1x, e1y, e1z = e1x / norm, e1y / norm, e1z / norm
+            e2x, e2y, e2z = by * e1z - bz * e1y, bz * e1x - bx * e1z, bx * e1y - by * e1x
+            for k in range(2):
+                ex, ey, ez = (e1x, e1y, e1z) if k == 0 else (e2x, e2y, e2z)
+                dot = ex * ux + ey * uy + ez * uz
+                r[k] = dot
+                # e (I - u u') / length, turned to world: derivative by the point
+                fx, fy, fz = (ex - dot * ux) / length, (ey - dot * uy) / length, (ez - dot * uz) / length
+                wx = R[0, 0] * fx + R[0, 1] * fy + R[0, 2] * fz
+                wy = R[1, 0] * fx + R[1, 1] * fy + R[1, 2] * fz
+                wz = R[2, 0] * fx + R[2, 1] * fy + R[2, 2] * fz
+                Jp[k, 0], Jp[k, 1], Jp[k, 2] = wx, wy, wz
+                J[k, 0], J[k, 1], J[k, 2] = -wx, -wy, -wz
+                # turning the camera by w moves the point's place by -w x d: derivative w . (f x d)
+                J[k, 3], J[k, 4], J[k, 5] = wy * dz - wz * dy, wz * dx - wx * dz, wx * dy - wy * dx
+                for s in range(S):
+                    total = 0.0
+                    for d in range(6):
+                        total += J[k, d] * b[s, d]
+                    J[k, 6 + s] = total
+            w = 1.0 / (sigma * sigma) / (1.0 + (r[0] * r[0] + r[1] * r[1]) / (sigma * sigma))
+            for i in range(3):
+                gp[p, i] += w * (Jp[0, i] * r[0] + Jp[1, i] * r[1])
+                for j in range(3):
+                    V[p, i, j] += w * (Jp[0, i] * Jp[0, j] + Jp[1, i] * Jp[1, j])
+            at = free[camera]
+            for i in range(D):
+                row = 6 * at + i if i < 6 else size - S + i - 6
+                if i < 6 and at < 0:
+                    continue
+                g[row] += w * (J[0, i] * r[0] + J[1, i] * r[1])
+                for j in range(3):
+                    W[o, i, j] = w * (J[0, i] * Jp[0, j] + J[1, i] * Jp[1, j])
+                for j in range(D):
+                    if j < 6 and at < 0:
+                        continue
+                    column = 6 * at + j if j < 6 else size - S + j - 6
+                    H[row, column] += w * (J[0, i] * J[0, j] + J[1, i] * J[1, j])
+    return H, g, V, gp, W
+
+
+@njit(cache=True, inline="always")
+def _inverse3(A, damping, out):  # type: ignore[no-untyped-def]
+    """Inverse of a damped symmetric (3, 3)."""
+    a, b, c = A[0, 0] * (1 + damping) + 1e-9, A[0, 1], A[0, 2]
+    d, e, f = A[1, 1] * (1 + damping) + 1e-9, A[1, 2], A[2, 2] * (1 + damping) + 1e-9
+    det = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
+    if abs(det) < 1e-30:
+        out[:, :] = 0.0
+        return
+    out[0, 0], out[0, 1], out[0, 2] = (d * f - e * e) / det, (c * e - b * f) / det, (b * e - c * d) / det
+    out[1, 0], out[1, 1], out[1, 2] = out[0, 1], (a * f - c * c) / det, (b * c - a * e) / det
+    out[2, 0], out[2, 1], out[2, 2] = out[0, 2], out[1, 2], (a * d - b * b) / det
+
+
+@njit(cache=True, nogil=True)
+def _schur(V, gp, W, starts, camera_of, free, S, size, damping):  # type: ignore[no-untyped-def]
+    """What eliminating the points takes from H and g."""
+    n = len(starts) - 1
+    D = 6 + S
+    H = np.zeros((size, size))
+    g = np.zeros(size)
+    inverse = np.empty((3, 3))
+    WV = np.empty((D, 3))
+    for p in range(n):
+        _inverse3(V[p], damping, inverse)
+        for a in range(starts[p], starts[p + 1]):
+            at = free[camera_of[a]]
+            for i in range(D):
+                if i < 6 and at < 0:
+                    continue
+                row = 6 * at + i if i < 6 else size - S + i - 6
+                for j in range(3):
+                    WV[i, j] = W[a, i, 0] * inverse[0, j] + W[a, i, 1] * inverse[1, j] + W[a, i, 2] * inverse[2, j]
+                g[row] += WV[i, 0] * gp[p, 0] + WV[i, 1] * gp[p, 1] + WV[i, 2] * gp[p, 2]
+            for o in range(starts[p], starts[p + 1]):
+                to = free[camera_of[o]]
+                for i in range(D):
+                    if i < 6 and at < 0:
+                        continue
+                    row = 6 * at + i if i < 6 else size - S + i - 6
+                    for j in range(D):
+                        if j < 6 and to < 0:
+                            continue
+                        column = 6 * to + j if j < 6 else size - S + j - 6
+                        H[row, column] += WV[i, 0] * W[o, j, 0] + WV[i, 1] * W[o, j, 1] + WV[i, 2] * W[o, j, 2]
+    return H, g
+
+
+@njit(cache=True, nogil=True)
+def _back(step, V, gp, W, starts, camera_of, free, S, damping):  # type: ignore[no-untyped-def]
+    """(P, 3) change of the points that follows from that of the cameras."""
+    n = len(starts) - 1
+    size = len(step)
+    D = 6 + S
+    out = np.zeros((n, 3))
+    for p in range(n):
+        inverse = np.empty((3, 3))
+        right = np.empty(3)
+        for j in range(3):
+            right[j] = gp[p, j]
+        for o in range(starts[p], starts[p + 1]):
+            at = free[camera_of[o]]
+            for i in range(D):
+                if i < 6 and at < 0:
+                    continue
+                row = 6 * at + i if i < 6 else size - S + i - 6
+                for j in range(3):
+                    right[j] += W[o, i, j] * step[row]
+        _inverse3(V[p], damping, inverse)
+        for i in range(3):
+            out[p, i] = -(inverse[i, 0] * right[0] + inverse[i, 1] * right[1] + inverse[i, 2] * right[2])
+    return out

@@ -1,0 +1,157 @@
+"""Corners, followed from frame to frame by pyramidal Lucas-Kanade, each in its chart of the sphere.
+
+Needs no weights. A corner is followed there and back; one that doesn't return to where it was is lost.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from scan2sim.pipeline.types import F32, F64, U8
+from scan2sim.slam.charts import Charts
+from scan2sim.slam.trackers import Tracks
+
+I64 = npt.NDArray[np.int64]
+
+WINDOW, FINE = 17, 9
+"""Pixels, of Lucas-Kanade's square: a large one finds a corner again, a small one says where it is: the larger
+a square, the more of it moves otherwise than its centre."""
+LEVELS = 4
+RETURN = 0.5
+"""Pixels within which a corner followed there and back must return."""
+SPACING = 12
+"""Pixels between corners."""
+QUALITY = 3e-4
+"""Smallest eigenvalue of a corner, of grey values in 0 to 1."""
+ACROSS = 24
+"""Cells a full width, between which corners are shared out evenly."""
+
+
+def load(charts: Charts, mask: U8 | None, count: int, features: None = None, matcher: None = None) -> CornerTracker:
+    """See `slam.trackers.named`; it needs no features."""
+    return CornerTracker(charts, mask, count)
+
+
+class CornerTracker:
+    """See `slam.trackers.Tracker`."""
+
+    STATE: tuple[str, ...] = ("tracks", "pictures", "_next")
+
+    def __init__(self, charts: Charts, mask: U8 | None, count: int) -> None:
+        """`mask` (H, W): 0 where the car itself is; `count`: corners to keep alive."""
+        self.charts, self.count = charts, count
+        self.tracks = Tracks()
+        self._masks = None if mask is None else charts.pictures(np.where(mask > 0, np.uint8(255), np.uint8(0)))
+        self.pictures: list[U8] = []
+        self._next = 0
+
+    def look(self, grey: U8, expected: F64 | None = None) -> float:
+        """Follow all tracks into the next frame; returns the share that could be followed.
+
+        Args:
+            grey: (H, W).
+            expected: (N, 3) bearings where they are probably seen now.
+        """
+        pictures = self.charts.pictures(grey)
+        before, tracks = self.pictures, self.tracks
+        self.pictures = pictures
+        if not before or not len(tracks):
+            return 0.0
+        expected = tracks.bearing if expected is None else expected
+        bearing = np.full_like(tracks.bearing, np.nan)
+        chart_of = self.charts.place(tracks.bearing)
+        for chart in range(self.charts.count):
+            rows = np.flatnonzero(chart_of == chart)
+            if len(rows):
+                bearing[rows] = self._follow(
+                    chart, before[chart], pictures[chart], tracks.bearing[rows], expected[rows]
+                )
+        found = np.isfinite(bearing[:, 0])
+        self.tracks = Tracks(tracks.ids[found], bearing[found])
+        return float(found.mean())
+
+    def _follow(self, chart: int, old: U8, new: U8, bearing: F64, expected: F64) -> F64:
+        start, guess = self.charts.pixels(chart, bearing), self.charts.pixels(chart, expected)
+        height, width = new.shape
+        if chart == 0 and not self.charts.whole:  # the shorter way round
+            turn = float(self.charts.camera.width)
+            guess[:, 0] = start[:, 0] + (guess[:, 0] - start[:, 0] + turn / 2) % turn - turn / 2
+        away = ~(np.isfinite(guess).all(axis=1) & (guess >= 0).all(axis=1) & (guess < (width, height)).all(axis=1))
+        guess[away] = start[away]
+        there, ok, _ = flow(old, new, start, guess.copy(), WINDOW, LEVELS)
+        there, ok2, _ = flow(old, new, start, there, FINE, 1)
+        back, ok3, _ = flow(new, old, there, start.copy(), FINE, 1)
+        good = ((ok > 0) & (ok2 > 0) & (ok3 > 0)).ravel() & (np.linalg.norm(back - start, axis=1) < RETURN)
+        edge = WINDOW / 2
+        good &= (there > edge).all(axis=1) & (there < (width - 1 - edge, height - 1 - edge)).all(axis=1)
+        if self._masks is not None:
+            at = there[good].astype(int)
+            good[good] = self._masks[chart][at[:, 1], at[:, 0]] > 0
+        out = np.full((len(bearing), 3), np.nan)
+        out[good] = self.charts.bearings(chart, there[good])
+        return out
+
+    def drop(self, ids: I64) -> None:
+        """Don't follow these any more."""
+        self.tracks = self.tracks.keep(~np.isin(self.tracks.ids, ids))
+
+    def refill(self) -> int:
+        """Find corners where few are followed; how many."""
+        fresh = [self._corners(chart) for chart in range(self.charts.count)]
+        bearing = np.concatenate([b for b, _ in fresh])
+        strength = np.concatenate([s for _, s in fresh])
+        if not len(bearing):
+            return 0
+        cell = self.charts.cell(bearing, ACROSS)
+        taken = np.bincount(self.charts.cell(self.tracks.bearing, ACROSS), minlength=cell.max() + 1)
+        cells = len(np.union1d(np.unique(cell), np.flatnonzero(taken)))
+        order = np.lexsort((-strength, cell))
+        first = np.searchsorted(cell[order], cell[order])
+        rank = np.arange(len(order)) - first + taken[cell[order]]
+        share = self.count / max(cells, 1)
+        room = self.count - len(self.tracks)
+        chosen = order[np.argsort(rank, kind="stable")]
+        ranks = np.sort(rank, kind="stable")
+        chosen = chosen[ranks < 3 * share][: max(room, 0)]
+        ids = self._next + np.arange(len(chosen))
+        self._next += len(chosen)
+        self.tracks = Tracks(
+            np.concatenate([self.tracks.ids, ids]), np.concatenate([self.tracks.bearing, bearing[chosen]])
+        )
+        return len(chosen)
+
+    def _corners(self, chart: int) -> tuple[F64, npt.NDArray[np.float32]]:
+        """(N, 3) bearings of corners away from all tracks, and how pronounced they are."""
+        import cv2
+
+        picture = self.pictures[chart]
+        mask = np.full(picture.shape, 255, np.uint8) if self._masks is None else self._masks[chart].copy()
+        height, width = picture.shape
+        edge = WINDOW // 2 + 1
+        mask[:edge], mask[-edge:], mask[:, :edge], mask[:, -edge:] = 0, 0, 0, 0
+        for x, y in self.charts.pixels(chart, self.tracks.bearing):
+            if 0 <= x < width and 0 <= y < height:
+                cv2.circle(mask, (int(x), int(y)), SPACING, 0, -1)
+        found = cv2.goodFeaturesToTrack(picture, 3 * self.count, 0.002, SPACING, mask=mask, blockSize=5)
+        if found is None:
+            return np.zeros((0, 3)), np.zeros(0, np.float32)
+        uv: F32 = np.asarray(found, np.float32).reshape(-1, 2)
+        strength = np.linspace(1, 0, len(uv), dtype=np.float32)  # they come strongest first
+        cv2.cornerSubPix(picture, uv, (3, 3), (-1, -1), (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 10, 0.03))
+        bearing = self.charts.bearings(chart, uv)
+        ok = np.isfinite(bearing[:, 0])
+        ok[ok] = self.charts.place(bearing[ok]) == chart
+        return bearing[ok], strength[ok]
+
+
+def flow(old: U8, new: U8, start: F32, guess: F32, window: int, levels: int) -> Any:
+    """Places in `new` of what is at `start` in `old`, whether found, and how well."""
+    import cv2
+
+    return cv2.calcOpticalFlowPyrLK(
+        old, new, start, guess, winSize=(window, window), maxLevel=levels, minEigThreshold=QUALITY,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+    )  # fmt: skip

@@ -1,0 +1,109 @@
+"""Corners on the sphere: seam and poles are no special places."""
+
+import numpy as np
+import pytest
+
+from scan2sim.pipeline.cameras import pixel_rays, project
+from scan2sim.pipeline.types import Camera
+from scan2sim.slam.charts import Charts
+from scan2sim.slam.geometry import exp_so3, relative_pose, rigid
+from scan2sim.slam.trackers.corners import CornerTracker
+
+CAMERA = Camera("equirectangular", 768, 384)
+
+
+def sphere(seed=0):
+    """A function of directions with texture everywhere, alike in all of them."""
+    import cv2
+    from scipy.ndimage import map_coordinates
+
+    rng = np.random.default_rng(seed)
+    faces = [cv2.GaussianBlur(rng.integers(0, 255, (400, 400), np.uint8), (0, 0), 2.0) for _ in range(6)]
+    faces = [cv2.normalize(f, None, 0, 255, cv2.NORM_MINMAX) for f in faces]
+
+    def look(rays):
+        axis = np.abs(rays).argmax(axis=-1)
+        out = np.zeros(rays.shape[:-1], np.float32)
+        for k in range(3):
+            for s, sign in enumerate((1, -1)):
+                at = (axis == k) & (np.sign(rays[..., k]) == sign)
+                a, b = (rays[at][:, (k + j) % 3] / np.abs(rays[at][:, k]) for j in (1, 2))
+                out[at] = map_coordinates(faces[2 * k + s].astype(np.float32), (np.stack([a, b]) + 1) * 199.5, order=1)
+        return out
+
+    return look
+
+
+def frame(world, R):
+    """What an equirectangular camera with rotation R (camera to world) sees."""
+    return world(pixel_rays(CAMERA).astype(np.float64) @ R.T).astype(np.uint8)
+
+
+def test_charts_and_sphere_agree_everywhere():
+    charts, rng = Charts(CAMERA), np.random.default_rng(0)
+    bearing = rng.normal(size=(3000, 3))
+    bearing /= np.linalg.norm(bearing, axis=1, keepdims=True)
+    chart = charts.place(bearing)
+    assert set(chart) == {0, 1, 2}
+    for k in range(3):
+        mine = bearing[chart == k]
+        assert np.abs(charts.bearings(k, charts.pixels(k, mine)) - mine).max() < 1e-5
+
+
+@pytest.mark.parametrize("axis", [[0, 1, 0], [1, 0, 0], [0, 0, 1]])
+def test_corners_are_followed_across_seam_and_poles(axis):
+    world, charts = sphere(), Charts(CAMERA)
+    tracker = CornerTracker(charts, None, 500)
+    tracker.look(frame(world, np.eye(3)))
+    tracker.refill()
+    first = tracker.tracks
+    steps = 8
+    for k in range(1, steps + 1):
+        tracker.look(frame(world, exp_so3(np.array(axis) * 0.06 * k)))
+    R = exp_so3(np.array(axis) * 0.06 * steps)
+    at = np.searchsorted(first.ids, tracker.tracks.ids)
+    assert len(at) > 0.6 * len(first)
+    off = np.degrees(np.arccos(np.clip((first.bearing[at] @ R * tracker.tracks.bearing).sum(axis=1), -1, 1)))
+    assert np.median(off) < 0.2  # a pixel is 0.47
+    azimuth = np.arctan2(first.bearing[at, 0], first.bearing[at, 2])
+    now = np.arctan2(tracker.tracks.bearing[:, 0], tracker.tracks.bearing[:, 2])
+    if axis == [0, 1, 0]:
+        crossed = np.abs(azimuth - now) > np.pi
+        assert crossed.sum() > 10 and np.median(off[crossed]) < 0.2
+    else:
+        polar = np.abs(tracker.tracks.bearing[:, 1]) > 0.95
+        assert polar.sum() > 5 and np.median(off[polar]) < 0.25
+
+
+def test_nothing_is_found_or_followed_on_the_car():
+    world, charts = sphere(), Charts(CAMERA)
+    mask = np.full((CAMERA.height, CAMERA.width), 255, np.uint8)
+    mask[300:] = 0
+    tracker = CornerTracker(charts, mask, 500)
+    for k in range(3):
+        tracker.look(frame(world, exp_so3([0, 0.05 * k, 0])))
+        tracker.refill()
+    uv, _ = project(CAMERA, tracker.tracks.bearing)
+    assert len(uv) > 100 and uv[:, 1].max() < 302
+
+
+def test_corners_are_shared_out_over_the_sphere():
+    tracker = CornerTracker(Charts(CAMERA), None, 400)
+    tracker.look(frame(sphere(), np.eye(3)))
+    tracker.refill()
+    octant = (tracker.tracks.bearing > 0) @ [1, 2, 4]
+    counts = np.bincount(octant, minlength=8)
+    assert counts.min() > 0.4 * counts.mean()
+
+
+def test_a_relative_pose_is_found_among_outliers():
+    rng = np.random.default_rng(0)
+    T = rigid(exp_so3([0.02, 0.3, -0.05]), np.array([0.6, 0.0, 0.8]))
+    xyz = rng.normal(0, 8, (300, 3))
+    a, b = xyz, (xyz - T[:3, 3]) @ T[:3, :3]
+    a, b = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (a, b))
+    b[:90] = np.roll(b[:90], 1, axis=0)
+    found = relative_pose(a, b, threshold=np.radians(0.2), rng=rng)
+    assert found is not None and np.abs(found[0] - T).max() < 1e-3
+    assert found[1][90:].mean() > 0.95 and found[1][:90].mean() < 0.2
+    assert relative_pose(a, rng.permutation(b), threshold=np.radians(0.2), rng=rng) is None

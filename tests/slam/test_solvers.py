@@ -1,0 +1,145 @@
+"""The graph's solvers against a slow reference, each other, and constraints of a user's own."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from scan2sim.pipeline.backends import names
+from scan2sim.slam import solvers
+from scan2sim.slam.geometry import exp_so3
+from scan2sim.slam.graph import Chord, Factor, Graph, errors
+from scan2sim.slam.solvers import lm
+
+
+def street(cameras=8, points=120, noise=5e-4, seed=0):
+    """Poses, and a graph that starts off them."""
+    rng = np.random.default_rng(seed)
+    poses = np.tile(np.eye(4), (cameras, 1, 1))
+    poses[:, 2, 3] = 2.5 * np.arange(cameras)
+    poses[:, :3, :3] = exp_so3(rng.normal(0, 0.02, (cameras, 3)))
+    xyz = rng.uniform([-20, -6, -10], [20, 2, 2.5 * cameras + 10], (points, 3))
+    xyz[:, 0] += 4 * np.sign(xyz[:, 0])
+    point, camera = (part.ravel().astype(np.int32) for part in np.mgrid[:points, :cameras])
+    bearing = np.einsum("oji,oj->oi", poses[camera, :3, :3], xyz[point] - poses[camera, :3, 3])
+    bearing /= np.linalg.norm(bearing, axis=1, keepdims=True)
+    bearing += rng.normal(0, noise, bearing.shape)
+    bearing /= np.linalg.norm(bearing, axis=1, keepdims=True)
+    start = poses.copy()
+    start[2:, :3, 3] += rng.normal(0, 0.15, (cameras - 2, 3))
+    start[2:, :3, :3] = exp_so3(rng.normal(0, 0.005, (cameras - 2, 3))) @ start[2:, :3, :3]
+    fixed = np.arange(cameras) < 2
+    xyz = xyz + rng.normal(0, 0.2, xyz.shape)
+    return poses, Graph(start, xyz, point, camera, bearing, fixed, np.radians(0.1))
+
+
+def positions(solved):
+    return solved.poses[:, :3, 3]
+
+
+def test_levenberg_marquardt_ends_where_a_general_solver_does():
+    from scipy.optimize import minimize
+
+    _, graph = street(4, 12)
+    free = ~graph.fixed
+    n = 6 * int(free.sum())
+
+    def unpack(x):
+        poses = graph.poses.copy()
+        poses[free, :3, 3] += x[:n].reshape(-1, 6)[:, :3]
+        poses[free, :3, :3] = exp_so3(0.1 * x[:n].reshape(-1, 6)[:, 3:]) @ poses[free, :3, :3]
+        return poses, graph.points + x[n:].reshape(-1, 3)
+
+    def cost(x):
+        return np.log1p((np.sin(errors(graph, *unpack(x))) / graph.sigma) ** 2).sum()
+
+    solved = lm.solve(graph, iterations=50)
+    start = np.zeros(n + graph.points.size)
+    slow = minimize(cost, start, method="BFGS", options={"maxiter": 150})
+    fast = np.log1p((np.sin(errors(graph, solved.poses, solved.points)) / graph.sigma) ** 2).sum()
+    assert cost(start) > 20 * fast
+    assert fast < 1.01 * slow.fun
+
+
+@pytest.mark.parametrize("name", names(solvers.__name__))
+def test_every_backend_finds_the_cameras(name):
+    if name == "adam":
+        pytest.importorskip("torch")
+    poses, graph = street()
+    solved = solvers.named(name).solve(graph)
+    before = np.abs(graph.poses[:, :3, 3] - poses[:, :3, 3]).max()
+    assert np.abs(positions(solved) - poses[:, :3, 3]).max() < 0.2 * before
+    assert np.median(errors(graph, solved.poses, solved.points)) < np.radians(0.06)
+    assert (solved.poses[graph.fixed] == graph.poses[graph.fixed]).all()
+
+
+@pytest.mark.parametrize("name", names(solvers.__name__))
+def test_a_constraint_of_ones_own_takes_a_few_lines(name):
+    """Wheel odometry: the second camera is where the wheels say, in the first's axes."""
+    if name == "adam":
+        pytest.importorskip("torch")
+    _, graph = street(noise=0.0)
+    wheels = Factor((0, 1), lambda a, b, m: (a[:3, :3].T @ (b[:3, 3] - a[:3, 3]) - m) / 0.001, np.array([0, 0, 3.0]))
+    graph = replace(graph, fixed=np.arange(8) < 1, factors=(wheels,))
+    solved = solvers.named(name).solve(graph, iterations=600 if name == "adam" else 30)
+    step = solved.poses[0, :3, :3].T @ (solved.poses[1, :3, 3] - solved.poses[0, :3, 3])
+    assert np.abs(step - [0, 0, 3.0]).max() < 0.02
+    if name == "lm":  # the whole path follows: 3 / 2.5 of what it was
+        assert np.linalg.norm(positions(solved)[-1]) == pytest.approx(7 * 3.0, rel=0.02)
+
+
+def test_outliers_and_points_behind_the_camera_dont_pull():
+    poses, graph = street()
+    bearing = graph.bearing.copy()
+    wrong = np.random.default_rng(1).random(len(bearing)) < 0.15
+    bearing[wrong] = exp_so3([0, 0.3, 0]) @ bearing[wrong][0]
+    bearing[:5] *= -1
+    solved = lm.solve(replace(graph, bearing=bearing), iterations=30)
+    assert np.abs(positions(solved) - poses[:, :3, 3]).max() < 0.08
+
+
+def test_a_chord_sets_the_scale():
+    poses, graph = street()
+    length = float(np.linalg.norm(poses[-1, :3, 3] - poses[0, :3, 3]))
+    graph = replace(graph, fixed=np.arange(8) < 1, chords=(Chord(0, 7, 1.2 * length, 0.01),))
+    solved = lm.solve(graph, iterations=30)
+    assert np.linalg.norm(positions(solved)[-1]) == pytest.approx(1.2 * length, rel=1e-3)
+
+
+def test_the_gradient_is_half_the_costs_slope():
+    """Of everything that a graph may hold, with no end of a chord or factor fixed."""
+    _, graph = street(5, 20)
+    rng = np.random.default_rng(4)
+    wheels = Factor((3, 1), lambda a, b, m: (a[:3, :3].T @ (b[:3, 3] - a[:3, 3]) - m) / 0.5, np.array([1.0, 0, -4]))
+    graph = replace(
+        graph, chords=(Chord(2, 4, 6.0, 0.8), Chord(0, 3, 8.0, 0.5)), factors=(wheels,), sigma=np.radians(2.0),
+        bend=rng.normal(0, 0.3, (len(graph.bearing), 2, 6)), shared=np.array([1e-3, -2e-3]),
+        shared_sigma=np.array([0.02, 0.03]),
+    )  # fmt: skip
+    free = np.cumsum(~graph.fixed) - 1
+    free[graph.fixed] = -1
+    shared, size = np.zeros(2), 6 * int((~graph.fixed).sum()) + 2
+    starts = np.searchsorted(graph.point_of, np.arange(len(graph.points) + 1))
+    _, g, _, gp, _ = lm._normal(graph, graph.poses, graph.points, shared, free, starts, size, True)
+
+    def cost(step):
+        poses, bent = lm._moved(graph.poses, shared, step[:size], graph.fixed)
+        return lm._cost(graph, poses, graph.points + step[size:].reshape(-1, 3), bent)
+
+    h = 1e-6 * np.eye(size + graph.points.size)
+    slope = np.array([(cost(step) - cost(-step)) / 2e-6 for step in h])
+    assert np.allclose(np.concatenate([g, gp.ravel()]), slope / 2, rtol=1e-4, atol=1e-4 * np.abs(slope).max())
+
+
+def test_covariance_grows_away_from_what_is_fixed_and_fits_the_scatter():
+    found = []
+    for seed in range(12):
+        poses, graph = street(5, 60)
+        noise = np.random.default_rng(100 + seed).normal(0, np.radians(0.1), graph.bearing.shape)
+        bearing = graph.bearing + noise
+        bearing /= np.linalg.norm(bearing, axis=1, keepdims=True)
+        solved = lm.solve(replace(graph, bearing=bearing, sigma=np.radians(0.1)), iterations=20, covariance=True)
+        found.append(positions(solved)[-1] - poses[-1, :3, 3])
+    sigma = np.sqrt(np.einsum("cii->ci", solved.covariance)[:, :3])
+    assert (np.diff(sigma[1:, 2]) > 0).all()
+    assert 0.4 < np.std(found, axis=0)[2] / sigma[-1, 2] < 2.5

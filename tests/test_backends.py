@@ -1,0 +1,185 @@
+"""One contract for all backends and formats, and one file is enough to add another."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import inspect
+import re
+import sys
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+from scan2sim.pipeline import backends
+from scan2sim.pipeline.errors import SettingError, UnavailableError
+from scan2sim.pipeline.extras import EXTRA_OF
+from scan2sim.pipeline.io import clouds, gps, meshes, models
+from scan2sim.segmentation import backends as networks
+from scan2sim.slam import features, matchers, solvers, trackers
+from tests.conftest import ROOT
+from tests.pipeline import made_up
+
+PROTOCOLS: dict[ModuleType, tuple[type, ...]] = {
+    networks: (networks.Backend,),
+    features: (features.Backend,),
+    matchers: (matchers.Backend,),
+    trackers: (trackers.Backend,),
+    solvers: (solvers.Solver,),
+    clouds: (clouds.Format,),
+    models: (models.Program,),
+    gps: (gps.Format,),
+    meshes: (meshes.ModelFormat, meshes.WorldFormat),
+}
+"""Packages of backends, and what their modules are: one of these."""
+ALL = [(package, name) for package in PROTOCOLS for name in backends.names(package.__name__)]
+each = pytest.mark.parametrize(("package", "name"), ALL, ids=[f"{p.__name__.split('.', 1)[1]}-{n}" for p, n in ALL])
+
+
+def keeps(module: Any, protocol: type) -> bool:
+    """Whether a module has a protocol's constants, and its functions with their parameters in their order."""
+    asked = {name: value for name, value in vars(protocol).items() if inspect.isfunction(value) and name[0] != "_"}
+    for name, function in asked.items():
+        wanted = [parameter for parameter in inspect.signature(function).parameters if parameter != "self"]
+        own = list(inspect.signature(getattr(module, name, lambda: None)).parameters.values())
+        if [parameter.name for parameter in own[: len(wanted)]] != wanted:
+            return False
+        if any(parameter.default is inspect.Parameter.empty for parameter in own[len(wanted) :]):
+            return False
+    return all(hasattr(module, name) for name in protocol.__annotations__)
+
+
+@each
+def test_it_has_what_its_protocol_asks(package: ModuleType, name: str) -> None:
+    module = backends.module(package.__name__, name)
+    assert sum(keeps(module, protocol) for protocol in PROTOCOLS[package]) == 1
+
+
+@each
+def test_it_says_what_it_needs(package: ModuleType, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    needs = backends.needs(backends.module(package.__name__, name))
+    core = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
+    extras = {EXTRA_OF[package] for package in needs if package in EXTRA_OF}
+    assert extras or set(needs) <= {re.split(r"[^\w.-]", line)[0] for line in core}
+    real = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda n, *more: None if n in needs else real(n, *more))
+    assert backends.missing(package.__name__, name) == (", ".join(needs) or None)
+    if needs:
+        with pytest.raises(UnavailableError) as caught:
+            backends.find(package.__name__, name, "a.setting")
+        assert caught.value.where == f"a.setting {name}" and all(n in caught.value.cause for n in needs)
+        assert not extras or caught.value.remedy == f"pip install 'scan2sim[{','.join(sorted(extras))}]'"
+
+
+@pytest.mark.parametrize("package", PROTOCOLS, ids=lambda p: p.__name__)
+def test_an_unknown_name_tells_the_known_ones(package: ModuleType) -> None:
+    with pytest.raises(SettingError, match=r"a\.setting: there is no 'surf'") as caught:
+        backends.find(package.__name__, "surf", "a.setting")
+    assert all(name in caught.value.remedy for name in backends.names(package.__name__))
+
+
+@pytest.mark.parametrize("package", [clouds, gps])
+def test_no_two_formats_read_the_same_files(package: ModuleType) -> None:
+    each = [backends.module(package.__name__, name).SUFFIXES for name in backends.names(package.__name__)]
+    assert sum(map(len, each)) == len(backends.by_suffix(package.__name__))
+
+
+@pytest.fixture
+def add(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Adds a module to a package: a file in a folder of its own."""
+    added = []
+
+    def one(package: ModuleType, name: str, code: str) -> None:
+        folder = tmp_path / package.__name__
+        folder.mkdir()
+        (folder / f"{name}.py").write_text(code)
+        monkeypatch.setattr(package, "__path__", [*package.__path__, str(folder)])
+        importlib.invalidate_caches()
+        added.append((package, name))
+
+    yield one
+    for package, name in added:
+        sys.modules.pop(f"{package.__name__}.{name}", None)
+        vars(package).pop(name, None)
+
+
+Add = Callable[[ModuleType, str, str], None]
+
+
+def test_a_network_is_one_file(add: Add) -> None:
+    from scan2sim.pipeline.types import Camera
+    from scan2sim.segmentation.label import LABEL
+    from scan2sim.segmentation.photos import Labeller, labels_of
+
+    add(networks, "allroad", """
+import numpy as np
+from scan2sim.segmentation.backends import Facts
+
+class Network:
+    facts = Facts("allroad", ("road", "building", "vegetation", "car"), "0" * 64, "none", None)
+    def probabilities(self, seen):
+        return np.stack([np.full(seen.shape[:2], share, np.float32) for share in (0.7, 0.1, 0.1, 0.1)])
+
+def check(weights):
+    pass
+
+def load(weights, device):
+    return Network()
+""")  # fmt: skip
+    assert LABEL.check is not None
+    LABEL.check(LABEL.params.of("label", {"network": "allroad"}))
+    labeller = Labeller(networks.load("allroad", None), "allroad")
+    seen = np.zeros((48, 64, 3), np.uint8)
+    camera = Camera("pinhole", 64, 48, 50.0, 50.0, 31.5, 23.5)
+    best, _ = labels_of(labeller.probabilities(seen, camera, None), (48, 64))
+    assert best.shape == (48, 64) and len(np.unique(best)) == 1
+
+
+def test_a_feature_is_one_file(add: Add) -> None:
+    from scan2sim.flows.slam import Options, _tracker
+    from scan2sim.pipeline.types import Camera
+
+    add(features, "blobs", """
+import cv2
+import numpy as np
+from scan2sim.slam.features import Found
+
+class Blobs:
+    name, binary, dimension = "blobs", False, 25
+    def detect(self, picture, mask=None):
+        uv = cv2.goodFeaturesToTrack(picture, 300, 0.01, 5).reshape(-1, 2)
+        looks = np.stack([cv2.getRectSubPix(picture, (5, 5), tuple(map(float, at))).ravel() for at in uv])
+        looks = looks.astype(np.float32) / np.linalg.norm(looks, axis=1, keepdims=True)
+        return Found(uv, looks, np.linspace(1, 0, len(uv), dtype=np.float32))
+    def describe(self):
+        return "blobs"
+
+def load(weights, count, upsample, device):
+    return Blobs()
+""")  # fmt: skip
+    grey = np.random.default_rng(0).integers(0, 255, (60, 80), np.uint8).repeat(4, 0).repeat(4, 1)
+    tracker = _tracker(Camera("pinhole", 320, 240, 200.0, 200.0, 159.5, 119.5), None, 100, Options(features="blobs"))
+    tracker.look(grey)
+    assert tracker.refill() > 50
+    assert tracker.look(grey) > 0.9
+
+
+def test_an_export_format_is_one_file(add: Add, tmp_path: Path) -> None:
+    add(meshes, "off", """
+SUFFIX = ".off"
+
+def write(path, surface, look):
+    rows = [f"{x} {y} {z}" for x, y, z in surface.mesh.vertices] + [f"3 {a} {b} {c}" for a, b, c in surface.mesh.faces]
+    path.write_text("\\n".join(["OFF", f"{len(surface.mesh.vertices)} {len(surface)} 0", *rows]))
+""")  # fmt: skip
+    import trimesh
+
+    world = made_up.world(tmp_path, formats=("obj", "off")).files["world"]
+    folder = world / "models" / "street" / "meshes"
+    assert len(trimesh.load(folder / "terrain.off", process=False).faces) == len(made_up.ground())
+    assert (folder / "terrain.obj").is_file() and not (folder / "terrain.dae").exists()
