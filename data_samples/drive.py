@@ -120,15 +120,7 @@ def _kept(frames: Iterable[U8], folder: Path) -> Iterator[U8]:
 
 def row_poses(trajectory: Trajectory, time: float, height: int, readout: float) -> F64:
     """(H, 4, 4) the pose of each row of a frame whose middle row is taken at `time`; held beyond the ends."""
-    from scipy.spatial.transform import Rotation, Slerp
-
-    assert trajectory.rotations is not None
-    times = time + ((np.arange(height) + 0.5) / height - 0.5) * readout
-    times = np.clip(times, *trajectory.times[[0, -1]])
-    poses = np.tile(np.eye(4), (height, 1, 1))
-    poses[:, :3, :3] = Slerp(trajectory.times, Rotation.from_matrix(trajectory.rotations))(times).as_matrix()
-    poses[:, :3, 3] = trajectory.at(times)
-    return poses
+    return trajectory.pose_at(time + ((np.arange(height) + 0.5) / height - 0.5) * readout)
 
 
 def write_truth(file: Path, trajectory: Trajectory) -> None:

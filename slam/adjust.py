@@ -11,11 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from scan2sim.pipeline.extras import need
+from scan2sim.pipeline.io.colmap_writer import SparseMap
+from scan2sim.pipeline.io.colmap_writer import write as write_colmap
 from scan2sim.pipeline.similarity import umeyama
 from scan2sim.pipeline.types import Trajectory
 from scan2sim.slam.geometry import angles
 from scan2sim.slam.odometry import Odometry
-from scan2sim.slam.output import SparseMap, write_colmap
 from scan2sim.slam.sparse import kept, move
 
 LOSS = 1.0

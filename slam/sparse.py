@@ -8,11 +8,11 @@ import numpy as np
 import numpy.typing as npt
 
 from scan2sim.pipeline.cameras import project
+from scan2sim.pipeline.io.colmap_writer import SparseMap
 from scan2sim.pipeline.types import F64, I32, Trajectory
 from scan2sim.slam.finish import Placing
 from scan2sim.slam.localmap import Landmarks
 from scan2sim.slam.odometry import Odometry
-from scan2sim.slam.output import SparseMap
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import os
 import shutil
 from pathlib import Path
 
-from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.errors import InputError, from_os_error
 
 PUT_THERE = "Put it there, or mend the name"
 
@@ -41,6 +41,18 @@ def lines(path: Path, remedy: str = PUT_THERE) -> list[str]:
         InputError: it is no file.
     """
     return check(path, remedy).read_text(encoding="utf-8-sig", errors="replace").splitlines()
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder, and those above it, unless it is there.
+
+    Raises:
+        SpaceError: the disk is full or may not be written to.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise from_os_error(error, folder) from error
 
 
 def pass_on(source: Path, target: Path) -> None:

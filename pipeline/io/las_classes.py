@@ -11,6 +11,7 @@ import numpy as np
 
 from scan2sim.pipeline.classes import CLASSES
 from scan2sim.pipeline.errors import DataError, SpaceError, UnavailableError, from_os_error
+from scan2sim.pipeline.io import las_header
 from scan2sim.pipeline.io.clouds.las import CHUNK, _open, _parts
 from scan2sim.pipeline.types import U8
 
@@ -249,8 +250,8 @@ def _wkt_of_geotiff(header: Any) -> str | None:
 
     keys = {k.id: k.value_offset for r in header.vlrs.get("GeoKeyDirectoryVlr") for k in r.geo_keys}
     try:
-        crs = header.parse_crs()
-    except (CRSError, NotImplementedError):
+        crs = las_header.parsed_crs(header)
+    except ValueError:
         return None
     if crs is None or (PROJECTED_KEY in keys and not crs.is_projected):  # a projection of their own: not its datum's
         return None

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import struct
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from scan2sim.pipeline.errors import InputError
 
@@ -148,3 +148,17 @@ def _check_layers(path: Path, file: BinaryIO, at: int, lengths: list[int], laszi
         if len(said) < 4 * layers or sum(struct.unpack(f"<{layers}I", said)) > length:
             raise truncated(path, 0, count, f"the chunk at byte {at:,} is longer than its {length:,} bytes")
         at += length
+
+
+def parsed_crs(header: Any) -> Any:
+    """The CRS (of pyproj) that a header of laspy's names; None where it names none.
+
+    Raises:
+        ValueError: it can't be read.
+    """
+    from pyproj.exceptions import CRSError
+
+    try:
+        return header.parse_crs()
+    except (CRSError, NotImplementedError) as error:
+        raise ValueError(str(error)) from error

@@ -12,9 +12,11 @@ from scipy.spatial.transform import Rotation
 from scan2sim.pipeline.cameras import inside, project
 from scan2sim.pipeline.errors import DataError
 from scan2sim.pipeline.io import trajectory as trajectory_io
+from scan2sim.pipeline.io.colmap_writer import SparseMap
+from scan2sim.pipeline.io.colmap_writer import write as write_colmap
 from scan2sim.pipeline.io.models.colmap import camera_of
 from scan2sim.pipeline.types import Camera, Frame, Trajectory
-from scan2sim.slam.output import SparseMap, write, write_colmap
+from scan2sim.slam.output import write
 
 UTM = Frame("EPSG:32633", (500_000.0, 5_400_000.0, 200.0))
 CAMERAS = {

@@ -276,11 +276,9 @@ def _eight_bits(rgb: Any) -> Any:
 
 
 def _crs(path: Path, header: Any) -> str | None:
-    from pyproj.exceptions import CRSError
-
     try:
-        crs = header.parse_crs()
-    except (CRSError, NotImplementedError) as error:
+        crs = las_header.parsed_crs(header)
+    except ValueError as error:
         raise InputError(
             path, f"its CRS can't be read ({error})", "Set `crs` in its header, or write it again"
         ) from None
