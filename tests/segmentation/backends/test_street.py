@@ -6,7 +6,7 @@ import pickle
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.errors import DataError, InputError, SettingError
+from scan2sim.pipeline.errors import DataError, InputError
 
 torch = pytest.importorskip("torch", reason="torch is not installed (pip install 'scan2sim[segmentation]')")
 safetensors = pytest.importorskip("safetensors.torch", reason="safetensors is not installed")
@@ -105,11 +105,6 @@ def test_a_pickle_is_refused_and_not_run(tmp_path):
     with pytest.raises(InputError, match="safetensors"):
         load("street", tmp_path / "w.pt", "cpu")
     assert not (tmp_path / "harm").exists()
-
-
-def test_a_backend_that_is_not_there():
-    with pytest.raises(SettingError, match="street, segformer, onnx"):
-        load("deeplab", None)
 
 
 def colourful(folder, n=6):
