@@ -2,7 +2,8 @@
 
 A wall is an upright plane of the cloud, cut into cells. A column of it may go on above its scan where that ends at the
 scanner's uppermost rays; a gap may be closed where no ray went through. How high a column goes is a line over all
-columns, solved by dynamic programming: as high as what is told of its cells says, and neighbours alike.
+columns, solved by dynamic programming: as high as what is told of its cells says, and neighbours alike. Import late: it
+loads numba.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from typing import Any
 import cv2
 import numpy as np
 import numpy.typing as npt
+from numba import njit
 
 from scan2sim.pipeline.planes import Planes
 from scan2sim.pipeline.types import F32, F64, I32
@@ -206,16 +208,31 @@ def solid(wall: Wall, through: Bools) -> Bools:
 
 def passed(wall: Wall, rays: Rays) -> Bools:
     """(R, C) cells that rays went through, to end behind the wall."""
-    before, behind = ((places - wall.corner) @ wall.normal for places in (rays.origin, rays.end))
-    through = (before > 0) & (behind < -DEEP)
-    share = before[through] / (before[through] - behind[through])
-    met = rays.origin[through] + share[:, None] * (rays.end[through] - rays.origin[through]) - wall.corner
-    row, column = (np.rint(met @ axis / wall.cell).astype(int) for axis in (wall.up, wall.along))
-    rows, columns = wall.known.shape
-    inside_ = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
-    out = np.zeros((rows, columns), bool)
-    out[row[inside_], column[inside_]] = True
+    out = np.zeros(wall.known.shape, np.bool_)
+    _cross(out, rays.origin, rays.end, wall.corner, wall.normal, wall.up / wall.cell, wall.along / wall.cell, DEEP)
     return out
+
+
+@njit(cache=True)
+def _cross(out, origin, end, corner, normal, up, along, deep):  # type: ignore[no-untyped-def]
+    """Mark in `out` (R, C) the cells of a plane that rays cross from before it to `deep` metres behind it."""
+    rows, columns = out.shape
+    for i in range(len(end)):
+        before, behind = 0.0, 0.0
+        for k in range(3):
+            before += (origin[i, k] - corner[k]) * normal[k]
+            behind += (end[i, k] - corner[k]) * normal[k]
+        if before <= 0 or behind >= -deep:
+            continue
+        share = before / (before - behind)
+        row, column = 0.0, 0.0
+        for k in range(3):
+            met = origin[i, k] + share * (end[i, k] - origin[i, k]) - corner[k]
+            row += met * up[k]
+            column += met * along[k]
+        row, column = np.rint(row), np.rint(column)
+        if 0 <= row < rows and 0 <= column < columns:
+            out[int(row), int(column)] = True
 
 
 def closed(known: Bools, through: Bools, reach: int) -> Bools:
