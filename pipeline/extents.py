@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import numpy.typing as npt
+from numba import njit
 from scipy.spatial import cKDTree
 
 from scan2sim.pipeline.planes import Planes
@@ -380,13 +381,8 @@ def _fit(flat: F64, a: F64, b: F64, voxel: float) -> Line:
     if length < SHORTEST * voxel:
         return (a + b) / 2, along, False
     out = np.array([along[1], -along[0]])
-    t, s = (flat - a) @ along, (flat - a) @ out
-    near = (t > 0) & (t < length) & (s > -DEEP * voxel) & (s < voxel)
-    bins = max(3, int(length / (BIN * voxel)))
-    index = np.minimum((t[near] / length * bins).astype(int), bins - 1)
-    count = np.bincount(index, minlength=bins)
-    far = np.full(bins, -np.inf)
-    np.maximum.at(far, index, s[near])
+    count, far = _outermost(flat, a, along, length, max(3, int(length / (BIN * voxel))), -DEEP * voxel, voxel)
+    bins = len(count)
     good = count >= FILLED
     if good.sum() < max(3, bins // 2):
         return (a + b) / 2, along, False
@@ -404,6 +400,23 @@ def _fit(flat: F64, a: F64, b: F64, voxel: float) -> Line:
     turned /= np.linalg.norm(turned)
     miss = np.quantile(np.abs(reach - slope * where - level), 0.8)
     return a + level * out, turned, bool(miss < TIGHT * voxel)
+
+
+@njit(cache=True)
+def _outermost(flat, start, along, length, bins, low, high):  # type: ignore[no-untyped-def]
+    """Number (B,) and greatest distance (B,) to the right of a line, of points (N, 2) in each of its parts.
+
+    Points count that are between `low` and `high` metres to its right.
+    """
+    count, far = np.zeros(bins, np.int64), np.full(bins, -np.inf)
+    for i in range(len(flat)):
+        x, y = flat[i, 0] - start[0], flat[i, 1] - start[1]
+        t, s = x * along[0] + y * along[1], x * along[1] - y * along[0]
+        if 0 < t < length and low < s < high:
+            k = min(int(t / length * bins), bins - 1)
+            count[k] += 1
+            far[k] = max(far[k], s)
+    return count, far
 
 
 def _without_chamfers(ring: F64, lines: list[Line], voxel: float) -> tuple[F64, list[Line]]:

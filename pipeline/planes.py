@@ -113,6 +113,12 @@ def _residuals(xyz, normal, near):  # type: ignore[no-untyped-def]
     return out
 
 
+@njit(cache=True, inline="always")
+def _along(places, i, axis):  # type: ignore[no-untyped-def]
+    """Place i (of (N, 3)) along an axis (3,)."""
+    return places[i, 0] * axis[0] + places[i, 1] * axis[1] + places[i, 2] * axis[2]
+
+
 @njit(cache=True)
 def _grow(xyz, normal, near, seeds, tolerance, turn, least):  # type: ignore[no-untyped-def]
     """(N,) regions from each seed in turn: neighbours are added that lie on the plane so far; small ones dissolve."""
@@ -122,7 +128,7 @@ def _grow(xyz, normal, near, seeds, tolerance, turn, least):  # type: ignore[no-
     for seed in seeds:
         if which[seed] >= 0:
             continue
-        axis, middle = normal[seed].copy(), xyz[seed].copy()
+        axis, level = normal[seed].copy(), _along(xyz, seed, normal[seed])
         total, outer = np.zeros(3), np.zeros((3, 3))
         count, at, refit = 1, 0, NEIGHBOURS
         members[0] = seed
@@ -130,19 +136,22 @@ def _grow(xyz, normal, near, seeds, tolerance, turn, least):  # type: ignore[no-
         while at < count:
             i = members[at]
             at += 1
-            x = xyz[i] - xyz[seed]
-            total += x
-            outer += np.outer(x, x)
+            for k in range(3):
+                x = xyz[i, k] - xyz[seed, k]
+                total[k] += x
+                for m in range(3):
+                    outer[k, m] += x * (xyz[i, m] - xyz[seed, m])
             if at == refit:
                 refit = int(1.5 * refit)
                 mean = total / at
                 vectors = np.linalg.eigh(outer / at - np.outer(mean, mean))[1]
                 turned = np.ascontiguousarray(vectors[:, 0])
                 axis = turned if np.dot(turned, axis) > 0 else -turned
-                middle = mean + xyz[seed]
+                level = np.dot(mean + xyz[seed], axis)
             for j in near[i]:
-                free = j < n and which[j] < 0
-                if free and np.dot(normal[j], axis) > turn and abs(np.dot(xyz[j] - middle, axis)) <= tolerance:
+                if j == n or which[j] >= 0 or _along(normal, j, axis) <= turn:
+                    continue
+                if abs(_along(xyz, j, axis) - level) <= tolerance:
                     which[j] = found
                     members[count] = j
                     count += 1
@@ -162,12 +171,12 @@ def _widened(xyz, near, which, normal, offset, tolerance):  # type: ignore[no-un
     for i in prange(n):
         best, own = tolerance, which[i]
         if own >= 0:
-            if abs(np.dot(xyz[i], normal[own]) - offset[own]) <= tolerance:
+            if abs(_along(xyz, i, normal[own]) - offset[own]) <= tolerance:
                 continue
             out[i] = -1
         for j in near[i]:
             if j < n and which[j] >= 0:
-                d = abs(np.dot(xyz[i], normal[which[j]]) - offset[which[j]])
+                d = abs(_along(xyz, i, normal[which[j]]) - offset[which[j]])
                 if d < best:
                     best = d
                     out[i] = which[j]

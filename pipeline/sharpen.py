@@ -40,6 +40,10 @@ ROUNDS = 8
 """Times that vertices are given back, whose faces have turned over."""
 
 
+Edges = tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]
+"""Of a mesh, as `edges_of` tells them."""
+
+
 @dataclass(frozen=True)
 class Sharpened:
     """A mesh on planes.
@@ -57,6 +61,7 @@ class Sharpened:
 
 def sharpen(
     mesh: Mesh,
+    edges: Edges,
     planes: Planes,
     own: I32,
     beside: npt.NDArray[np.bool_],
@@ -69,6 +74,7 @@ def sharpen(
 
     Args:
         mesh: to be sharpened.
+        edges: its `edges_of`.
         planes: that its vertices lie on; the last of them are the ends of others.
         own: (V,) which of them, -1 for none.
         beside: (V,) bool, rounded beside an edge: laid on its plane from wherever it is. Others are the less moved, the
@@ -84,7 +90,7 @@ def sharpen(
     off = planes.beyond(vertices[on], own[on])
     part = share[on] * np.where(beside[on], 1.0, np.clip((FADES - np.abs(off) / tolerance) / (FADES - 1), 0, 1))
     moved[on] -= (part * off)[:, None] * planes.normal[own[on]]
-    pairs, edges = _edges(faces)
+    pairs, of_face = edges
     a, b = own[pairs[:, 0]], own[pairs[:, 1]]
     middle = vertices[pairs].mean(axis=1)
     crossing = np.flatnonzero((a >= 0) & (b >= 0) & (a != b))
@@ -93,10 +99,10 @@ def sharpen(
     crossing, place = crossing[sharp], place[sharp]
     new = np.full(len(pairs), -1)
     new[crossing] = len(vertices) + np.arange(len(crossing))
-    split, parent, corner = _split(faces, new[edges], len(vertices) + len(crossing))
+    split, parent, corner = _split(faces, new[of_face], len(vertices) + len(crossing))
     three = own[faces[corner]]
     place3, far3 = meet(vertices[faces[corner]].mean(axis=1), planes, three)
-    around = np.concatenate([moved, place])[new[edges[corner]]].mean(axis=1) if len(corner) else place3
+    around = np.concatenate([moved, place])[new[of_face[corner]]].mean(axis=1) if len(corner) else place3
     place3 = np.where((far3 <= ROUNDED * voxel)[:, None], place3, around)
     first = np.concatenate([vertices, middle[crossing], vertices[faces[corner]].mean(axis=1)])
     last = np.concatenate([moved, place, place3])
@@ -182,10 +188,10 @@ def upright(
     return last, stayed
 
 
-def border_of(mesh: Mesh) -> npt.NDArray[np.int64]:
-    """The vertices on the mesh's border."""
-    pairs, edges = _edges(mesh.faces.astype(np.int64))
-    return np.unique(pairs[np.bincount(edges.ravel(), minlength=len(pairs)) == 1])
+def border_of(edges: Edges) -> npt.NDArray[np.int64]:
+    """The vertices on a mesh's border."""
+    pairs, of_face = edges
+    return np.unique(pairs[np.bincount(of_face.ravel(), minlength=len(pairs)) == 1])
 
 
 @njit(cache=True, parallel=True)
@@ -235,8 +241,9 @@ def _assign(xyz, normal, near, axis, offset, tolerance, rounded, own, beside):  
                     break
 
 
-def _edges(faces: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+def edges_of(mesh: Mesh) -> Edges:
     """Edges (E, 2), and which of them each face has (F, 3): from its first corner, its second, its third."""
+    faces = mesh.faces.astype(np.int64)
     ends = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2)
     ends.sort(axis=1)
     code, back = np.unique(ends[:, 0] * (int(faces.max(initial=0)) + 1) + ends[:, 1], return_inverse=True)

@@ -67,7 +67,8 @@ def planes(inputs: Inputs, params: PlanesParams, out: Path, report: Report) -> D
     sides = extents.sides(points, own, found, voxel)
     faces, between, of_face = extents.steps(sides, found, cloud.xyz, which, voxel, tolerance)
     others = [PointCloud.load(path).xyz for name, path in inputs.items() if name.startswith("other.")]
-    border = mesh.vertices[sharpen.border_of(mesh)]
+    edges = sharpen.edges_of(mesh)
+    border = mesh.vertices[sharpen.border_of(edges)]
     ends, of_side = extents.free(
         sides, found, cloud.xyz, which, np.concatenate([np.zeros((0, 3), np.float32), *others]), border, voxel
     )
@@ -86,7 +87,8 @@ def planes(inputs: Inputs, params: PlanesParams, out: Path, report: Report) -> D
     beside |= laid != near
     share = inland(mesh, params)
     laid[share == 0] = -1
-    sharp = sharpen.sharpen(mesh, Planes.join([every, sides.planes]), laid, beside, share, len(every), voxel, tolerance)
+    every_end = Planes.join([every, sides.planes])
+    sharp = sharpen.sharpen(mesh, edges, every_end, laid, beside, share, len(every), voxel, tolerance)
     sharp.mesh.save(out / "mesh.npz")
     facts |= {
         "faces": len(sharp.mesh),
