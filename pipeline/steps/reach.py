@@ -53,6 +53,8 @@ def reach(inputs: Inputs, params: ReachParams, out: Path, report: Report) -> Don
     (`HIGH`). Facts: `points` kept, `left_out` points, about `left_out_m2` of surface, and `far_m`, how far from the
     path the farthest point is that is kept.
     """
+    from dataclasses import replace
+
     import numpy as np
 
     from scan2sim.pipeline.io import views as views_io
@@ -68,7 +70,7 @@ def reach(inputs: Inputs, params: ReachParams, out: Path, report: Report) -> Don
     size = PATCH * params.voxel
     report(0.1, "thinning")
     order, starts = voxel_groups(cloud.xyz, size)
-    thin = sample(cloud, size)
+    thin = sample(replace(cloud, rgb=None), size, (order, starts))
     if _above(thin, path.positions) > HIGH:
         kept = np.ones(len(thin), bool)
     elif not isinstance(params.limit, str):

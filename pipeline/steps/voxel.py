@@ -11,7 +11,12 @@ from scan2sim.pipeline.ranges import Voxel
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
     from scan2sim.pipeline.types import F32, PointCloud
+
+    Groups = tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]
 
 
 class VoxelParams(Params):
@@ -50,9 +55,10 @@ def voxel(inputs: Inputs, params: VoxelParams, out: Path, report: Report) -> Don
     return Done({"cloud": out / "cloud.npz"}, facts)
 
 
-def sample(cloud: PointCloud, size: float) -> PointCloud:
+def sample(cloud: PointCloud, size: float, groups: Groups | None = None) -> PointCloud:
     """One point a voxel of `size` metres: mean position and colour; class, intensity and time of one member.
 
+    `groups` are its `voxel_groups`, where they are known.
     Means are rounded to `pipeline.borders.grid.GRID`, so that tiles which know the same points around their border, in
     the same order (`overlap`), have the same samples there.
     """
@@ -64,7 +70,7 @@ def sample(cloud: PointCloud, size: float) -> PointCloud:
 
     if len(cloud) == 0:
         return cloud
-    order, starts = voxel_groups(cloud.xyz, size)
+    order, starts = groups or voxel_groups(cloud.xyz, size)
     counts = np.diff(np.append(starts, len(order)))
     first = order[starts]
 
@@ -82,7 +88,7 @@ def sample(cloud: PointCloud, size: float) -> PointCloud:
     return thin
 
 
-def voxel_groups(xyz: F32, size: float) -> tuple[np.ndarray, np.ndarray]:  # type: ignore[name-defined]  # noqa: F821
+def voxel_groups(xyz: F32, size: float) -> Groups:
     """Points sorted by voxel, and where each voxel starts in that order.
 
     Voxels begin at whole multiples of `size`, in height half a voxel beside them (a level floor at a round height
@@ -100,8 +106,13 @@ def voxel_groups(xyz: F32, size: float) -> tuple[np.ndarray, np.ndarray]:  # typ
         cell = np.floor(xyz[:, axis].astype(np.float64) / size + shift + 1e-6).astype(np.int64)
         cell -= cell.min()
         code = code * (cell.max() + 1) + cell
-    order = np.argsort(code, kind="stable")
-    code = code[order]
+    bits = len(xyz).bit_length()
+    if int(code.max(initial=0)).bit_length() + bits < 64:  # numbers are sorted several times as fast as their places
+        packed = np.sort(code << bits | np.arange(len(xyz)))
+        order, code = packed & ((1 << bits) - 1), packed >> bits
+    else:
+        order = np.argsort(code, kind="stable")
+        code = code[order]
     starts = np.flatnonzero(np.concatenate([[True], code[1:] != code[:-1]]))
     return order, starts
 
