@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
     from scan2sim.texturing.photos import Exposures, Photos
     from scan2sim.texturing.predict import Prediction
 
+KEPT = 16
+"""Depth maps kept in memory."""
 PIXELS = 250_000
 """Photos are compared at this size at most."""
 SAMPLES = 300
@@ -143,6 +146,7 @@ def agreement(inputs: Inputs, params: AgreementParams, out: Path, report: Report
     used = [i for i, view in enumerate(views) if not held[i] and view.camera.model != "orthographic"]
     exposures, photos = Exposures.load(inputs["exposures"]), Photos(views)
 
+    @lru_cache(maxsize=KEPT)
     def depth(i: int) -> DepthMap:
         return load_depth_map(inputs["depth"] / f"{i}.npy", views[i].camera, views[i].T_world_cam)
 

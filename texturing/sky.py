@@ -52,7 +52,8 @@ def sky(rgb: U8, depth: F32, up: F32, pixel: float, loose: float) -> Bools | Non
     colour, seeds = _colour(rgb, far & (cv2.resize(up, size) > 0))
     if colour is None or int(seeds.sum()) < LEAST:
         return None
-    like = (np.abs(rgb.astype(np.float32) - colour).max(axis=2) < ALIKE).astype(np.uint8)
+    most = float(np.nextafter(np.float32(ALIKE), np.float32(0)))
+    like = np.asarray(cv2.inRange(cv2.absdiff(rgb.astype(np.float32), colour), (0,) * 3, (most,) * 3), np.uint8) & 1
     open_ = _touching(like & far, seeds)
     near = cv2.resize(np.where(np.isfinite(depth), depth, 0), size, interpolation=cv2.INTER_NEAREST)
     aside = cv2.distanceTransform(1 - open_, cv2.DIST_L2, 3) * near * pixel  # metres from its outline, seen from here
@@ -84,14 +85,14 @@ def _colour(rgb: U8, far: U8) -> tuple[F32 | None, U8]:
     mean = cv2.blur(grey, (5, 5))
     rough = cv2.blur(grey * grey, (5, 5)) - mean * mean
     inner = cv2.erode(far, np.ones((2 * INSIDE + 1, 2 * INSIDE + 1)), borderValue=1)
-    r, g, b = (rgb[..., k].astype(np.int16) for k in range(3))
-    seeds = ((inner > 0) & (rough < SMOOTH**2) & (b + BLUE >= np.maximum(r, g)) & (b > BRIGHT)).astype(np.uint8)
+    r, g, b = cv2.split(rgb)
+    seeds = ((inner > 0) & (rough < SMOOTH**2) & (cv2.add(b, BLUE) >= cv2.max(r, g)) & (b > BRIGHT)).astype(np.uint8)
     seeds = cv2.morphologyEx(seeds, cv2.MORPH_OPEN, np.ones((7, 7)))
     small = (max(1, rgb.shape[1] // 8), max(1, rgb.shape[0] // 8))
     weight = cv2.resize(seeds.astype(np.float32), small, interpolation=cv2.INTER_AREA)
     if float(weight.sum()) * 64 < LEAST:
         return None, seeds
-    held = cv2.resize(rgb.astype(np.float32) * seeds[..., None], small, interpolation=cv2.INTER_AREA)
+    held = cv2.resize(cv2.copyTo(rgb, seeds).astype(np.float32), small, interpolation=cv2.INTER_AREA)
     sigma = AROUND / 8
     total = cv2.GaussianBlur(weight, (0, 0), sigma)
     colour = cv2.GaussianBlur(held, (0, 0), sigma) / np.maximum(total, 1e-3)[..., None]
