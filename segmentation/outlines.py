@@ -9,15 +9,21 @@ Import late: it loads numba.
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit
 
 from scan2sim.pipeline.plates import ASPECT, OUTLINES, SIZE, Plate, Shape, inside
 from scan2sim.pipeline.types import F32, F64, U8, View
+
+if TYPE_CHECKING:
+    from scipy.optimize import OptimizeResult
 
 PHOTOS = (3, 6)
 """Photos that a plate is looked for in, at least and at most: the finest."""
@@ -41,6 +47,10 @@ ALIKE = 0.8
 """Share of what is seen of a plate's face that all photos agree on."""
 NEARLY = 0.8
 """Share of both from which a plate is looked at more closely."""
+HOPEFUL, EARLY = 0.4, 10
+"""Share of both below which a search ends after so many generations."""
+ROUGHLY = 0.6
+"""Share of both from which what a search ends with is refined."""
 TURN = math.radians(60)
 """By which a plate's heading may be wrong."""
 LARGER = 0.03
@@ -203,8 +213,9 @@ def _clearest(
         low, high: (K,) bounds of the parameters but those.
         turns: radians by which the heading of what is found may be off.
     """
-    best = [_best(shown, shape, at, low, high) for shape in OUTLINES]
-    found = [_outermost(shown, plate, turns) for plate in best if shown.shows(plate, NEARLY)]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        best = list(pool.map(lambda shape: _best(shown, shape, at, low, high), OUTLINES))
+    found = [_outermost(shown, plate, turns) for plate in best if plate is not None and shown.shows(plate, NEARLY)]
     there = [plate for plate in found if shown.shows(plate)]
     if not there:
         return None
@@ -217,8 +228,8 @@ def _clearest(
 
 def _best(
     shown: CloseUps, shape: Shape, at: Callable[[Shape, F64], F64], low: Sequence[float], high: Sequence[float]
-) -> Plate:
-    """The clearest plate of a shape, between bounds."""
+) -> Plate | None:
+    """The clearest plate of a shape, between bounds; None where none is near to be one."""
     from scipy.optimize import differential_evolution, minimize
 
     sides = 2 if shape == "rectangle" else 1
@@ -234,10 +245,17 @@ def _best(
     def one(p: F64) -> float:
         return float(price(p[:, None])[0])
 
+    def hopeless(intermediate_result: OptimizeResult) -> bool:
+        best = _of(shape, plates(intermediate_result.x[None])[0])
+        return bool(intermediate_result.nit >= EARLY and not shown.shows(best, HOPEFUL))
+
     bounds = list(zip(low, high, strict=True))
     found = differential_evolution(
-        price, bounds, popsize=16, maxiter=50, tol=1e-2, rng=0, polish=False, updating="deferred", vectorized=True
-    )
+        price, bounds, popsize=16, maxiter=50, tol=1e-2, rng=0, polish=False, updating="deferred", vectorized=True,
+        callback=hopeless,
+    )  # fmt: skip
+    if not shown.shows(_of(shape, plates(found.x[None])[0]), ROUGHLY):
+        return None
     finer = minimize(
         one, found.x, method="Nelder-Mead", bounds=bounds, options={"maxiter": 300, "xatol": 1e-3, "fatol": 1e-5}
     )
@@ -309,44 +327,49 @@ def _samples(shape: Shape) -> tuple[F64, F64]:
     return np.concatenate([rim, rim, face]), np.concatenate([-out, out, np.zeros_like(face)])
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _clear(pictures, project, focal, plates, flat, out, rim, off, noise):  # type: ignore[no-untyped-def]
     """`CloseUps.clear`; `flat` and `out` are of `_samples`."""
     rated = np.zeros((len(plates), 3))
+    seen, mean, edge = np.empty((len(pictures), len(flat), 3)), np.empty((len(flat), 3)), np.empty(rim)
     for n in range(len(plates)):
-        seen = np.empty((len(pictures), len(flat), 3))
-        if _look(pictures, project, focal, plates[n], flat, out, rim, off, seen):
-            rated[n] = _rate(seen, rim, noise)
+        if _look(pictures, project, focal, plates, n, flat, out, rim, off, seen):
+            rated[n, 0], rated[n, 1], rated[n, 2] = _rate(seen, mean, edge, noise)
     return rated
 
 
-@njit(cache=True)
-def _look(pictures, project, focal, plate, flat, out, rim, off, seen):  # type: ignore[no-untyped-def]
+@njit(cache=True, nogil=True)
+def _look(pictures, project, focal, plates, n, flat, out, rim, off, seen):  # type: ignore[no-untyped-def]
     """Colours (J, S, 3) into `seen` at `_samples` of a plate (6,), its rim's `off` pixels in and out.
 
     False where a picture doesn't show them all.
     """
     height, width = pictures.shape[1:3]
-    centre, size, across = plate[:3], plate[4:], (-math.sin(plate[3]), math.cos(plate[3]))
+    x, y, z, wide, tall = plates[n, 0], plates[n, 1], plates[n, 2], plates[n, 4], plates[n, 5]
+    right, ahead = -math.sin(plates[n, 3]), math.cos(plates[n, 3])
     for j in range(len(pictures)):
-        m = project[j]
-        pixel = (m[2, 0] * centre[0] + m[2, 1] * centre[1] + m[2, 2] * centre[2] + m[2, 3]) / focal[j]
+        # a place a across and b up from the middle is at pixel (u + a ua + b ub, v + ...) / (w + ...)
+        u = project[j, 0, 0] * x + project[j, 0, 1] * y + project[j, 0, 2] * z + project[j, 0, 3]
+        v = project[j, 1, 0] * x + project[j, 1, 1] * y + project[j, 1, 2] * z + project[j, 1, 3]
+        w = project[j, 2, 0] * x + project[j, 2, 1] * y + project[j, 2, 2] * z + project[j, 2, 3]
+        ua, ub = project[j, 0, 0] * right + project[j, 0, 1] * ahead, project[j, 0, 2]
+        va, vb = project[j, 1, 0] * right + project[j, 1, 1] * ahead, project[j, 1, 2]
+        wa, wb = project[j, 2, 0] * right + project[j, 2, 1] * ahead, project[j, 2, 2]
+        step = off * w / focal[j]
         for i in range(len(flat)):
-            a, b = flat[i, 0] * size[0] / 2, flat[i, 1] * size[1] / 2
+            a, b = flat[i, 0] * wide / 2, flat[i, 1] * tall / 2
             if i < 2 * rim:
-                p, q = out[i, 0] / size[0], out[i, 1] / size[1]
-                step = off * pixel / math.hypot(p, q)
-                a, b = a + step * p, b + step * q
-            x, y, z = centre[0] + a * across[0], centre[1] + a * across[1], centre[2] + b
-            depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
+                p, q = out[i, 0] / wide, out[i, 1] / tall
+                scale = step / math.sqrt(p * p + q * q)
+                a, b = a + scale * p, b + scale * q
+            depth = w + a * wa + b * wb
             if depth < 0.3:
                 return False
-            u = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / depth
-            v = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / depth
-            if not (u >= 0 and v >= 0 and u < width - 1 and v < height - 1):
+            column, row = (u + a * ua + b * ub) / depth, (v + a * va + b * vb) / depth
+            if not (column >= 0 and row >= 0 and column < width - 1 and row < height - 1):
                 return False
-            c, r = int(u), int(v)
-            s, t = u - c, v - r
+            c, r = int(column), int(row)
+            s, t = column - c, row - r
             for k in range(3):
                 upper = pictures[j, r, c, k] * (1 - s) + pictures[j, r, c + 1, k] * s
                 lower = pictures[j, r + 1, c, k] * (1 - s) + pictures[j, r + 1, c + 1, k] * s
@@ -354,23 +377,28 @@ def _look(pictures, project, focal, plate, flat, out, rim, off, seen):  # type: 
     return True
 
 
-@njit(cache=True)
-def _rate(seen, rim, noise):  # type: ignore[no-untyped-def]
-    """As `CloseUps.clear`, of colours (J, S, 3): `rim` just inside, `rim` just outside, and the face's."""
+@njit(cache=True, nogil=True)
+def _rate(seen, mean, edge, noise):  # type: ignore[no-untyped-def]
+    """As `CloseUps.clear`, of colours (J, S, 3): just inside of the rim, just outside, and the face's.
+
+    `mean` (S, 3) and `edge` (rim,) are room to work in.
+    """
     count, places, _ = seen.shape
-    mean = np.zeros((places, 3))
-    for j in range(count):
-        mean += seen[j] / count
-    whole = np.zeros(3)
-    for i in range(2 * rim, places):
-        whole += mean[i] / (places - 2 * rim)
+    rim = len(edge)
     told, apart = 0.0, 0.0
-    for i in range(2 * rim, places):
-        for k in range(3):
-            told += (mean[i, k] - whole[k]) ** 2 + noise**2
+    for k in range(3):
+        whole = 0.0
+        for i in range(places):
+            total = 0.0
+            for j in range(count):
+                total += seen[j, i, k]
+            mean[i, k] = total / count
+            if i >= 2 * rim:
+                whole += mean[i, k] / (places - 2 * rim)
+        for i in range(2 * rim, places):
+            told += (mean[i, k] - whole) ** 2 + noise**2
             for j in range(count):
                 apart += (seen[j, i, k] - mean[i, k]) ** 2 / count
-    edge = np.zeros(rim)
     for i in range(rim):
         contrast, spread = 0.0, 0.0
         for j in range(count):
