@@ -81,6 +81,8 @@ LANE = 3.0
 """Metres."""
 CARVED = 0.3
 """Share of a thing's points near which others moved, from which on all of it moved."""
+MOSTLY = 0.5
+"""Share of a standing person's points that are told to be one's, at least: bins and posts are told so in part."""
 
 
 @dataclass(frozen=True)
@@ -225,6 +227,22 @@ def remains(scan: Scan) -> Ints:
 
 def people(scan: Scan) -> list[Thing]:
     """Clusters of a person's size that are told to be persons, whole."""
+    return [thing for thing in _of_a_persons_size(scan) if _is_person(scan, thing)]
+
+
+def no_people(scan: Scan) -> Ints:
+    """Indices of points that are told to be persons', in things of their size that most votes take for another."""
+    found = [thing.index for thing in _of_a_persons_size(scan) if not _is_person(scan, thing)]
+    index = np.unique(np.concatenate([*found, np.zeros(0, np.int64)]))
+    return index[scan.label[index] == CODE["person"]]
+
+
+def _is_person(scan: Scan, thing: Thing) -> bool:
+    return thing.moved or float((scan.label[thing.index] == CODE["person"]).mean()) > MOSTLY
+
+
+def _of_a_persons_size(scan: Scan) -> list[Thing]:
+    """All of that size of which some points are told to be a person's."""
     tree = cKDTree(scan.xyz[:, :2])
     found = []
     for cluster in clusters(scan.xyz, ~scan.ground & (scan.label == CODE["person"]) & (scan.height < 2.3)):

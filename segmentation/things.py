@@ -113,7 +113,7 @@ def decide(
     if own:
         return numbered, cloud.label
     thin = scan.label.copy()
-    back = instances.no_vehicles(scan, found)
+    back = np.union1d(instances.no_vehicles(scan, found), instances.no_people(scan))
     thin[back] = other_class(scan, back)
     for thing in found:
         thin[thing.index] = CODE["person" if thing.kind == "person" else "vehicle"]
@@ -166,7 +166,7 @@ def look(thin: PointCloud, sure: U8, source: U8, moving: F32, moments: tuple[F64
 
 
 def other_class(scan: Scan, index: Ints) -> U8:
-    """The classes (K,) of points that are of no vehicle: of the nearest on the ground, or above it, that is of none."""
+    """The classes (K,) of points that are of no thing: of the nearest on the ground, or above it, that is of none."""
     import numpy as np
     from scipy.spatial import cKDTree
 
@@ -216,4 +216,4 @@ def _movable() -> tuple[int, int]:
     return CODE["vehicle"], CODE["person"]
 
 
-THINGS = Step("things", 2, things, ThingsParams)
+THINGS = Step("things", 3, things, ThingsParams)

@@ -174,6 +174,19 @@ def test_people_are_whole(tmp_path: Path) -> None:
     assert (told(done, person)["0"][person[:, 2] > 0.25] == CODE["person"]).mean() > 0.98
 
 
+def test_a_post_that_is_told_to_be_a_person_in_part_stays(tmp_path: Path) -> None:
+    post = shell((0.4, 0.3, 0.95), (4, -3), 0.0)
+    inputs = street(tmp_path, person=post)
+    cloud = PointCloud.load(inputs["cloud"])
+    assert cloud.label is not None
+    label = cloud.label.copy()
+    label[len(label) - len(post) // 3 :] = CODE["person"]
+    replace(cloud, label=label).save(inputs["cloud"])
+    done = go(inputs, tmp_path)
+    assert done.facts["people"] == 0
+    assert not np.isin(told(done, post)["0"], [CODE["person"], VEHICLE]).any()
+
+
 def test_without_a_path_nothing_is_looked_at(tmp_path: Path) -> None:
     inputs = street(tmp_path)
     done = go({"cloud": inputs["cloud"], "confidence": inputs["confidence"]}, tmp_path)
