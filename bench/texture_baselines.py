@@ -14,9 +14,10 @@ import numpy as np
 from numba import njit, prange
 
 from bench.texture_scenes import Scene
-from scan2sim.pipeline.cameras import EQUIRECTANGULAR, MODEL_ID, parameters, pixel_angle, project_point
+from scan2sim.pipeline.cameras import EQUIRECTANGULAR
 from scan2sim.pipeline.io import image
-from scan2sim.pipeline.range_image import is_visible
+from scan2sim.pipeline.looking import eye, is_seen, pixel_of, sighted, to_camera, turned
+from scan2sim.pipeline.sampling import bilinear
 from scan2sim.pipeline.types import U8, Mesh
 from scan2sim.pipeline.visibility import BIAS, load_depth_map
 from scan2sim.texturing import blend, fill
@@ -104,8 +105,7 @@ def _paint(scene: Scene, out: Path, *, only_nearest: bool) -> None:
             assert photo is not None
             depth = load_depth_map(scene.depth / f"{i}.npy", view.camera, view.T_world_cam)
             _add(
-                total, places, normals[faces], face, photo, MODEL_ID[view.camera.model], parameters(view.camera),
-                depth.range, parameters(depth.camera), pixel_angle(depth.camera), np.linalg.inv(view.T_world_cam),
+                total, places, normals[faces], face, photo, eye(view.camera, view.T_world_cam), depth.ranges,
                 BIAS, MAX_DISTANCE, MIN_COS, only_nearest,
             )  # fmt: skip
         rgb, seen = np.zeros((height, width, 3), np.uint8), np.zeros((height, width), np.uint8)
@@ -132,51 +132,29 @@ def _places(flat, corners, face, rows, columns):  # type: ignore[no-untyped-def]
     return out
 
 
-@njit(cache=True)
-def _bilinear(photo, u, v, k):  # type: ignore[no-untyped-def]
-    """A channel of a photo (H, W, 3) between its pixels; held at the borders, a panorama's seam too."""
-    height, width = photo.shape[:2]
-    a, c = int(min(max(math.floor(u), 0), width - 2)), int(min(max(math.floor(v), 0), height - 2))
-    x, y = min(max(u - a, 0.0), 1.0), min(max(v - c, 0.0), 1.0)
-    upper = photo[c, a, k] * (1 - x) + photo[c, a + 1, k] * x
-    lower = photo[c + 1, a, k] * (1 - x) + photo[c + 1, a + 1, k] * x
-    return upper * (1 - y) + lower * y
-
-
-@njit(cache=True)
-def _turned(T, a, w):  # type: ignore[no-untyped-def]
-    """The point (w 1) or direction (w 0) in the axes that T leads to."""
-    return (
-        T[0, 0] * a[0] + T[0, 1] * a[1] + T[0, 2] * a[2] + T[0, 3] * w,
-        T[1, 0] * a[0] + T[1, 1] * a[1] + T[1, 2] * a[2] + T[1, 3] * w,
-        T[2, 0] * a[0] + T[2, 1] * a[1] + T[2, 2] * a[2] + T[2, 3] * w,
-    )
-
-
 @njit(cache=True, parallel=True)
 def _add(  # type: ignore[no-untyped-def]
-    total, places, normals, face, photo, model, p, depth, depth_p, pixel, T, bias, max_distance, min_cos, only_nearest
+    total, places, normals, face, photo, eye, ranges, bias, max_distance, min_cos, only_nearest
 ):
     """Add a photo's weighted colour to the texels (N, 4) that it sees, or put it in the place of a farther one's."""
     for i in prange(len(places)):
-        x, y, z = _turned(T, places[i], 1.0)
-        nx, ny, nz = _turned(T, normals[face[i]], 0.0)
-        d2 = x * x + y * y + z * z
-        if d2 > max_distance * max_distance or -(x * nx + y * ny + z * nz) < min_cos * math.sqrt(d2):
+        place, normal = places[i], normals[face[i]]
+        x, y, z = to_camera(eye.T, place[0], place[1], place[2])
+        nx, ny, nz = turned(eye.T, normal[0], normal[1], normal[2])
+        r, cos = sighted(eye, x, y, z, nx, ny, nz)
+        if r > max_distance or cos < min_cos:
             continue
-        u, v, ok = project_point(model, p, x, y, z)
-        wide = model == EQUIRECTANGULAR
-        if not ok or v < -0.5 or v >= p[13] - 0.5 or ((u < -0.5 or u >= p[12] - 0.5) and not wide):
+        u, v, ok = pixel_of(eye, x, y, z)
+        if not ok or not is_seen(eye, ranges, u, v, r, cos, bias):
             continue
-        if not is_visible(depth, model, depth_p, pixel, bias, x, y, z, nx, ny, nz):
-            continue
-        w = 1.0 / d2
+        w = 1.0 / (r * r)
         if only_nearest:
             if w <= total[i, 3]:
                 continue
             total[i, :] = 0
+        rgb = bilinear(photo, u, v, eye.model == EQUIRECTANGULAR)
         for k in range(3):
-            total[i, k] += w * _bilinear(photo, u, v, k)
+            total[i, k] += w * rgb[k]
         total[i, 3] += w
 
 

@@ -68,6 +68,12 @@ def project(camera: Camera, points_cam: npt.ArrayLike) -> tuple[F32, npt.NDArray
         uv (N, 2) float32 pixels, and valid (N,) bool: in front of the camera and within the field where
         its distortion holds. Whether a pixel lies within the image is not looked at (`inside`).
     """
+    uv, valid = project_exactly(camera, points_cam)
+    return uv.astype(np.float32), valid
+
+
+def project_exactly(camera: Camera, points_cam: npt.ArrayLike) -> tuple[F64, npt.NDArray[np.bool_]]:
+    """`project` in float64, for differences of pixels."""
     points = np.ascontiguousarray(points_cam, np.float64).reshape(-1, 3)
     return _project(MODEL_ID[camera.model], parameters(camera), points)
 
@@ -92,9 +98,10 @@ def ray_origins(camera: Camera, uv: npt.ArrayLike) -> F64:
 
 
 def inside(camera: Camera, uv: npt.NDArray[np.floating]) -> npt.NDArray[np.bool_]:
-    """(N,) whether pixels (N, 2) lie within the image, its half-pixel border included."""
+    """(N,) whether pixels (N, 2) lie within the image, its half-pixel border included; a panorama's sides are none."""
     u, v = uv[:, 0], uv[:, 1]
-    return (u >= -0.5) & (u < camera.width - 0.5) & (v >= -0.5) & (v < camera.height - 0.5)
+    across = (u >= -0.5) & (u < camera.width - 0.5) | (camera.model == "equirectangular")
+    return across & (v >= -0.5) & (v < camera.height - 0.5)
 
 
 def pixel_angle(camera: Camera) -> float:
@@ -221,7 +228,7 @@ def _undistort(p, xd, yd):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, parallel=True)
 def _project(model, p, points):  # type: ignore[no-untyped-def]
-    uv = np.empty((len(points), 2), np.float32)
+    uv = np.empty((len(points), 2))
     valid = np.empty(len(points), np.bool_)
     for i in prange(len(points)):
         u, v, ok = project_point(model, p, points[i, 0], points[i, 1], points[i, 2])

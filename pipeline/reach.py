@@ -13,8 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
-from scan2sim.pipeline.cameras import EQUIRECTANGULAR, MODEL_ID, parameters, pixel_angle, project_point
-from scan2sim.pipeline.range_image import is_visible
+from scan2sim.pipeline.looking import eye, is_seen, pixel_of, sighted, to_camera, turned
 from scan2sim.pipeline.step import Report, silent
 from scan2sim.pipeline.types import F32, F64, PointCloud, View
 from scan2sim.pipeline.visibility import depth_map, scene
@@ -43,35 +42,26 @@ def finest(cloud: PointCloud, views: Sequence[View], *, size: float, coarsest: f
     for i, view in enumerate(views):
         report(i / len(views), view.name)
         depth = depth_map(view.camera, view.T_world_cam, hides, time=view.time, pixels=PIXELS)
-        _refine(
-            patch, cloud.xyz, cloud.normal, np.linalg.inv(view.T_world_cam), MODEL_ID[view.camera.model],
-            parameters(view.camera), pixel_angle(view.camera), depth.range, parameters(depth.camera),
-            pixel_angle(depth.camera), size, coarsest,
-        )  # fmt: skip
+        sees = eye(view.camera, view.T_world_cam)
+        _refine(patch, cloud.xyz, cloud.normal, sees, depth.ranges, size, coarsest)
     return patch
 
 
 @njit(cache=True, parallel=True)
-def _refine(patch, xyz, normals, T, model, p, angle, depth, depth_p, depth_angle, bias, coarsest):  # type: ignore[no-untyped-def]
+def _refine(patch, xyz, normals, eye, ranges, bias, coarsest):  # type: ignore[no-untyped-def]
     """Lower `patch` in place to what one photo's pixels cover, where that photo sees the point."""
     for i in prange(len(patch)):
-        a, b, c = np.float64(xyz[i, 0]), np.float64(xyz[i, 1]), np.float64(xyz[i, 2])
-        x = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]
-        y = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3]
-        z = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3]
+        x, y, z = to_camera(eye.T, xyz[i, 0], xyz[i, 1], xyz[i, 2])
         r = math.sqrt(x * x + y * y + z * z)
-        if angle * r >= min(coarsest, patch[i]) or r < 1e-3:
+        if eye.pixel * r >= min(coarsest, patch[i]) or r < 1e-3:
             continue
-        u, v, ok = project_point(model, p, x, y, z)
-        if not ok or v < -0.5 or v >= p[13] - 0.5 or ((u < -0.5 or u >= p[12] - 0.5) and model != EQUIRECTANGULAR):
+        u, v, ok = pixel_of(eye, x, y, z)
+        if not ok:
             continue
-        e, f, g = normals[i, 0], normals[i, 1], normals[i, 2]
-        nx = T[0, 0] * e + T[0, 1] * f + T[0, 2] * g
-        ny = T[1, 0] * e + T[1, 1] * f + T[1, 2] * g
-        nz = T[2, 0] * e + T[2, 1] * f + T[2, 2] * g
-        cos = max(abs(x * nx + y * ny + z * nz) / r, LEAST_COS)
-        side = angle * r / math.sqrt(cos)
-        if side < patch[i] and is_visible(depth, model, depth_p, depth_angle, bias, x, y, z, nx, ny, nz):
+        nx, ny, nz = turned(eye.T, normals[i, 0], normals[i, 1], normals[i, 2])
+        r, cos = sighted(eye, x, y, z, nx, ny, nz)
+        side = eye.pixel * r / math.sqrt(max(abs(cos), LEAST_COS))
+        if side < patch[i] and is_seen(eye, ranges, u, v, r, cos, bias):
             patch[i] = side
 
 

@@ -18,13 +18,16 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from scan2sim.pipeline.classes import CODE
 from scan2sim.pipeline.types import F32, F64, Camera, Mesh, PointCloud
+
+if TYPE_CHECKING:
+    from scan2sim.pipeline.looking import Ranges
 
 BIAS = 0.04
 """Metres that a point may lie behind what the range image shows and still count as seen."""
@@ -90,6 +93,14 @@ class DepthMap:
     camera: Camera
     T_world_cam: F64
     range: F32
+
+    @property
+    def ranges(self) -> Ranges:
+        """As kernels take it."""
+        from scan2sim.pipeline.cameras import pixel_angle
+        from scan2sim.pipeline.looking import Ranges
+
+        return Ranges(self.range, pixel_angle(self.camera))
 
 
 def scene(
@@ -223,10 +234,11 @@ def depth_map(
         pixels: the camera is scaled to at most this many, and to at most `ENLARGED` times its width.
     """
     from scan2sim.pipeline import range_image
-    from scan2sim.pipeline.cameras import MODEL_ID, parameters, pixel_rays, ray_origins
+    from scan2sim.pipeline.cameras import pixel_rays, ray_origins
+    from scan2sim.pipeline.looking import eye
 
     camera = camera.scaled(min(ENLARGED, math.sqrt(pixels / (camera.width * camera.height))))
-    model, p, rays = MODEL_ID[camera.model], parameters(camera), pixel_rays(camera)
+    rays = pixel_rays(camera)
     T_world_cam = np.asarray(T_world_cam, np.float64)
     depth = np.full((camera.height, camera.width), np.inf, np.float32)
     if hides.triangles:
@@ -245,9 +257,8 @@ def depth_map(
     if time is not None:
         there = np.isnan(hides.spans[:, 0]) | ((time > hides.spans[:, 0]) & (time < hides.spans[:, 1]))
     if there.any():
-        T_cam_world: F64 = np.linalg.inv(T_world_cam).astype(np.float64)
         centres, normals, radii = hides.centres[there], hides.normals[there], hides.radii[there]
-        range_image.draw_discs(depth, rays, model, p, T_cam_world, centres, normals, radii)
+        range_image.draw_discs(depth, rays, eye(camera, T_world_cam), centres, normals, radii)
     return DepthMap(camera, T_world_cam, depth)
 
 
@@ -269,18 +280,8 @@ def visible(
         normals: (N, 3) unit, of the surface at the points; either side; None: seen head-on.
         bias: metres allowed behind the range image, before the slope's share.
     """
-    from scan2sim.pipeline import range_image
-    from scan2sim.pipeline.cameras import MODEL_ID, parameters, pixel_angle
+    from scan2sim.pipeline.looking import eye, places_seen
 
     points = np.ascontiguousarray(points, np.float64).reshape(-1, 3)
     facing = np.zeros((0, 3)) if normals is None else np.ascontiguousarray(normals, np.float64).reshape(-1, 3)
-    return range_image.points_visible(
-        depth.range,
-        MODEL_ID[depth.camera.model],
-        parameters(depth.camera),
-        np.linalg.inv(depth.T_world_cam),
-        points,
-        facing,
-        bias,
-        pixel_angle(depth.camera),
-    )
+    return places_seen(eye(depth.camera, depth.T_world_cam), depth.ranges, points, facing, bias)

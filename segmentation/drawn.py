@@ -11,8 +11,9 @@ from functools import cached_property
 import numpy as np
 from numba import njit
 
-from scan2sim.pipeline.cameras import EQUIRECTANGULAR, MODEL_ID, parameters, pixel_angle, project_point
+from scan2sim.pipeline.cameras import EQUIRECTANGULAR, project_point
 from scan2sim.pipeline.channels import FAR, FRACTION, coded, level
+from scan2sim.pipeline.looking import eye, to_camera
 from scan2sim.pipeline.types import F32, I32, U8, Camera, PointCloud, View
 
 NEIGHBOURS = 12
@@ -53,10 +54,7 @@ class Drawn:
         camera = resized(view.camera, size)
         nearest = np.full((camera.height, camera.width), -1, np.int32)
         distance = np.full(nearest.shape, np.inf, np.float32)
-        _draw(
-            nearest, distance, self._xyz, np.linalg.inv(view.T_world_cam), MODEL_ID[camera.model],
-            parameters(camera), 0.5 * self._size / pixel_angle(camera),
-        )  # fmt: skip
+        _draw(nearest, distance, self._xyz, eye(camera, view.T_world_cam), self._size)
         return nearest, distance
 
 
@@ -66,19 +64,16 @@ def resized(camera: Camera, size: tuple[int, int]) -> Camera:
 
 
 @njit(cache=True)
-def _draw(nearest, distance, xyz, T, model, p, half):  # type: ignore[no-untyped-def]
-    """Which point each pixel shows: the nearest of the squares over it; `half`: of a square at a metre, pixels."""
+def _draw(nearest, distance, xyz, eye, size):  # type: ignore[no-untyped-def]
+    """Which point each pixel shows: the nearest of the squares over it, whose sides are `size` metres."""
     rows, columns = nearest.shape
-    wide = model == EQUIRECTANGULAR
+    wide, half = eye.model == EQUIRECTANGULAR, 0.5 * size / eye.pixel
     for i in range(len(xyz)):
-        a, b, c = np.float64(xyz[i, 0]), np.float64(xyz[i, 1]), np.float64(xyz[i, 2])
-        x = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]
-        y = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3]
-        z = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3]
+        x, y, z = to_camera(eye.T, xyz[i, 0], xyz[i, 1], xyz[i, 2])
         far = math.sqrt(x * x + y * y + z * z)
         if far < 0.5 or far > FAR:
             continue
-        u, v, ok = project_point(model, p, x, y, z)
+        u, v, ok = project_point(eye.model, eye.p, x, y, z)  # squares may reach into the image from beside it
         if not ok:
             continue
         reach = half / far

@@ -6,7 +6,6 @@ texturing. A vote for the sky on a point that is there proves a projection wrong
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,8 +13,9 @@ from pathlib import Path
 import numpy as np
 from numba import njit, prange
 
-from scan2sim.pipeline.cameras import EQUIRECTANGULAR, MODEL_ID, parameters, pixel_angle, project_point
-from scan2sim.pipeline.range_image import is_visible
+from scan2sim.pipeline.cameras import EQUIRECTANGULAR
+from scan2sim.pipeline.looking import eye, is_seen, pixel_of, sighted, to_camera, turned
+from scan2sim.pipeline.sampling import allows, mixed, rescaled, taps
 from scan2sim.pipeline.step import Report, silent
 from scan2sim.pipeline.types import F32, PointCloud, View
 from scan2sim.pipeline.visibility import depth_map, scene
@@ -73,13 +73,9 @@ def vote(
         file = labels / f"{i}.npy"
         if not file.is_file():
             continue
-        camera = view.camera
-        depth = depth_map(camera, view.T_world_cam, hides, time=view.time, pixels=PIXELS)
-        told = _ask(
-            score, weight, cloud.xyz, cloud.normal, np.linalg.inv(view.T_world_cam), np.load(file),
-            MODEL_ID[camera.model], parameters(camera), depth.range, parameters(depth.camera),
-            pixel_angle(depth.camera), _mask(view),
-        )  # fmt: skip
+        depth = depth_map(view.camera, view.T_world_cam, hides, time=view.time, pixels=PIXELS)
+        sees = eye(view.camera, view.T_world_cam)
+        told = _ask(score, weight, cloud.xyz, cloud.normal, sees, depth.ranges, np.load(file), _mask(view))
         seen, sky = seen + int(told[0]), sky + int(told[1])
     return Votes(score, weight, sky / seen if seen else 0.0)
 
@@ -92,57 +88,32 @@ def _mask(view: View) -> np.ndarray:
 
 
 @njit(cache=True, parallel=True)
-def _ask(score, weight, xyz, normals, T, labels, model, p, depth, depth_p, pixel, mask):  # type: ignore[no-untyped-def]
+def _ask(score, weight, xyz, normals, eye, ranges, labels, mask):  # type: ignore[no-untyped-def]
     """Add a photo's votes in place; returns (points seen, those that it takes for sky)."""
     n, classes = score.shape
-    wide = model == EQUIRECTANGULAR
-    rows, columns = labels.shape[0], labels.shape[1]
     kind = np.zeros(n, np.uint8)
     for i in prange(n):
-        a, b, c = np.float64(xyz[i, 0]), np.float64(xyz[i, 1]), np.float64(xyz[i, 2])
-        x = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]
-        y = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3]
-        z = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3]
+        x, y, z = to_camera(eye.T, xyz[i, 0], xyz[i, 1], xyz[i, 2])
         d2 = x * x + y * y + z * z
         if not 0.25 < d2 < FAR * FAR:
             continue
-        u, v, ok = project_point(model, p, x, y, z)
-        if not ok or v < -0.5 or v >= p[13] - 0.5 or ((u < -0.5 or u >= p[12] - 0.5) and not wide):
+        u, v, ok = pixel_of(eye, x, y, z)
+        if not ok or not allows(mask, eye.p, u, v):
             continue
-        if mask.shape[0] > 0 and mask[int(v + 0.5), int(u + 0.5) % mask.shape[1]] == 0:
+        nx, ny, nz = turned(eye.T, normals[i, 0], normals[i, 1], normals[i, 2])
+        distance, cos = sighted(eye, x, y, z, nx, ny, nz)
+        if not is_seen(eye, ranges, u, v, distance, cos, BIAS):
             continue
-        e, f, g = normals[i, 0], normals[i, 1], normals[i, 2]
-        nx = T[0, 0] * e + T[0, 1] * f + T[0, 2] * g
-        ny = T[1, 0] * e + T[1, 1] * f + T[1, 2] * g
-        nz = T[2, 0] * e + T[2, 1] * f + T[2, 2] * g
-        if not is_visible(depth, model, depth_p, pixel, BIAS, x, y, z, nx, ny, nz):
-            continue
-        distance = math.sqrt(d2)
-        cos = abs(x * nx + y * ny + z * nz) / distance
-        w = (0.2 + 0.8 * cos) / (1 + d2 / (NEAR * NEAR))
-        s, t = (u + 0.5) * columns / p[12] - 0.5, (v + 0.5) * rows / p[13] - 0.5
-        s0, t0 = math.floor(s), math.floor(t)
-        fs, ft = s - s0, t - t0
-        a0, a1, b0, b1 = int(s0), int(s0) + 1, int(t0), int(t0) + 1
-        if wide:
-            a0, a1 = a0 % columns, a1 % columns
-        else:
-            a0, a1 = min(max(a0, 0), columns - 1), min(max(a1, 0), columns - 1)
-        b0, b1 = min(max(b0, 0), rows - 1), min(max(b1, 0), rows - 1)
-        w00, w10, w01, w11 = (1 - fs) * (1 - ft), fs * (1 - ft), (1 - fs) * ft, fs * ft
-        up = (
-            labels[b0, a0, SKY] * w00 + labels[b0, a1, SKY] * w10
-            + labels[b1, a0, SKY] * w01 + labels[b1, a1, SKY] * w11
-        ) / 255.0  # fmt: skip
+        w = (0.2 + 0.8 * abs(cos)) / (1 + d2 / (NEAR * NEAR))
+        s, t = rescaled(eye.p, u, v, labels)
+        at = taps(labels, s, t, eye.model == EQUIRECTANGULAR)
+        up = mixed(labels, SKY, at) / 255.0
         if up > 0.5:
             kind[i] = 2
             continue
         kind[i] = 1
         for k in range(classes):
             if k != SKY:
-                score[i, k] += w * (
-                    labels[b0, a0, k] * w00 + labels[b0, a1, k] * w10
-                    + labels[b1, a0, k] * w01 + labels[b1, a1, k] * w11
-                ) / 255.0  # fmt: skip
+                score[i, k] += w * mixed(labels, k, at) / 255.0
         weight[i] += w * (1 - up)
     return (kind > 0).sum(), (kind == 2).sum()

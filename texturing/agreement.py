@@ -414,4 +414,4 @@ def _facts(rows: Sequence[dict[str, Any]], used: Sequence[int]) -> dict[str, Any
     }
 
 
-AGREEMENT = Step("agreement", 2, agreement, AgreementParams)
+AGREEMENT = Step("agreement", 3, agreement, AgreementParams)

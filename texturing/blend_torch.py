@@ -14,15 +14,15 @@ from torch import Tensor
 
 from scan2sim.pipeline.cameras import ALIKE, EQUIRECTANGULAR, FISHEYE, OPENCV, ORTHOGRAPHIC
 from scan2sim.pipeline.errors import SettingError
-from scan2sim.pipeline.range_image import MAX_SLOPE, SLOPE_SHARE
+from scan2sim.pipeline.looking import MAX_SLOPE, SLOPE_SHARE
 from scan2sim.texturing.blend import EDGE, WHITE
 from scan2sim.texturing.photos import OFFSET
 
 if TYPE_CHECKING:
     import numpy.typing as npt
 
-    from scan2sim.pipeline.types import F32, F64, I32, U8
-    from scan2sim.texturing.blend import Look, Weighing
+    from scan2sim.pipeline.types import F32, F64, U8
+    from scan2sim.texturing.blend import Laid, Look, Weighing
 
 CHUNK = 2_000_000
 """Texels that are worked on at a time: some 500 MB."""
@@ -32,15 +32,14 @@ class TorchRows:
     """Rows of a page that photos are added to; as `blend.Rows`.
 
     Args:
-        owner: (H, W) the face of each texel, index into the next three; -1 where none.
-        flat, corners, normals: (F, 3, 2) texels, (F, 3, 3) metres and (F, 3) unit.
+        laid: the faces on them.
         device: of torch, as "cuda" or "cpu".
 
     Raises:
         SettingError: this torch has no such device.
     """
 
-    def __init__(self, owner: I32, flat: F32, corners: F32, normals: F32, device: str) -> None:
+    def __init__(self, laid: Laid, device: str) -> None:
         try:
             self._device = torch.zeros(1, device=device).device
         except (RuntimeError, AssertionError) as error:
@@ -48,13 +47,13 @@ class TorchRows:
             raise SettingError(
                 "texture.device", f"torch can't use {device!r} ({reason})", 'Say "numba", or "auto"'
             ) from None
-        self._shape = owner.shape
-        owned = np.flatnonzero(owner.ravel() >= 0)
+        self._shape = laid.owner.shape
+        owned = np.flatnonzero(laid.owner.ravel() >= 0)
         self._texel = self._to(owned)
-        self._face = self._to(owner.ravel()[owned].astype(np.int64))
-        self._flat, self._normal = self._to(flat).double(), self._to(normals).double()
-        self._origin, self._per_x, self._per_y, self._flat_enough = _frames(self._flat, self._to(corners).double())
-        self._low, self._detail = (torch.zeros((owner.size, 4), device=self._device) for _ in range(2))
+        self._face = self._to(laid.owner.ravel()[owned].astype(np.int64))
+        self._flat, self._normal = self._to(laid.flat).double(), self._to(laid.normals).double()
+        self._origin, self._per_x, self._per_y, self._flat_enough = _frames(self._flat, self._to(laid.corners).double())
+        self._low, self._detail = (torch.zeros((laid.owner.size, 4), device=self._device) for _ in range(2))
 
     def add(self, faces: npt.NDArray[np.int64], share: F32, look: Look, weighing: Weighing) -> int:
         """Add what one photo says of `faces` (N,), its share of their detail (N, 3); returns the texels it sees."""
@@ -77,32 +76,33 @@ class TorchRows:
         return torch.from_numpy(np.ascontiguousarray(array)).to(self._device)
 
     def _add(self, part: Tensor, which: Tensor, share: Tensor, photo: Sampled, look: Look, weighing: Weighing) -> int:
-        p, g = look.parameters, weighing
-        wide = look.model == EQUIRECTANGULAR
-        R, t = self._to(look.R), self._to(look.t)
+        eye, p, g = look.eye, look.eye.p, weighing
+        wide = eye.model == EQUIRECTANGULAR
+        T = self._to(eye.T)
+        R, t = T[:3, :3], T[:3, 3]
         texel, f = self._texel[part], self._face[part]
         tx, ty = (texel % self._shape[1]).double()[:, None], (texel // self._shape[1]).double()[:, None]
         per_x, per_y = self._per_x @ R.T, self._per_y @ R.T
         at = (self._origin @ R.T + t)[f] + tx * per_x[f] + ty * per_y[f]
         normal = (self._normal @ R.T)[f]
         focal = p[12] / (2 * math.pi) if wide else min(p[0], p[1])
-        if look.model == ORTHOGRAPHIC:  # how far away it is says nothing of how large its pixels are
+        if eye.model == ORTHOGRAPHIC:  # how far away it is says nothing of how large its pixels are
             distance, cos, far = at[:, 2], -normal[:, 2], torch.ones_like(at[:, 2])
             alike = far * (ALIKE / focal)
         else:
             distance = alike = far = at.norm(dim=1)
             cos = -(at * normal).sum(dim=1) / distance
-        u, v, ok = _project(look.model, p, at)
+        u, v, ok = _project(eye.model, p, at)
         ok &= (v >= -0.5) & (v < p[13] - 0.5) & (cos >= 0.5 * g.min_cos)
         if not wide:
             ok &= (u >= -0.5) & (u < p[12] - 0.5)
         u, v = torch.where(ok, u, 0.0), torch.where(ok, v, 0.0)
         ok &= photo.allows(u, v)
-        rows, columns = look.depth.shape
+        rows, columns = look.hides.first.shape
         column = ((u + 0.5) * (columns / p[12])).long().clamp(0, columns - 1)
         row = ((v + 0.5) * (rows / p[13])).long().clamp(0, rows - 1)
-        lean = _slope(cos) * far * look.pixel
-        ok &= distance <= photo.depth[row, column] + g.bias + SLOPE_SHARE * lean
+        lean = _slope(cos) * far * look.hides.pixel
+        ok &= distance <= photo.first[row, column] + g.bias + SLOPE_SHARE * lean
         keep = torch.nonzero(ok).ravel()
         texel, f, tx, ty, u, v = (a[keep] for a in (texel, f, tx, ty, u, v))
         row, column, lean, distance, cos, far, alike = (a[keep] for a in (row, column, lean, distance, cos, far, alike))
@@ -111,10 +111,10 @@ class TorchRows:
         if not wide:
             border = torch.minimum(border, torch.minimum(u + 0.5, p[12] - 0.5 - u))
         whole = (cos * cos / alike**2) ** g.power * (0.02 + 0.98 * (border / g.feather).clamp(max=1.0))
-        apart = distance > photo.apart[row, column] + g.bias + (look.reach + 0.5) * lean
+        apart = distance > photo.apart[row, column] + g.bias + (look.hides.reach + 0.5) * lean
         weight = torch.where(apart, whole * EDGE, whole)
-        factor = torch.exp(self._to(look.exposure[:3])) * photo.vignette(u, v)[:, None]
-        if look.warp.shape[0]:
+        factor = torch.exp(self._to(look.shown.exposure[:3])) * photo.vignette(u, v)[:, None]
+        if look.shown.warp.shape[0]:
             u, v = photo.warped(u, v)
         size = torch.maximum((per_x**2).sum(dim=1), (per_y**2).sum(dim=1)).sqrt()[f]
         chosen = (share.sum(dim=1) > 0)[which[f]]
@@ -145,18 +145,19 @@ class Sampled:
     """A photo on the device, and lookups in it by pixel (u, v)."""
 
     def __init__(self, look: Look, to: Any) -> None:
-        self._p, self._wide, self._exposure = look.parameters, look.model == EQUIRECTANGULAR, look.exposure
-        self._levels = [to(level) for level in look.photo.levels]
-        self._low, self._mask, self._warp = to(look.photo.low), to(look.mask), to(look.warp)
-        self.depth, self.near, self.apart = to(look.depth), to(look.near), to(look.apart)
+        shown, hides = look.shown, look.hides
+        self._p, self._wide, self._exposure = look.eye.p, look.eye.model == EQUIRECTANGULAR, shown.exposure
+        self._levels = [to(level) for level in (shown.whole, shown.half, shown.quarter)]
+        self._low, self._mask, self._warp = to(shown.low), to(shown.mask), to(shown.warp)
+        self.first, self.near, self.apart = to(hides.first), to(hides.near), to(hides.apart)
 
     def allows(self, u: Tensor, v: Tensor) -> Tensor:
-        """As `blend.mask_allows`."""
+        """As `sampling.allows`."""
         rows, columns = self._mask.shape
         if not rows:
             return torch.ones_like(u, dtype=torch.bool)
-        column = ((u + 0.5) / self._p[12] * columns).long() % columns
-        row = ((v + 0.5) / self._p[13] * rows).long().clamp(0, rows - 1)
+        column = ((u + 0.5) * (columns / self._p[12])).long().clamp(0, columns - 1)
+        row = ((v + 0.5) * (rows / self._p[13])).long().clamp(0, rows - 1)
         return self._mask[row, column] != 0
 
     def vignette(self, u: Tensor, v: Tensor) -> Tensor:
@@ -166,16 +167,13 @@ class Sampled:
         return torch.exp(self._exposure[3] * q + self._exposure[4] * q * q)
 
     def warped(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-        """As `blend.warped`."""
-        height, width = self._warp.shape[:2]
-        by = self._linear(self._warp, (u + 0.5) * width / self._p[12] - 0.5, (v + 0.5) * height / self._p[13] - 0.5)
+        """As `blend._displaced`."""
+        by = self._linear(self._warp, *self._rescaled(u, v, self._warp))
         return u + by[:, 0], v + by[:, 1]
 
     def coarse(self, u: Tensor, v: Tensor) -> Tensor:
         """(M, 3) low frequencies."""
-        height, width = self._low.shape[:2]
-        x, y = (u + 0.5) * (width / self._p[12]) - 0.5, (v + 0.5) * (height / self._p[13]) - 0.5
-        return self._linear(self._low, x, y)
+        return self._linear(self._low, *self._rescaled(u, v, self._low))
 
     def colour(self, u: Tensor, v: Tensor, ratio: Tensor, sharp: Tensor) -> Tensor:
         """(M, 3) colours where a texel is `ratio` pixels wide: sharply sampled where asked, of a halving if wide."""
@@ -185,8 +183,13 @@ class Sampled:
         out[bicubic] = self._cubic(u[bicubic], v[bicubic])
         for k, image in enumerate(self._levels):
             at = (level == k) & ~bicubic
-            out[at] = self._linear(image, (u[at] + 0.5) * 0.5**k - 0.5, (v[at] + 0.5) * 0.5**k - 0.5)
+            out[at] = self._linear(image, *self._rescaled(u[at], v[at], image))
         return out
+
+    def _rescaled(self, u: Tensor, v: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
+        """As `sampling.rescaled`."""
+        height, width = image.shape[:2]
+        return (u + 0.5) * (width / self._p[12]) - 0.5, (v + 0.5) * (height / self._p[13]) - 0.5
 
     def _columns(self, x: Tensor, width: int) -> Tensor:
         return x % width if self._wide else x.clamp(0, width - 1)
@@ -235,7 +238,7 @@ def _frames(flat: Tensor, corners: Tensor) -> tuple[Tensor, Tensor, Tensor, Tens
 
 
 def _slope(cos: Tensor) -> Tensor:
-    """As `range_image.slope_of`."""
+    """The slope in `looking.met`."""
     c = cos.clamp(max=1.0)
     return ((1 - c * c).sqrt() / c.clamp(min=1e-6)).clamp(max=MAX_SLOPE)
 

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from scan2sim.pipeline.cameras import MODEL_ID, parameters, project, project_point, unproject
+from scan2sim.pipeline.cameras import project, project_exactly, unproject
 from scan2sim.pipeline.types import F64, Camera
 from scan2sim.texturing.matches import Matches
 
@@ -179,14 +179,14 @@ def _linearised(found: Matches, place: F64, cameras: Sequence[Camera], poses: F6
         rows = np.flatnonzero(found.view == j)
         R, from_ = poses[j, :3, :3], place[found.of[rows]] - poses[j, :3, 3]
         x = from_ @ R
-        uv, valid = _project(cameras[j], x)
+        uv, valid = project_exactly(cameras[j], x)
         J = np.zeros((len(rows), 2, 3))
         step = 1e-4 * np.linalg.norm(x, axis=1)
         for k in range(3):  # whatever the camera's model
             d = np.zeros_like(x)
             d[:, k] = step
-            ahead, ok_a = _project(cameras[j], x + d)
-            behind, ok_b = _project(cameras[j], x - d)
+            ahead, ok_a = project_exactly(cameras[j], x + d)
+            behind, ok_b = project_exactly(cameras[j], x - d)
             J[:, :, k] = (ahead - behind) / (2 * step[:, None])
             valid &= ok_a & ok_b
         J[~valid] = 0
@@ -199,19 +199,6 @@ def _linearised(found: Matches, place: F64, cameras: Sequence[Camera], poses: F6
         by_pose[rows, :, :3] = by_place[rows] @ turning
         by_pose[rows, :, 3:] = -by_place[rows]
     return residual, by_place, by_pose
-
-
-def _project(camera: Camera, x: F64) -> tuple[F64, npt.NDArray[np.bool_]]:
-    """`cameras.project` in float64: its pixels are rounded too much for differences."""
-    return _project64(MODEL_ID[camera.model], parameters(camera), np.ascontiguousarray(x))
-
-
-@njit(cache=True)
-def _project64(model, p, points):  # type: ignore[no-untyped-def]
-    uv, ok = np.zeros((len(points), 2)), np.zeros(len(points), np.bool_)
-    for i in range(len(points)):
-        uv[i, 0], uv[i, 1], ok[i] = project_point(model, p, points[i, 0], points[i, 1], points[i, 2])
-    return uv, ok
 
 
 def _pairs(found: Matches, count: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int32]]:

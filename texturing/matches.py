@@ -17,13 +17,12 @@ import numpy.typing as npt
 from numba import njit, prange
 
 from scan2sim.pipeline.cameras import (
-    MODEL_ID,
-    parameters,
     pixel_rays,
     project_point,
     unproject,
     unproject_pixel,
 )
+from scan2sim.pipeline.looking import eye, to_camera
 from scan2sim.pipeline.types import F64, U8, Camera, View
 from scan2sim.pipeline.visibility import DepthMap, visible
 
@@ -128,11 +127,9 @@ def matches(
         for j in others:
             theirs = pictures[j]
             sees = np.flatnonzero(visible(depth(j), world, facing, bias=BEHIND))
-            to = np.ascontiguousarray(np.linalg.inv(views[j].T_world_cam) @ T)
             found, ok = _find(
-                *mine.levels, *theirs.levels, theirs.usable, at[sees], p[sees], n[sees], to,
-                MODEL_ID[mine.camera.model], parameters(mine.camera),
-                MODEL_ID[theirs.camera.model], parameters(theirs.camera),
+                mine.levels, theirs.levels, theirs.usable, at[sees], p[sees], n[sees],
+                eye(mine.camera, T), eye(theirs.camera, views[j].T_world_cam, T),
             )  # fmt: skip
             of.append(total + sees[ok])
             seen_by.append(np.full(int(ok.sum()), j))
@@ -220,19 +217,23 @@ def _planes(points):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, parallel=True)
-def _find(  # type: ignore[no-untyped-def]
-    a0, a1, a2, b0, b1, b2, usable, corner, place, normal, T, model_a, p_a, model_b, p_b
-):  # fmt: skip
-    """Pixels (N, 2) at which the second photo shows corners of the first, and whether it was found (N,)."""
+def _find(a, b, usable, corner, place, normal, eye_a, eye_b):  # type: ignore[no-untyped-def]
+    """Pixels (N, 2) at which the second photo shows corners of the first, and whether it was found (N,).
+
+    Args:
+        a, b: `levels` of both pictures; usable: of the second.
+        corner, place, normal: (N, 2) pixels of the first, (N, 3) and (N, 3) in its camera's axes.
+        eye_a, eye_b: of both photos; the second's takes places in the first's axes.
+    """
     found = np.zeros((len(corner), 2))
     good = np.zeros(len(corner), np.bool_)
     for i in prange(len(corner)):
         u, v = corner[i, 0], corner[i, 1]
-        x0, y0, ok = _through_plane(model_a, p_a, u, v, place[i], normal[i], T, model_b, p_b)
-        ax, ay, ok1 = _through_plane(model_a, p_a, u + 2, v, place[i], normal[i], T, model_b, p_b)
-        bx, by, ok2 = _through_plane(model_a, p_a, u - 2, v, place[i], normal[i], T, model_b, p_b)
-        cx, cy, ok3 = _through_plane(model_a, p_a, u, v + 2, place[i], normal[i], T, model_b, p_b)
-        dx, dy, ok4 = _through_plane(model_a, p_a, u, v - 2, place[i], normal[i], T, model_b, p_b)
+        x0, y0, ok = _through_plane(eye_a, u, v, place[i], normal[i], eye_b)
+        ax, ay, ok1 = _through_plane(eye_a, u + 2, v, place[i], normal[i], eye_b)
+        bx, by, ok2 = _through_plane(eye_a, u - 2, v, place[i], normal[i], eye_b)
+        cx, cy, ok3 = _through_plane(eye_a, u, v + 2, place[i], normal[i], eye_b)
+        dx, dy, ok4 = _through_plane(eye_a, u, v - 2, place[i], normal[i], eye_b)
         if not (ok and ok1 and ok2 and ok3 and ok4):
             continue
         A = np.array([[(ax - bx) / 4, (cx - dx) / 4], [(ay - by) / 4, (cy - dy) / 4]])
@@ -240,9 +241,9 @@ def _find(  # type: ignore[no-untyped-def]
         if not SCALES[0] < area < SCALES[1]:  # at an equirectangular photo's seam, too
             continue
         shift = np.zeros(2)  # pixels of the first photo
-        ok = _align(a2, b2, 4.0, u, v, x0, y0, A, shift) >= 0
-        ok = ok and _align(a1, b1, 2.0, u, v, x0, y0, A, shift) >= 0
-        if not ok or _align(a0, b0, 1.0, u, v, x0, y0, A, shift) < ALIKE:
+        ok = _align(a[2], b[2], 4.0, u, v, x0, y0, A, shift) >= 0
+        ok = ok and _align(a[1], b[1], 2.0, u, v, x0, y0, A, shift) >= 0
+        if not ok or _align(a[0], b[0], 1.0, u, v, x0, y0, A, shift) < ALIKE:
             continue
         x = x0 + A[0, 0] * shift[0] + A[0, 1] * shift[1]
         y = y0 + A[1, 0] * shift[0] + A[1, 1] * shift[1]
@@ -253,20 +254,15 @@ def _find(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _through_plane(model_a, p_a, u, v, place, normal, T, model_b, p_b):  # type: ignore[no-untyped-def]
+def _through_plane(eye_a, u, v, place, normal, eye_b):  # type: ignore[no-untyped-def]
     """(u, v, ok): where the second camera has what the first one's pixel shows of a plane (in the first's axes)."""
-    x, y, z = unproject_pixel(model_a, p_a, u, v)
+    x, y, z = unproject_pixel(eye_a.model, eye_a.p, u, v)
     along = x * normal[0] + y * normal[1] + z * normal[2]
     t = (place[0] * normal[0] + place[1] * normal[1] + place[2] * normal[2]) / along if along < -1e-4 else -1.0
     if not t > 0:
         return 0.0, 0.0, False
-    x, y, z = x * t, y * t, z * t
-    return project_point(  # type: ignore[no-any-return]
-        model_b, p_b,
-        T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3],
-        T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3],
-        T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3],
-    )  # fmt: skip
+    x, y, z = to_camera(eye_b.T, x * t, y * t, z * t)
+    return project_point(eye_b.model, eye_b.p, x, y, z)  # type: ignore[no-any-return]
 
 
 @njit(cache=True)

@@ -14,11 +14,12 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
-from scan2sim.pipeline.cameras import EQUIRECTANGULAR, MODEL_ID, parameters, pixel_angle, pixel_rays, project_point
-from scan2sim.pipeline.range_image import is_visible
+from scan2sim.pipeline.cameras import EQUIRECTANGULAR, pixel_angle, pixel_rays
+from scan2sim.pipeline.looking import eye, is_seen, pixel_of, sighted, to_camera, turned
+from scan2sim.pipeline.sampling import allows, halving, read
 from scan2sim.pipeline.types import F32, F64, U8, Camera
 from scan2sim.pipeline.visibility import DepthMap
-from scan2sim.texturing.blend import corrected, mask_allows, sample, vignette
+from scan2sim.texturing.blend import corrected, vignette
 from scan2sim.texturing.photos import Photo
 
 ALIKE = 28.0
@@ -86,12 +87,10 @@ class Predictor:
     def ask(self, photo: Photo, camera: Camera, T_world_cam: F64, depth: DepthMap, exposure: F64) -> None:
         """Add what one photo shows; `exposure` (5,) of `Exposures.of`."""
         s, (max_distance, min_cos, bias) = self._surface, self._limits
-        T = np.linalg.inv(T_world_cam) @ s.T_world_cam
         _look(
-            self._rgb[self._asked], self._weight[self._asked], s.points, s.normals, np.ascontiguousarray(T),
-            photo.levels, photo.mask, MODEL_ID[camera.model], parameters(camera), depth.range,
-            parameters(depth.camera), pixel_angle(depth.camera), pixel_angle(camera), pixel_angle(s.camera),
-            exposure, max_distance, min_cos, bias,
+            self._rgb[self._asked], self._weight[self._asked], s.points, s.normals, pixel_angle(s.camera),
+            photo.levels, photo.mask, eye(camera, T_world_cam, s.T_world_cam), depth.ranges, exposure,
+            max_distance, min_cos, bias,
         )  # fmt: skip
         self._asked += 1
 
@@ -146,11 +145,10 @@ def _normals(points):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, parallel=True)
 def _look(  # type: ignore[no-untyped-def]
-    rgb, weight, points, normals, T, photo, mask, model, p, depth, depth_p, depth_pixel, pixel, own_pixel,
-    exposure, max_distance, min_cos, bias,
+    rgb, weight, points, normals, own_pixel, levels, mask, eye, ranges, exposure, max_distance, min_cos, bias
 ):  # fmt: skip
     height, width = weight.shape
-    wide = model == EQUIRECTANGULAR
+    wide = eye.model == EQUIRECTANGULAR
     factors = (math.exp(exposure[0]), math.exp(exposure[1]), math.exp(exposure[2]))
     for row in prange(height):
         for column in range(width):
@@ -158,33 +156,24 @@ def _look(  # type: ignore[no-untyped-def]
             r2 = a[0] * a[0] + a[1] * a[1] + a[2] * a[2]
             if not 0.01 < r2 < max_distance * max_distance:
                 continue
-            x = T[0, 0] * a[0] + T[0, 1] * a[1] + T[0, 2] * a[2] + T[0, 3]
-            y = T[1, 0] * a[0] + T[1, 1] * a[1] + T[1, 2] * a[2] + T[1, 3]
-            z = T[2, 0] * a[0] + T[2, 1] * a[1] + T[2, 2] * a[2] + T[2, 3]
+            x, y, z = to_camera(eye.T, a[0], a[1], a[2])
             d2 = x * x + y * y + z * z
             if not 0.01 < d2 < max_distance * max_distance:
                 continue
-            u, v, ok = project_point(model, p, x, y, z)
-            if not ok or v < -0.5 or v >= p[13] - 0.5 or ((u < -0.5 or u >= p[12] - 0.5) and not wide):
+            u, v, ok = pixel_of(eye, x, y, z)
+            if not ok:
                 continue
-            nx = T[0, 0] * n[0] + T[0, 1] * n[1] + T[0, 2] * n[2]
-            ny = T[1, 0] * n[0] + T[1, 1] * n[1] + T[1, 2] * n[2]
-            nz = T[2, 0] * n[0] + T[2, 1] * n[1] + T[2, 2] * n[2]
-            distance = math.sqrt(d2)
-            cos = -(x * nx + y * ny + z * nz) / distance
-            if cos < min_cos or not mask_allows(mask, u, v, p):
+            nx, ny, nz = turned(eye.T, n[0], n[1], n[2])
+            distance, cos = sighted(eye, x, y, z, nx, ny, nz)
+            if cos < min_cos or not allows(mask, eye.p, u, v):
                 continue
-            if not is_visible(depth, model, depth_p, depth_pixel, bias, x, y, z, nx, ny, nz):
+            if not is_seen(eye, ranges, u, v, distance, cos, bias):
                 continue
-            ratio = math.sqrt(r2) * own_pixel / (distance * pixel)
+            ratio = math.sqrt(r2) * own_pixel / (distance * eye.pixel)
             share = min(ratio, 1.0)
-            level = 0
-            while level + 1 < len(photo) and ratio >= 1.6:
-                ratio *= 0.5
-                level += 1
-            scale = 0.5**level
-            r, g, b = sample(photo[level], (u + 0.5) * scale - 0.5, (v + 0.5) * scale - 0.5, wide)
-            fall = vignette(exposure, p, u, v)
+            level = halving(ratio, len(levels))
+            r, g, b = read(levels[level], eye.p, u, v, wide)
+            fall = vignette(exposure, eye.p, u, v)
             rgb[row, column, 0] = min(255.0, max(0.0, corrected(r, factors[0] * fall) + 0.5))
             rgb[row, column, 1] = min(255.0, max(0.0, corrected(g, factors[1] * fall) + 0.5))
             rgb[row, column, 2] = min(255.0, max(0.0, corrected(b, factors[2] * fall) + 0.5))

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numba import njit, prange
 
-from scan2sim.pipeline.cameras import ALIKE, MODEL_ID, ORTHOGRAPHIC, parameters, pixel_angle
-from scan2sim.pipeline.range_image import is_visible
+from scan2sim.pipeline.cameras import ALIKE, ORTHOGRAPHIC
+from scan2sim.pipeline.looking import eye, is_seen, pixel_of, sighted, to_camera, turned
 from scan2sim.pipeline.types import F32, U8
 from scan2sim.pipeline.visibility import DepthMap
 
@@ -54,29 +52,25 @@ class Candidates:
             mask: (H, W) of any size, 0 where the photo must not be used; None or (0, 0): nowhere.
             factor: on the view's quality, less than 1 for a blurred photo.
         """
-        image = depth.range
+        ranges = depth.ranges
         if mask is not None and mask.size:
             import cv2
 
-            small = cv2.resize(mask, image.shape[::-1], interpolation=cv2.INTER_NEAREST)
-            image = np.where(small > 0, image, np.float32(-1e9))  # nothing is seen there
-        rated = _rate(
-            self._corners, self._normals, image, MODEL_ID[depth.camera.model], parameters(depth.camera),
-            np.linalg.inv(depth.T_world_cam), pixel_angle(depth.camera), bias, max_distance, min_cos, _SAMPLES,
-        )  # fmt: skip
+            small = cv2.resize(mask, depth.range.shape[::-1], interpolation=cv2.INTER_NEAREST)
+            ranges = ranges._replace(first=np.where(small > 0, depth.range, np.float32(-1e9)))  # nothing is seen there
+        sees = eye(depth.camera, depth.T_world_cam)
+        rated = _rate(self._corners, self._normals, sees, ranges, bias, max_distance, min_cos, _SAMPLES)
         rated *= np.float32(factor)
         _insert(rated, index, self.view, self.quality)
         return int((rated > 0).sum())
 
 
 @njit(cache=True, parallel=True)
-def _rate(corners, normals, depth, model, p, T, pixel, bias, max_distance, min_cos, samples):  # type: ignore[no-untyped-def]
+def _rate(corners, normals, eye, ranges, bias, max_distance, min_cos, samples):  # type: ignore[no-untyped-def]
     """(F,) float32: cos / distance^2 (1/m2), meaned over the face's samples, 0 for those not seen."""
     quality = np.zeros(len(corners), np.float32)
     for f in prange(len(corners)):
-        nx = T[0, 0] * normals[f, 0] + T[0, 1] * normals[f, 1] + T[0, 2] * normals[f, 2]
-        ny = T[1, 0] * normals[f, 0] + T[1, 1] * normals[f, 1] + T[1, 2] * normals[f, 2]
-        nz = T[2, 0] * normals[f, 0] + T[2, 1] * normals[f, 1] + T[2, 2] * normals[f, 2]
+        nx, ny, nz = turned(eye.T, normals[f, 0], normals[f, 1], normals[f, 2])
         total = 0.0
         for s in range(len(samples)):
             wx = wy = wz = 0.0
@@ -84,20 +78,18 @@ def _rate(corners, normals, depth, model, p, T, pixel, bias, max_distance, min_c
                 wx += samples[s, k] * corners[f, k, 0]
                 wy += samples[s, k] * corners[f, k, 1]
                 wz += samples[s, k] * corners[f, k, 2]
-            x = T[0, 0] * wx + T[0, 1] * wy + T[0, 2] * wz + T[0, 3]
-            y = T[1, 0] * wx + T[1, 1] * wy + T[1, 2] * wz + T[1, 3]
-            z = T[2, 0] * wx + T[2, 1] * wy + T[2, 2] * wz + T[2, 3]
-            if model == ORTHOGRAPHIC:
-                if -nz >= max(min_cos, DRAPED) and is_visible(depth, model, p, pixel, bias, x, y, z, nx, ny, nz):
-                    total += nz * nz * (min(p[0], p[1]) / ALIKE) ** 2
+            x, y, z = to_camera(eye.T, wx, wy, wz)
+            r, cos = sighted(eye, x, y, z, nx, ny, nz)
+            if eye.model == ORTHOGRAPHIC:  # how far away it is says nothing of how large its pixels are
+                d2, flattest = (ALIKE / min(eye.p[0], eye.p[1])) ** 2, max(min_cos, DRAPED)
+            else:
+                d2, flattest = x * x + y * y + z * z, min_cos
+                if d2 > max_distance * max_distance or d2 < 1e-6:
+                    continue
+            if cos < flattest:
                 continue
-            d2 = x * x + y * y + z * z
-            if d2 > max_distance * max_distance or d2 < 1e-6:
-                continue
-            cos = -(x * nx + y * ny + z * nz) / math.sqrt(d2)
-            if cos < min_cos:
-                continue
-            if is_visible(depth, model, p, pixel, bias, x, y, z, nx, ny, nz):
+            u, v, ok = pixel_of(eye, x, y, z)
+            if ok and is_seen(eye, ranges, u, v, r, cos, bias):
                 total += cos * cos / d2
         quality[f] = total / len(samples)
     return quality

@@ -29,9 +29,8 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from scan2sim.pipeline.types import F32, I32, U8, Mesh, PointCloud, View
-    from scan2sim.pipeline.visibility import DepthMap
     from scan2sim.texturing.agreement import Agreement
-    from scan2sim.texturing.blend import Rows
+    from scan2sim.texturing.blend import Hides, Laid, Rows
     from scan2sim.texturing.choose import Choice
     from scan2sim.texturing.fill import Colours, Page
     from scan2sim.texturing.photos import Exposures
@@ -246,7 +245,7 @@ class Painter:
         label = mesh.label
         self._sign = np.zeros(len(mesh), bool) if label is None else label == CODE["road_sign"]
         self._backwards, self._device = True, params.device if params.device != "auto" else best_device()
-        self._ranges = lru_cache(maxsize=KEPT)(self._read_ranges)
+        self._hides = lru_cache(maxsize=KEPT)(self._read_hides)
         self.photos = Photos(views, max(1, params.band))
         self.used: dict[int, int] = {}
 
@@ -284,9 +283,10 @@ class Painter:
         """Paint the rows of a page; `here` are its faces (indices into `faces`) that reach into them."""
         import numpy as np
 
+        from scan2sim.texturing.blend import Laid
+
         flat = page.flat - np.array([0, rows.start], np.float32)
-        owner = page.owner[rows]
-        band = self._rows(owner, flat, page.corners, self._normals[faces])
+        band = self._rows(Laid(page.owner[rows], flat, page.corners, self._normals[faces]))
         candidates = self._choice.view[faces[here]]
         order = np.unique(candidates[candidates >= 0]).tolist()
         self._backwards = not self._backwards  # what the last rows read last is still in memory
@@ -297,36 +297,31 @@ class Painter:
                 self.used[i] = self.used.get(i, 0) + texels
         band.resolve(page.rgb[rows], page.seen[rows])
 
-    def _rows(self, owner: I32, flat: F32, corners: F32, normals: F32) -> Rows:
+    def _rows(self, laid: Laid) -> Rows:
         """What paints, on this machine's GPU or its processors."""
         if self._device == "numba":
             from scan2sim.texturing.blend import NumbaRows
 
-            return NumbaRows(owner, flat, corners, normals)
+            return NumbaRows(laid)
         from scan2sim.texturing.blend_torch import TorchRows
 
-        return TorchRows(owner, flat, corners, normals, self._device)
+        return TorchRows(laid, self._device)
 
     def _look(self, i: int, rows: Rows, mine: npt.NDArray[np.int64], faces: npt.NDArray[np.int64]) -> int:
         """Add what photo `i` says of the page's faces `mine`, the mesh's `faces`; returns the texels it sees."""
         import numpy as np
 
-        from scan2sim.pipeline.cameras import MODEL_ID, parameters, pixel_angle
-        from scan2sim.texturing.blend import Look, Weighing
+        from scan2sim.pipeline.looking import eye
+        from scan2sim.texturing.blend import Look, Shown, Weighing
 
         photo = self.photos.get(i)
         if photo is None:
             return 0
         p, view = self._params, self._views[i]
-        depth, near, apart, reach = self._ranges(i)
-        T = np.linalg.inv(view.T_world_cam)
         share = self._share(i)[self._mesh.faces[faces]] if p.fade else self._alone(i, faces)
         share[self._sign[faces]] = 1.0  # photos of a plate have been chosen to agree: all give its detail
-        look = Look(
-            photo, self._mask(i, view), MODEL_ID[view.camera.model], parameters(view.camera), depth.range, near, apart,
-            reach, np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3]), pixel_angle(depth.camera),
-            self._exposures.of(view), self._warp(i),
-        )  # fmt: skip
+        shown = Shown(*photo.levels, photo.low, self._mask(i, view), self._warp(i), self._exposures.of(view))
+        look = Look(shown, eye(view.camera, view.T_world_cam), self._hides(i))
         weighing = Weighing(p.bias, p.power, p.feather * view.camera.width, p.min_cos, p.band)
         return rows.add(mine, np.ascontiguousarray(share, np.float32), look, weighing)
 
@@ -339,19 +334,23 @@ class Painter:
 
         return np.repeat((self._choice.label[faces] == i).astype(np.float32)[:, None], 3, axis=1)
 
-    def _read_ranges(self, i: int) -> tuple[DepthMap, F32, F32, int]:
-        """A view's depth map, and `near`, `apart` and `reach` of `blend.Look`."""
+    def _read_hides(self, i: int) -> Hides:
+        """A view's depth map, and the least ranges around its pixels."""
         import cv2
         import numpy as np
 
         from scan2sim.pipeline.visibility import load_depth_map
+        from scan2sim.texturing.blend import Hides
 
         view, band = self._views[i], self._params.band
         depth = load_depth_map(self._depth_file(i), view.camera, view.T_world_cam)
-        near = np.asarray(cv2.erode(depth.range, np.ones((3, 3))), np.float32)
         reach = round(band * depth.camera.width / view.camera.width) if band > 0 else 1
-        around = np.ones((2 * reach + 1, 2 * reach + 1))
-        return depth, near, near if reach == 1 else np.asarray(cv2.erode(depth.range, around), np.float32), reach
+
+        def least(pixels: int) -> F32:
+            return np.asarray(cv2.erode(depth.range, np.ones((2 * pixels + 1, 2 * pixels + 1))), np.float32)
+
+        near = least(1)
+        return Hides(*depth.ranges, near, near if reach == 1 else least(reach), reach)
 
 
 def best_device() -> str:
@@ -506,7 +505,7 @@ def can_texture(params: TextureParams) -> None:
 
 TEXTURE = Step(
     "texture",
-    6,
+    7,
     texture,
     TextureParams,
     class_defaults={"terrain": {"continued": True}},

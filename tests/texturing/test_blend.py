@@ -1,4 +1,4 @@
-"""What a photo says of texels, against a slow reference: place, pose, warp, exposure, halved photos."""
+"""What photos say of texels: what they show at the texels' places, and line for line as `plain_blend` has it."""
 
 from __future__ import annotations
 
@@ -7,11 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.cameras import MODEL_ID, parameters, pixel_angle, project
+from scan2sim.pipeline.cameras import pixel_angle, project
+from scan2sim.pipeline.looking import eye
 from scan2sim.pipeline.render import look_at
 from scan2sim.pipeline.types import Camera
 from scan2sim.texturing import blend
-from scan2sim.texturing.photos import OFFSET, Photo
+from scan2sim.texturing.photos import OFFSET
+from tests.texturing import plain_blend
+from tests.texturing.scattered import CAMERAS, scattered, taken
 
 CAMERA = Camera("pinhole", 80, 60, 60.0, 62.0, 38.0, 31.0)
 POSE = look_at((0.4, -0.6, 3.0), (0.1, 0.2, 0.0))
@@ -37,16 +40,16 @@ def test_texels_show_what_the_photo_shows_there(size: int, warp: tuple[float, fl
     flat = blend.texels(uv, size, size)
     owner = blend.owners(flat, size, size)
     assert (owner >= 0).all()
-    T = np.linalg.inv(POSE)
     gain, fall = np.array([0.1, -0.05, 0.0]), np.array([0.3, 0.2])
     everywhere = np.full((6, 8), np.inf, np.float32)
     look = blend.Look(
-        Photo(tuple(levels), levels[0], np.zeros((0, 0), np.uint8)), np.zeros((0, 0), np.uint8),
-        MODEL_ID["pinhole"], parameters(CAMERA), everywhere, everywhere, everywhere, 1,
-        np.ascontiguousarray(T[:3, :3]), T[:3, 3].copy(), pixel_angle(CAMERA), np.concatenate([gain, fall]),
-        np.tile(np.float32(warp), (3, 4, 1)),
+        blend.Shown(
+            *levels, levels[0], np.zeros((0, 0), np.uint8), np.tile(np.float32(warp), (3, 4, 1)),
+            np.concatenate([gain, fall]),
+        ),
+        eye(CAMERA, POSE), blend.Hides(everywhere, pixel_angle(CAMERA), everywhere, everywhere, 1),
     )  # fmt: skip
-    rows = blend.NumbaRows(owner, flat, corners, np.tile(np.float32([0, 0, 1]), (2, 1)))
+    rows = blend.NumbaRows(blend.Laid(owner, flat, corners, np.tile(np.float32([0, 0, 1]), (2, 1))))
     weighing = blend.Weighing(bias=0.1, power=1.0, feather=4.0, min_cos=0.1, band=-1)
     rows.add(np.arange(2), np.zeros((2, 3), np.float32), look, weighing)
     rgb, seen = np.zeros((size, size, 3), np.uint8), np.zeros((size, size), np.uint8)
@@ -62,3 +65,23 @@ def test_texels_show_what_the_photo_shows_there(size: int, warp: tuple[float, fl
     light = np.exp(gain + fall[0] * q + fall[1] * q**2)
     expected = (shown(*(at + warp).T) + OFFSET) * light - OFFSET
     assert np.abs(rgb.reshape(-1, 3) - expected).max() < 1.6
+
+
+@pytest.mark.parametrize("band", [2, 0, -1])
+@pytest.mark.parametrize("name", CAMERAS)
+def test_photos_are_added_as_the_plain_words_have_it(name: str, band: int) -> None:
+    camera, rng = CAMERAS[name], np.random.default_rng(7)
+    laid = scattered(rng, camera)
+    count, shape = len(laid.flat), (*laid.owner.shape, 4)
+    fast, plain = (blend.Sums(*(np.zeros(shape, np.float32) for _ in range(2))) for _ in range(2))
+    weighing = blend.Weighing(bias=0.05, power=1.5, feather=9.0, min_cos=0.5, band=band)
+    seen = 0
+    for _ in range(2):
+        look, faces = taken(rng, camera, band), rng.permutation(count)[: 3 * count // 4]
+        share = (rng.uniform(size=(len(faces), 3)) * rng.choice([0, 1], (len(faces), 1))).astype(np.float32)
+        texels = plain_blend.accumulate(plain, laid, faces, share, look, weighing, camera)
+        assert blend.accumulate(fast, laid, faces, share, *look, weighing) == len(texels)
+        seen += len(texels)
+    assert 0.1 < seen / (2 * (laid.owner >= 0).sum()) < 0.6  # many are seen, many are not
+    for mine, theirs in zip(fast, plain, strict=True):
+        np.testing.assert_allclose(mine, theirs, rtol=1e-3, atol=1e-6 * np.abs(theirs).max())

@@ -5,6 +5,8 @@ import pytest
 
 from scan2sim.pipeline.errors import SettingError
 from scan2sim.pipeline.io import image
+from scan2sim.texturing import blend
+from tests.texturing import scattered
 from tests.texturing.corner import CAMERAS, POSES, photograph, points
 
 pytest.importorskip("torch", reason="torch is not installed (pip install 'scan2sim[segmentation]')")
@@ -27,6 +29,26 @@ def test_torch_paints_the_same(street, name, band):
         assert (seen[0] == seen[1]).mean() > 0.99999
         assert (abs(a - b).max(axis=2) <= 1).mean() > 0.99999
     assert told.facts["coverage"] == pytest.approx(done.facts["coverage"], abs=1e-4)
+
+
+@pytest.mark.parametrize("band", [2, 0, -1])
+@pytest.mark.parametrize("name", scattered.CAMERAS)
+def test_torch_adds_the_same(name, band):
+    from scan2sim.texturing.blend_torch import TorchRows
+
+    camera, rng = scattered.CAMERAS[name], np.random.default_rng(7)
+    laid = scattered.scattered(rng, camera)
+    look, faces = scattered.taken(rng, camera, band), np.arange(len(laid.flat))
+    share = rng.choice([0, 1], (len(faces), 3)).astype(np.float32)
+    weighing = blend.Weighing(bias=0.05, power=1.5, feather=9.0, min_cos=0.5, band=band)
+    pages = []
+    for rows in (blend.NumbaRows(laid), TorchRows(laid, "cpu")):
+        rgb, seen = np.zeros((*laid.owner.shape, 3), np.uint8), np.zeros(laid.owner.shape, np.uint8)
+        texels = rows.add(faces, share, look, weighing)
+        rows.resolve(rgb, seen)
+        assert texels == (seen == 255).sum() > 500
+        pages.append(rgb.astype(int))
+    assert abs(pages[0] - pages[1]).max() <= 1
 
 
 def test_a_device_that_is_not_there_is_named(street):

@@ -1,0 +1,111 @@
+"""How a picture is read at a pixel of the photo that it belongs to, written once for all kernels.
+
+Pictures (the photo, halvings of it, masks, classes, range images, warps) may be of any size: they cover the photo.
+A photo is told by its camera's parameters `p` (`cameras.parameters`); `wrap` says that its sides meet, as a panorama's
+do. Import late: it loads numba.
+"""
+
+from __future__ import annotations
+
+import math
+
+from numba import njit
+
+
+@njit(cache=True, inline="always")
+def rescaled(p, u, v, picture):  # type: ignore[no-untyped-def]
+    """(x, y): the pixel of a picture (H, W, ...) that shows what the photo's pixel (u, v) shows."""
+    return (u + 0.5) * (picture.shape[1] / p[12]) - 0.5, (v + 0.5) * (picture.shape[0] / p[13]) - 0.5
+
+
+@njit(cache=True, inline="always")
+def halving(wide, count):  # type: ignore[no-untyped-def]
+    """Which of `count` halvings of a photo to read where what is painted is `wide` of its pixels wide: no finer one."""
+    level = 0
+    while level + 1 < count and wide >= 1.6:
+        wide *= 0.5
+        level += 1
+    return level
+
+
+@njit(cache=True, inline="always")
+def nearest(p, u, v, picture):  # type: ignore[no-untyped-def]
+    """(row, column) of the pixel of a picture (H, W, ...) that a place (u, v) within the photo is in."""
+    row, column = int((v + 0.5) * (picture.shape[0] / p[13])), int((u + 0.5) * (picture.shape[1] / p[12]))
+    return min(max(row, 0), picture.shape[0] - 1), min(max(column, 0), picture.shape[1] - 1)
+
+
+@njit(cache=True, inline="always")
+def allows(mask, p, u, v):  # type: ignore[no-untyped-def]
+    """Whether a mask (H, W), 0 where the photo must not be used, lets it be used at (u, v); (0, 0) always does."""
+    if mask.shape[0] == 0:
+        return True
+    row, column = nearest(p, u, v, mask)
+    return mask[row, column] != 0
+
+
+@njit(cache=True, inline="always")
+def taps(picture, x, y, wrap):  # type: ignore[no-untyped-def]
+    """(a, b, c, d, w_ca, w_cb, w_da, w_db): columns, rows, weights of a bilinear lookup; outside, borders go on."""
+    height, width = picture.shape[0], picture.shape[1]
+    x0, y0 = math.floor(x), math.floor(y)
+    s, t = x - x0, y - y0
+    a, b = int(x0), int(x0) + 1
+    if wrap:
+        a, b = a % width, b % width
+    else:
+        a, b = min(max(a, 0), width - 1), min(max(b, 0), width - 1)
+    c, d = min(max(int(y0), 0), height - 1), min(max(int(y0) + 1, 0), height - 1)
+    return a, b, c, d, (1 - s) * (1 - t), s * (1 - t), (1 - s) * t, s * t
+
+
+@njit(cache=True, inline="always")
+def mixed(picture, k, at):  # type: ignore[no-untyped-def]
+    """Channel k of a picture (H, W, C) at `taps`."""
+    a, b, c, d, w_ca, w_cb, w_da, w_db = at
+    return picture[c, a, k] * w_ca + picture[c, b, k] * w_cb + picture[d, a, k] * w_da + picture[d, b, k] * w_db
+
+
+@njit(cache=True, inline="always")
+def bilinear(picture, x, y, wrap):  # type: ignore[no-untyped-def]
+    """(r, g, b) of a picture (H, W, 3) at its pixel (x, y)."""
+    at = taps(picture, x, y, wrap)
+    return mixed(picture, 0, at), mixed(picture, 1, at), mixed(picture, 2, at)
+
+
+@njit(cache=True, inline="always")
+def read(picture, p, u, v, wrap):  # type: ignore[no-untyped-def]
+    """(r, g, b) of a picture (H, W, 3) of a photo, where the photo's pixel (u, v) is."""
+    x, y = rescaled(p, u, v, picture)
+    return bilinear(picture, x, y, wrap)
+
+
+@njit(cache=True)
+def bicubic(picture, x, y, wrap):  # type: ignore[no-untyped-def]
+    """The same, bicubic: keeps what bilinear interpolation blurs (Catmull and Rom)."""
+    height, width = picture.shape[0], picture.shape[1]
+    x0, y0 = math.floor(x), math.floor(y)
+    across, down = _cubic(x - x0), _cubic(y - y0)
+    r = g = b = 0.0
+    for j in range(4):
+        row = min(max(int(y0) + j - 1, 0), height - 1)
+        for i in range(4):
+            column = int(x0) + i - 1
+            column = column % width if wrap else min(max(column, 0), width - 1)
+            w = across[i] * down[j]
+            r += w * picture[row, column, 0]
+            g += w * picture[row, column, 1]
+            b += w * picture[row, column, 2]
+    return r, g, b
+
+
+@njit(cache=True, inline="always")
+def _cubic(f):  # type: ignore[no-untyped-def]
+    """Weights of four neighbours at fraction f between the middle ones."""
+    f2, f3 = f * f, f * f * f
+    return (
+        -0.5 * f3 + f2 - 0.5 * f,
+        1.5 * f3 - 2.5 * f2 + 1,
+        -1.5 * f3 + 2 * f2 + 0.5 * f,
+        0.5 * f3 - 0.5 * f2,
+    )

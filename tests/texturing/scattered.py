@@ -1,0 +1,71 @@
+"""A made-up scene without sense, in which a photo shows what it does in every way: for tests of kernels."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+
+from scan2sim.pipeline.cameras import pixel_angle, unproject
+from scan2sim.pipeline.looking import eye
+from scan2sim.pipeline.types import Camera
+from scan2sim.texturing import blend
+from scan2sim.texturing.photos import low_frequencies, shrunk
+
+CAMERAS = {
+    "pinhole": Camera("pinhole", 97, 71, 60.0, 62.0, 47.0, 36.0),
+    "opencv": Camera("opencv", 97, 71, 60.0, 62.0, 47.0, 36.0, (-0.2, 0.05, 0.001, -0.002)),
+    "fisheye": Camera("fisheye", 97, 71, 40.0, 41.0, 47.0, 36.0, (0.02, -0.003, 0.0, 0.0)),
+    "equirectangular": Camera("equirectangular", 142, 71),
+    "orthographic": Camera("orthographic", 97, 71, 12.0, 12.0, 47.0, 36.0),
+}
+CELL, CELLS = 12, 8
+"""Texels of a square's side on the page, and squares of its side."""
+
+
+def scattered(rng: np.random.Generator, camera: Camera) -> blend.Laid:
+    """Squares about a camera at the origin, of all sizes, turned every way; each has a cell of the page to itself."""
+    n = CELLS**2
+    u, v = rng.uniform(-0.2, 1.2, n) * camera.width, rng.uniform(-0.1, 1.1, n) * camera.height
+    away = rng.uniform(2, 12, n)[:, None]
+    if camera.model == "orthographic":
+        middle = np.column_stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, away])
+    else:
+        ray = unproject(camera, np.column_stack([u, v]))
+        middle = np.where(np.isfinite(ray), ray, [1.0, 0.0, 0.0]) * away
+    facing = -middle / np.linalg.norm(middle, axis=1, keepdims=True) + rng.normal(0, 0.6, (n, 3))
+    facing /= np.linalg.norm(facing, axis=1, keepdims=True)
+    right = np.cross(facing, [0.1, 0.9, 0.3])
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    span = (rng.uniform(0.02, 0.6, n) * (6 if camera.model == "orthographic" else away[:, 0]))[:, None]
+    across, down = right * span, np.cross(right, facing) * span * rng.uniform(0.5, 2, (n, 1))
+    corners = np.stack([middle - across - down, middle + across - down, middle + across + down, middle - across + down])
+    low = np.stack(np.divmod(np.arange(n), CELLS), axis=1)[:, None] * CELL - 0.3
+    flat = low + np.array([[0.0, 0.0], [CELL, 0.0], [CELL, CELL], [0.0, CELL]]) * 0.93
+    triangles = np.array([[0, 1, 2], [0, 2, 3]])
+    flat = flat[:, triangles].reshape(-1, 3, 2).astype(np.float32)
+    corners = corners.transpose(1, 0, 2)[:, triangles].reshape(-1, 3, 3).astype(np.float32)
+    owner = blend.owners(flat, CELL * CELLS, CELL * CELLS)
+    return blend.Laid(owner, flat, corners, np.repeat(facing, 2, axis=0).astype(np.float32))
+
+
+def taken(rng: np.random.Generator, camera: Camera, band: int) -> blend.Look:
+    """A photo with all that can be about it: things before what it shows, a mask, a warp, exposure, white patches."""
+
+    def patches(values: Any, size: int) -> Any:
+        return np.kron(rng.choice(values, (12, 24)), np.ones((size, size))).astype(np.float32)
+
+    whole = rng.integers(0, 256, (camera.height, camera.width, 3)).astype(np.uint8)
+    whole = cv2.GaussianBlur(whole, (0, 0), 0.8)
+    whole[10:20, 15:40] = 255
+    half = shrunk(whole, 2)
+    first = patches([np.inf, 9.0, 6.0, 4.0], 8)
+    wider = camera.resized(first.shape[1], first.shape[0])
+    shown = blend.Shown(
+        whole, half, shrunk(half, 2), low_frequencies(whole, max(1, band)),
+        rng.choice([0, 255, 255, 255], (24, 33)).astype(np.uint8), rng.normal(0, 2, (5, 7, 2)).astype(np.float32),
+        np.array([0.1, -0.05, 0.02, 0.3, 0.2]),
+    )  # fmt: skip
+    near, apart = (np.asarray(cv2.erode(first, np.ones((n, n)))) for n in (3, 7))
+    return blend.Look(shown, eye(camera, np.eye(4)), blend.Hides(first, pixel_angle(wider), near, apart, 3))
