@@ -28,8 +28,9 @@ from scipy.spatial.transform import Rotation
 
 from bench import street
 from bench.texture_scenes import Scene, fresh, make
-from scan2sim.pipeline.cameras import inside, project, unproject
+from scan2sim.pipeline.cameras import unproject
 from scan2sim.pipeline.io import views as views_io
+from scan2sim.pipeline.looking import pixels
 from scan2sim.pipeline.step import silent
 from scan2sim.pipeline.types import F64, Mesh, PointCloud, View
 from scan2sim.pipeline.visibility import DepthMap, depth_map, scene, visible
@@ -71,11 +72,7 @@ def errors(views: Sequence[View], truth: Sequence[View], maps: Sequence[DepthMap
     between: list[F64] = []
     for k, (view, true, depth) in enumerate(zip(views, truth, maps, strict=True)):
         shown = surface(depth.camera, depth)
-        points, normals = shown.points.reshape(-1, 3), shown.normals.reshape(-1, 3)
-        near = np.flatnonzero(np.linalg.norm(points, axis=1) < NEAR)
-        at = rng.choice(near, min(PLACES, len(near)), replace=False)
-        places = points[at] @ true.T_world_cam[:3, :3].T + true.centre
-        normal = normals[at] @ true.T_world_cam[:3, :3].T
+        places, normal = shown.some(PLACES, NEAR, rng)
         absolute.append(np.linalg.norm(_pixels(view, places) - _pixels(true, places), axis=1))
         ray = unproject(view.camera, _pixels(true, places)) @ view.T_world_cam[:3, :3].T
         far = np.einsum("ij,ij->i", places - view.centre, normal) / np.einsum("ij,ij->i", ray, normal)
@@ -93,8 +90,8 @@ def errors(views: Sequence[View], truth: Sequence[View], maps: Sequence[DepthMap
 
 def _pixels(view: View, places: F64) -> F64:
     """(N, 2) where a photo has places; NaN outside of it."""
-    uv, ok = project(view.camera, (places - view.centre) @ view.T_world_cam[:3, :3])
-    return np.where((ok & inside(view.camera, uv))[:, None], uv, np.nan).astype(np.float64)
+    uv, shown = pixels(view.camera, view.T_world_cam, places)
+    return np.where(shown[:, None], uv, np.nan).astype(np.float64)
 
 
 def synthetic(folder: Path) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from scan2sim.pipeline.classes import CODE
 from scan2sim.pipeline.io import image
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.tile import read_tile
+from scan2sim.pipeline.looking import pixels
 from scan2sim.pipeline.render import Body, Renderer, textured
 from scan2sim.pipeline.types import F32, U8, Mesh, PointCloud, View
 from scan2sim.pipeline.visibility import load_depth_map, visible
@@ -65,8 +66,6 @@ def samples(scene: Scene) -> Samples:
     import cv2
     import open3d as o3d
 
-    from scan2sim.pipeline.cameras import project
-
     mesh, tile = Mesh.load(scene.mesh), read_tile(scene.tile)
     assert tile.truth_points is not None and tile.truth_mesh is not None
     casting = _casting(Mesh.load(tile.truth_mesh).moved_to(mesh.frame))
@@ -83,8 +82,7 @@ def samples(scene: Scene) -> Samples:
         rays = np.concatenate([np.broadcast_to(view.centre.astype(np.float32), to.shape), to], axis=1)
         first = casting.cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy()  # in lengths of the ray to the sample
         better = better[np.abs(first - 1) * np.linalg.norm(to, axis=1) < TRUE_REACH]
-        T = np.linalg.inv(view.T_world_cam)
-        uv, _ = project(view.camera, truth.xyz[better] @ T[:3, :3].T + T[:3, 3])
+        uv, _ = pixels(view.camera, view.T_world_cam, truth.xyz[better])
         photo = image.read_rgb(view.photo)
         assert photo is not None
         for part in np.array_split(np.arange(len(better)), len(better) // 30_000 + 1):  # remap takes 32 767 rows
@@ -260,9 +258,6 @@ def _car_pixels(clean: View, hard: View, ev: float) -> Bools:
 
 def _at_pixels(mask: Bools, view: View, places: F32) -> Bools:
     """(N,) the mask's values where a view sees places."""
-    from scan2sim.pipeline.cameras import project
-
-    T = np.linalg.inv(view.T_world_cam)
-    uv, _ = project(view.camera, places @ T[:3, :3].T + T[:3, 3])
+    uv, _ = pixels(view.camera, view.T_world_cam, places)
     column, row = np.rint(np.clip(uv, 0, [view.camera.width - 1, view.camera.height - 1])).astype(int).T
     return mask[row, column]

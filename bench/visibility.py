@@ -38,9 +38,9 @@ from scan2sim.flows.planning import plan
 from scan2sim.flows.recipe import recipe
 from scan2sim.flows.settings import Settings
 from scan2sim.pipeline import visibility
-from scan2sim.pipeline.cameras import inside, project
 from scan2sim.pipeline.classes import CLASSES, GROUPS
 from scan2sim.pipeline.io.tile import read_tile
+from scan2sim.pipeline.looking import pixels
 from scan2sim.pipeline.steps.visibility import VisibilityParams
 from scan2sim.pipeline.store import Store
 from scan2sim.pipeline.types import F32, F64, U8, Frame, Mesh, PointCloud, Tile, View
@@ -167,9 +167,9 @@ def draw(meshes: dict[str, Mesh], view: View, count: int, seed: int) -> Iterator
         points, normals = (1 - u) * a + u * (1 - v) * b + u * v * c, mesh.face_normal[face]
         to = view.centre - points
         distance = np.linalg.norm(to, axis=1)
-        uv, valid = project(view.camera, -to @ view.T_world_cam[:3, :3])
+        _, shown = pixels(view.camera, view.T_world_cam, points)
         facing = np.einsum("ij,ij->i", to, normals) > FLATTEST * distance
-        keep = valid & inside(view.camera, uv) & facing & (distance < REACH)
+        keep = shown & facing & (distance < REACH)
         yield group, (points[keep].astype(np.float32), normals[keep])
 
 
@@ -241,12 +241,10 @@ def boxes(cloud: PointCloud, view: View) -> DepthMap:
     import cv2
 
     camera = view.camera
-    local = (cloud.xyz - view.centre) @ view.T_world_cam[:3, :3]
-    uv, valid = project(camera, local)
-    keep = valid & inside(camera, uv)
+    uv, keep = pixels(camera, view.T_world_cam, cloud.xyz)
     column, row = np.floor(uv[keep] + 0.5).astype(int).T
     depth = np.full((camera.height, camera.width), np.inf, np.float32)
-    np.minimum.at(depth, (row, column), np.linalg.norm(local[keep], axis=1).astype(np.float32))
+    np.minimum.at(depth, (row, column), np.linalg.norm(cloud.xyz[keep] - view.centre, axis=1).astype(np.float32))
     splats = np.asarray(cv2.erode(depth, np.ones((SPLAT, SPLAT))), np.float32)
     return DepthMap(camera, view.T_world_cam, splats + np.float32(SPLAT_BIAS))
 

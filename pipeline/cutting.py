@@ -125,14 +125,13 @@ def members(xy: F64, places: F64, buffer: float) -> tuple[I64, I64, I64]:
 
 def sees(view: View, xyz: F64) -> bool:
     """Whether a photo shows enough of points (N, 3), local coordinates; what hides them is not asked."""
-    from scan2sim.pipeline.cameras import inside, project
+    from scan2sim.pipeline.looking import pixels
 
     xyz = xyz[np.linalg.norm(xyz - view.centre, axis=1) <= SIGHT]
     if len(xyz) == 0:
         return False
-    T_cam_world = np.linalg.inv(view.T_world_cam)
-    uv, valid = project(view.camera, xyz @ T_cam_world[:3, :3].T + T_cam_world[:3, 3])
-    return int(np.count_nonzero(valid & inside(view.camera, uv))) >= min(ENOUGH, max(1.0, SHARE * len(xyz)))
+    _, shown = pixels(view.camera, view.T_world_cam, xyz)
+    return int(np.count_nonzero(shown)) >= min(ENOUGH, max(1.0, SHARE * len(xyz)))
 
 
 def _grid(low: F64, high: F64, length: float, name: str) -> F64:

@@ -15,8 +15,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from scan2sim.pipeline.cameras import inside, pixel_angle, project
+from scan2sim.pipeline.cameras import pixel_angle
 from scan2sim.pipeline.facades import Wall
+from scan2sim.pipeline.looking import pixels
 from scan2sim.pipeline.types import F32, I32, U8, View
 from scan2sim.pipeline.visibility import DepthMap, visible
 
@@ -105,8 +106,7 @@ def looked_at(wall: Wall, photo: Looked, offset: float = 0.0, texels: float = TE
     uv = np.full((len(flat), 2), -1, np.float32)
     if seen.any():
         at = np.flatnonzero(seen)
-        uv[at], valid = project(camera, ray[at] @ photo.view.T_world_cam[:3, :3])
-        valid &= inside(camera, uv[at])
+        uv[at], valid = pixels(camera, photo.view.T_world_cam, flat[at])
         valid[valid] = visible(photo.hides, flat[at[valid]] + OFF * wall.normal)
         seen[at] = valid
     finer = wall.cell / texels / float(np.median(pixel[seen])) if seen.any() else 1.0

@@ -73,10 +73,9 @@ def _along(ray: F64, own: int, views: Sequence[View], shown: Mapping[int, U8]) -
 
 def _told(view: View, sign: U8, places: F64) -> npt.NDArray[np.float32]:
     """(N,) how surely a photo shows a sign at places (N, 3), of 255; NaN where it doesn't show them."""
-    from scan2sim.pipeline.cameras import inside, project
+    from scan2sim.pipeline.looking import pixels
 
-    uv, valid = project(view.camera, (places - view.centre) @ view.T_world_cam[:3, :3])
-    valid &= inside(view.camera, uv)
+    uv, valid = pixels(view.camera, view.T_world_cam, places)
     uv = np.where(valid[:, None], uv, 0)
     column = ((uv[:, 0] + 0.5) * sign.shape[1] / view.camera.width).astype(int).clip(0, sign.shape[1] - 1)
     row = ((uv[:, 1] + 0.5) * sign.shape[0] / view.camera.height).astype(int).clip(0, sign.shape[0] - 1)

@@ -191,12 +191,10 @@ def neighbours(
     for i in used:
         camera = views[i].camera
         small = surface(camera.scaled(min(1.0, (60_000 / (camera.width * camera.height)) ** 0.5)), depth(i))
-        near = np.einsum("hwk,hwk->hw", small.points, small.points) < params.max_distance**2
-        at = np.flatnonzero(near.ravel())
-        at = rng.choice(at, min(SAMPLES, len(at)), replace=False) if len(at) else at
-        place.append(small.points.reshape(-1, 3)[at] @ views[i].T_world_cam[:3, :3].T + views[i].centre)
-        normal.append(small.normals.reshape(-1, 3)[at] @ views[i].T_world_cam[:3, :3].T)
-        owner.append(np.full(len(at), i))
+        p, n = small.some(SAMPLES, params.max_distance, rng)
+        place.append(p)
+        normal.append(n)
+        owner.append(np.full(len(p), i))
     if not place:
         return {}
     xyz, facing, whose = np.concatenate(place), np.concatenate(normal), np.concatenate(owner)

@@ -50,6 +50,8 @@ class ExposureParams(Params):
     tint: Stops = 0.15
 
 
+PIXELS = 400_000
+"""Places are drawn from depth maps of this size at most."""
 OUTLIER = 0.06
 """Residual, of the encoded values' logarithm, beyond which an observation's say falls (Huber)."""
 DARK, BRIGHT = 12, 243
@@ -121,15 +123,17 @@ def observe(
 
     from scan2sim.pipeline.visibility import load_depth_map
     from scan2sim.texturing.photos import Photos
+    from scan2sim.texturing.predict import surface
 
     rng = np.random.default_rng(0)
     points, normals = [], []
     for i in used:
         view = views[i]
         depth = load_depth_map(depth_file(i), view.camera, view.T_world_cam)
-        p, n = _places(depth, params.samples, params.max_distance, rng)
-        points.append(p @ view.T_world_cam[:3, :3].T + view.centre)
-        normals.append(n @ view.T_world_cam[:3, :3].T)
+        coarse = surface(depth.camera.scaled(min(1.0, (PIXELS / depth.range.size) ** 0.5)), depth)
+        p, n = coarse.some(params.samples, params.max_distance, rng)
+        points.append(p)
+        normals.append(n)
     place, normal = np.concatenate(points), np.concatenate(normals)
     photos = Photos(views)
     rows = []
@@ -148,21 +152,6 @@ def observe(
     return Observed(index[several], at[several], value[several], q[several])
 
 
-def _places(
-    depth: DepthMap, count: int, max_distance: float, rng: np.random.Generator
-) -> tuple[npt.NDArray[np.floating], npt.NDArray[np.floating]]:
-    """Random places (N, 3) that a depth map shows, and their normals, in camera axes."""
-    import numpy as np
-
-    from scan2sim.texturing.predict import surface
-
-    small = surface(depth.camera.scaled(min(1.0, (400_000 / depth.range.size) ** 0.5)), depth)
-    near = np.einsum("hwk,hwk->hw", small.points, small.points) < max_distance**2
-    at = np.flatnonzero(near.ravel())
-    at = rng.choice(at, min(count, len(at)), replace=False) if len(at) else at
-    return small.points.reshape(-1, 3)[at], small.normals.reshape(-1, 3)[at]
-
-
 def _look_up(
     low: npt.NDArray[np.uint8],
     mask: npt.NDArray[np.uint8],
@@ -176,7 +165,7 @@ def _look_up(
     import cv2
     import numpy as np
 
-    from scan2sim.pipeline.cameras import inside, project
+    from scan2sim.pipeline.looking import pixels
     from scan2sim.pipeline.visibility import DepthMap as Map
     from scan2sim.pipeline.visibility import visible
     from scan2sim.texturing.photos import OFFSET
@@ -186,8 +175,8 @@ def _look_up(
     distance = np.linalg.norm(to, axis=1)
     cos = np.einsum("ij,ij->i", to, normal) / np.maximum(distance, 1e-9)
     at = np.flatnonzero((distance < max_distance) & (cos > MIN_COS))
-    uv, ok = project(camera, -to[at] @ view.T_world_cam[:3, :3])
-    at, uv = at[ok & inside(camera, uv)], uv[ok & inside(camera, uv)]
+    uv, shown = pixels(camera, view.T_world_cam, place[at])
+    at, uv = at[shown], uv[shown]
     # beside something nearer the low frequencies mix both: not asked there
     reach = 2 * round(camera.width / low.shape[1] * depth.camera.width / camera.width) + 1
     near = Map(depth.camera, depth.T_world_cam, np.asarray(cv2.erode(depth.range, np.ones((reach, reach)))))

@@ -41,6 +41,14 @@ class Surface:
     points: F32
     normals: F32
 
+    def some(self, count: int, max_distance: float, rng: np.random.Generator) -> tuple[F64, F64]:
+        """At most `count` random places (N, 3) nearer than that, and their normals (N, 3), local coordinates."""
+        near = np.einsum("hwk,hwk->hw", self.points, self.points) < max_distance**2
+        at = np.flatnonzero(near.ravel())
+        at = rng.choice(at, min(count, len(at)), replace=False) if len(at) else at
+        R, centre = self.T_world_cam[:3, :3], self.T_world_cam[:3, 3]
+        return self.points.reshape(-1, 3)[at] @ R.T + centre, self.normals.reshape(-1, 3)[at] @ R.T
+
 
 @dataclass(frozen=True)
 class Prediction:

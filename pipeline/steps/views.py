@@ -99,11 +99,11 @@ def _cut(view: View, points: F32, folder: Path, index: int) -> View:
 
     import numpy as np
 
-    from scan2sim.pipeline.cameras import project
     from scan2sim.pipeline.io import image
+    from scan2sim.pipeline.looking import pixels
 
-    T_cam_world, camera = np.linalg.inv(view.T_world_cam), view.camera
-    uv, _ = project(camera, points @ T_cam_world[:3, :3].T + T_cam_world[:3, 3])
+    camera = view.camera
+    uv, _ = pixels(camera, view.T_world_cam, points)
     size = np.array([camera.width, camera.height])
     low = np.clip(np.floor(uv.min(axis=0)) - MARGIN, 0, size - 1).astype(int)
     high = np.clip(np.ceil(uv.max(axis=0)) + MARGIN, low + 1, size).astype(int)
@@ -159,17 +159,12 @@ def _sees(view: View, points: F32) -> bool:
     """Whether any of the points (N, 3) is inside the image and within reach."""
     import numpy as np
 
-    from scan2sim.pipeline.cameras import project
+    from scan2sim.pipeline.looking import pixels
 
-    T_cam_world = np.linalg.inv(view.T_world_cam)
-    local = points @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]
     if view.camera.model != "orthographic":
-        local = local[np.einsum("ij,ij->i", local, local) < REACH**2]
-    if len(local) == 0:
-        return False
-    uv, valid = project(view.camera, local)
-    inside = (uv > -0.5).all(axis=1) & (uv[:, 0] < view.camera.width - 0.5) & (uv[:, 1] < view.camera.height - 0.5)
-    return bool((inside & valid).any())
+        points = points[np.linalg.norm(points - view.centre, axis=1) < REACH]
+    _, shown = pixels(view.camera, view.T_world_cam, points)
+    return bool(shown.any())
 
 
 VIEWS = Step("views", 2, views, ViewsParams)
