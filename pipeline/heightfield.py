@@ -120,18 +120,21 @@ def drawn(rings: Sequence[npt.NDArray[np.floating]], shape: tuple[int, int]) -> 
 
 def grown(mask: Bools, radius: float) -> Bools:
     """A mask with all cells within a radius, in cells."""
-    from scipy import ndimage
+    return np.asarray(_away(mask) <= radius, bool) if mask.any() else mask
 
-    return np.asarray(ndimage.distance_transform_edt(~mask) <= radius, bool) if mask.any() else mask
+
+def _away(mask: Bools) -> F32:
+    """Cells from each one to the nearest of a mask."""
+    import cv2
+
+    return np.asarray(cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE), np.float32)
 
 
 def closed(mask: Bools, radius: float) -> Bools:
     """A mask whose gaps of less than twice the radius, in cells, are closed."""
-    from scipy import ndimage
-
     room = math.ceil(radius) + 1
     wide = grown(np.pad(mask, room), radius)
-    return np.asarray(ndimage.distance_transform_edt(wide) > radius, bool)[room:-room, room:-room] | mask
+    return np.asarray(_away(~wide) > radius, bool)[room:-room, room:-room] | mask
 
 
 def membrane(values: F64, wanted: Bools) -> F64:

@@ -88,6 +88,7 @@ def texture(inputs: Inputs, params: TextureParams, out: Path, report: Report) ->
 
     from scan2sim.pipeline.io import views as views_io
     from scan2sim.pipeline.types import Mesh
+    from scan2sim.texturing import fill
     from scan2sim.texturing.agreement import Agreement
     from scan2sim.texturing.choose import Choice
     from scan2sim.texturing.photos import Exposures
@@ -117,10 +118,13 @@ def texture(inputs: Inputs, params: TextureParams, out: Path, report: Report) ->
         )  # fmt: skip
         if plan is not None:
             plan.clear(page)
-        texels[faces] = _finish(page, faces, mesh, colours, None if own else made, params)
+        texels[faces] = _filled(page, faces, mesh, colours, None if own else made)
         if plan is not None:
             plan.add(page)
-        writer.write(folder / f"page_{k}", page)
+        waits = plan is not None and bool(texels[faces, 3].any())
+        if not waits:
+            fill.pad(page.rgb, page.seen, params.padding)
+        writer.write(folder / f"page_{k}", page, compression=0 if waits else 2)
         del page
     writer.finish()
     if plan is not None and texels[:, 3].any():
@@ -154,15 +158,13 @@ def _texel(mesh: Mesh, sizes: Sequence[dict[str, int]]) -> float:
 
 
 def _go_on(plan: Plan, folder: Path, mesh: Mesh, wanting: npt.NDArray[np.bool_], params: TextureParams) -> None:
-    """Paint the pages of the faces that are `wanting` (F,) once more, where the ground goes on."""
+    """Paint the pages of the faces that are `wanting` (F,), where the ground goes on, and pad their charts."""
     import numpy as np
 
     from scan2sim.pipeline.io import image
     from scan2sim.texturing import blend, fill
 
     ground = plan.go_on()
-    if ground is None:
-        return
     assert mesh.page is not None and mesh.uv is not None
     writer = Writer()
     for k in np.unique(mesh.page[wanting]).tolist():
@@ -174,7 +176,8 @@ def _go_on(plan: Plan, folder: Path, mesh: Mesh, wanting: npt.NDArray[np.bool_],
         assert rgb is not None and seen is not None  # both have just been written
         flat = blend.texels(mesh.uv[faces], seen.shape[1], seen.shape[0])
         page = fill.Page(rgb, seen, blend.owners(flat, seen.shape[1], seen.shape[0]), flat, mesh.corners[faces])
-        ground.paint(page)
+        if ground is not None:
+            ground.paint(page)
         fill.pad(page.rgb, page.seen, params.padding)
         writer.write(path, page)
     writer.finish()
@@ -187,10 +190,10 @@ class Writer:
         self._pool = ThreadPoolExecutor(1)
         self._last: Future[None] | None = None
 
-    def write(self, path: Path, page: Page) -> None:
+    def write(self, path: Path, page: Page, compression: int = 2) -> None:
         """Begin `path`.png and `path`_seen.png, once the page before is written."""
         self.finish()
-        self._last = self._pool.submit(_write, path, page.rgb, page.seen)
+        self._last = self._pool.submit(_write, path, page.rgb, page.seen, compression)
 
     def finish(self) -> None:
         """Wait; raises what went wrong."""
@@ -198,11 +201,11 @@ class Writer:
             self._last.result()
 
 
-def _write(path: Path, rgb: U8, seen: U8) -> None:
+def _write(path: Path, rgb: U8, seen: U8, compression: int) -> None:
     from scan2sim.pipeline.io import image
 
-    image.write(path.with_name(f"{path.name}.png"), rgb)
-    image.write(path.with_name(f"{path.name}_seen.png"), seen, compression=1)
+    image.write(path.with_name(f"{path.name}.png"), rgb, compression=compression)
+    image.write(path.with_name(f"{path.name}_seen.png"), seen, compression=min(1, compression))
 
 
 class Painter:
@@ -435,15 +438,14 @@ def _labels(cloud: PointCloud) -> U8:
     return np.ones(len(cloud), np.uint8) if cloud.label is None else cloud.label
 
 
-def _finish(
+def _filled(
     page: Page,
     faces: npt.NDArray[np.int64],
     mesh: Mesh,
     colours: Colours | None,
     made: tuple[F32, U8] | None,
-    params: TextureParams,
 ) -> npt.NDArray[np.int64]:
-    """Fill what no photo saw, pad the charts; returns (N, 4) texels of the faces, as `blend.count`.
+    """Fill what no photo saw; returns (N, 4) texels of the faces, as `blend.count`.
 
     Where points have no colours of their own, texels that photos saw stand in, but for what was made up (`made`).
     """
@@ -463,9 +465,7 @@ def _finish(
     else:
         page.seen[(page.owner >= 0) & (page.seen == 0)] = fill.FILLED
         page.rgb[page.seen == fill.FILLED] = 128
-    counts = blend.count(page.owner, page.seen, page.flat)
-    fill.pad(page.rgb, page.seen, params.padding)
-    return np.asarray(counts)
+    return np.asarray(blend.count(page.owner, page.seen, page.flat))
 
 
 def _facts(
