@@ -13,6 +13,7 @@ import numpy.typing as npt
 from numba import njit
 from scipy.spatial import cKDTree
 
+from scan2sim.pipeline.ordering import ordered
 from scan2sim.pipeline.planes import Planes
 from scan2sim.pipeline.steps.voxel import voxel_groups
 from scan2sim.pipeline.types import F32, F64, I32
@@ -149,8 +150,8 @@ def sides(xyz: F32, own: I32, planes: Planes, voxel: float) -> Sides:
         planes: of the points.
         voxel: metres.
     """
-    order = np.argsort(own, kind="stable")
-    first = np.searchsorted(own[order], np.arange(len(planes) + 1))
+    order, of_plane = ordered(own.astype(np.int64) + 1)
+    first = np.searchsorted(of_plane, np.arange(len(planes) + 1) + 1)
     rows: list[tuple[int, F64, F64, F64, bool, bool]] = []
     for p in range(len(planes)):
         points = xyz[order[first[p] : first[p + 1]]].astype(np.float64)

@@ -105,19 +105,17 @@ def sheet(plate: Plate) -> Triangles:
     return primitives.plate(corners, -SHEET * plate.normal)
 
 
-def find(cloud: PointCloud, height: F32, path: Trajectory) -> list[Thing]:
+def find(cloud: PointCloud, columns: Columns, height: F32, path: Trajectory) -> list[Thing]:
     """All street furniture of a cloud.
 
     Args:
         cloud: N points above the ground, classified: of classes, only vegetation matters.
+        columns: of its points.
         height: (N,) metres above the ground.
         path: the scanner's.
     """
     xyz = cloud.xyz
-    if not len(xyz):
-        return []
     assert cloud.label is not None
-    columns = Columns(xyz)
     leafy = group_of()[cloud.label] == 2
     things = []
     for stem in stems(columns, height, LEAST):

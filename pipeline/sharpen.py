@@ -14,6 +14,7 @@ import numpy.typing as npt
 from numba import njit, prange
 from scipy.spatial import cKDTree
 
+from scan2sim.pipeline.ordering import first_of_each, ordered
 from scan2sim.pipeline.planes import Planes
 from scan2sim.pipeline.types import F32, F64, I32, Mesh
 
@@ -109,10 +110,12 @@ def sharpen(
     which_of = np.concatenate([own, np.full(len(last) - len(own), -1, np.int32)]).astype(np.int32)
     kept = np.flatnonzero(~(which_of[split] >= ends).any(axis=1))
     last, _ = upright(first, last, split[kept], _cross(vertices[faces])[parent[kept]], SLIVER * voxel**2)
-    used, again = np.unique(split[kept], return_inverse=True)
+    left = np.zeros(len(last), bool)
+    left[split[kept]] = True
+    used, again = np.flatnonzero(left), (np.cumsum(left) - 1)[split[kept]]
     edge = used >= len(own)
     last[used] += np.random.default_rng(0).normal(0, GRAIN, (len(used), 3))
-    small = Mesh(mesh.frame, last[used].astype(np.float32), again.reshape(-1, 3).astype(np.int32))
+    small = Mesh(mesh.frame, last[used].astype(np.float32), again.astype(np.int32))
     return Sharpened(small, which_of[used], edge)
 
 
@@ -245,10 +248,12 @@ def edges_of(mesh: Mesh) -> Edges:
     """Edges (E, 2), and which of them each face has (F, 3): from its first corner, its second, its third."""
     faces = mesh.faces.astype(np.int64)
     ends = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2)
-    ends.sort(axis=1)
-    code, back = np.unique(ends[:, 0] * (int(faces.max(initial=0)) + 1) + ends[:, 1], return_inverse=True)
     side = int(faces.max(initial=0)) + 1
-    return np.stack([code // side, code % side], axis=1), back.reshape(-1, 3)
+    order, code = ordered(ends.min(axis=1) * side + ends.max(axis=1))
+    first = first_of_each(code)
+    of_face = np.empty(len(ends), np.int64)
+    of_face[order] = np.cumsum(first) - 1
+    return np.stack([code[first] // side, code[first] % side], axis=1), of_face.reshape(-1, 3)
 
 
 def _split(

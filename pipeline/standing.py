@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from scan2sim.pipeline.ordering import ordered
 from scan2sim.pipeline.types import F32, F64
 
 Bools = npt.NDArray[np.bool_]
@@ -154,8 +155,8 @@ def _discs(xyz: F32, height: F32) -> F64:
     row = np.floor(xyz[:, 1] / CELL).astype(np.int64)
     column, row = column - column.min() + 1, row - row.min() + 1
     shape = int(row.max()) + 2, int(column.max()) + 2
-    order = np.argsort(slab, kind="stable")
-    starts = np.searchsorted(slab[order], np.arange(slab.min(), slab.max() + 2))
+    order, level = ordered(slab - slab.min())
+    starts = np.searchsorted(level, np.arange(level[-1] + 2))
     most = int(WIDEST / CELL)
     discs = []
     for first, last in pairwise(starts.tolist()):
@@ -292,11 +293,10 @@ class Columns:
     def __init__(self, xyz: F32) -> None:
         self.xyz = xyz
         self._low = np.floor(xyz[:, :2].min(axis=0)).astype(np.int32)
-        at = np.floor(xyz[:, :2]).astype(np.int32) - self._low
+        at = np.floor(xyz[:, :2]).astype(np.int64) - self._low
         self._size = at.max(axis=0) + 1
-        code = at[:, 0] * self._size[1] + at[:, 1]
-        self._order = np.argsort(code, kind="stable")
-        self._start = np.searchsorted(code[self._order], np.arange(int(self._size.prod()) + 1))
+        self._order, code = ordered(at[:, 0] * self._size[1] + at[:, 1])
+        self._start = np.searchsorted(code, np.arange(int(self._size.prod()) + 1))
 
     def near(self, place: F64, radius: float) -> Ints:
         """Indices of the points in the square of twice the radius around a place (2,)."""

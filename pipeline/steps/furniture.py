@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from scan2sim.pipeline.furniture import Thing
     from scan2sim.pipeline.plates import Plate
+    from scan2sim.pipeline.standing import Columns
     from scan2sim.pipeline.types import F32, Frame, Mesh
 
 CELL = 0.5  # metres, of the ground's heights
@@ -55,6 +56,7 @@ def furniture(inputs: Inputs, params: FurnitureParams, out: Path, report: Report
     from scan2sim.pipeline.cells import Cell
     from scan2sim.pipeline.classes import CODE, NOISE, group_of
     from scan2sim.pipeline.furniture import find
+    from scan2sim.pipeline.standing import Columns
     from scan2sim.pipeline.types import PointCloud, Trajectory
 
     cloud, path = PointCloud.load(inputs["cloud"]), Trajectory.load(inputs["path"])
@@ -69,7 +71,9 @@ def furniture(inputs: Inputs, params: FurnitureParams, out: Path, report: Report
         some, height = some[(height > LOW) & (height < HIGH)], height[(height > LOW) & (height < HIGH)]
         part = cloud.take(some)
         report(0.3, "stems")
-        things = find(part, height, path)
+        if len(part):
+            columns = Columns(part.xyz)
+            things = find(part, columns, height, path)
     if params.seed is not None and things:
         feet = np.array([thing.foot[:2] for thing in things]) + np.asarray(cloud.frame.origin[:2])
         outside = Cell(params.seed, params.neighbours).outside(feet)
@@ -79,7 +83,7 @@ def furniture(inputs: Inputs, params: FurnitureParams, out: Path, report: Report
     else:
         free = shown = things
     if free:
-        taken = some[_held(part.xyz, free)]
+        taken = some[_held(columns, free)]
     np.savez(out / "taken.npz", index=taken)
     files = {"taken": out / "taken.npz"}
     faces = 0
@@ -123,13 +127,11 @@ def heights(ground: F32, xyz: F32) -> F32:
     return (xyz[:, 2] - smooth[raster.at(xyz)]).astype(np.float32)
 
 
-def _held(xyz: F32, things: list[Thing]) -> npt.NDArray[np.int64]:
-    """Indices of the points (N, 3) that are one of the things' own."""
+def _held(columns: Columns, things: list[Thing]) -> npt.NDArray[np.int64]:
+    """Indices of the points that are one of the things' own."""
     import numpy as np
 
-    from scan2sim.pipeline.standing import Columns
-
-    columns = Columns(xyz)
+    xyz = columns.xyz
     near = [columns.near(thing.stem.middle, 4.0) for thing in things]
     own = [index[thing.held(xyz[index])] for index, thing in zip(near, things, strict=True)]
     return np.unique(np.concatenate([np.zeros(0, np.int64), *own]))

@@ -100,20 +100,16 @@ def voxel_groups(xyz: F32, size: float) -> Groups:
     """
     import numpy as np
 
+    from scan2sim.pipeline.ordering import first_of_each, ordered
+
     code = np.zeros(len(xyz), np.int64)
     for axis, shift in ((2, 0.5), (1, 0.0), (0, 0.0)):
         # the guard: a place on the face of two voxels is in the same one, whatever the origin
         cell = np.floor(xyz[:, axis].astype(np.float64) / size + shift + 1e-6).astype(np.int64)
         cell -= cell.min()
         code = code * (cell.max() + 1) + cell
-    bits = len(xyz).bit_length()
-    if int(code.max(initial=0)).bit_length() + bits < 64:  # numbers are sorted several times as fast as their places
-        packed = np.sort(code << bits | np.arange(len(xyz)))
-        order, code = packed & ((1 << bits) - 1), packed >> bits
-    else:
-        order = np.argsort(code, kind="stable")
-        code = code[order]
-    starts = np.flatnonzero(np.concatenate([[True], code[1:] != code[:-1]]))
+    order, code = ordered(code)
+    starts = np.flatnonzero(first_of_each(code))
     return order, starts
 
 
