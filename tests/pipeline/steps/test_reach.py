@@ -116,5 +116,5 @@ def test_only_where_photos_are_taken_along_a_path_and_neighbours_read_it() -> No
         replace(bare, name="b", cell=Cell((10, 0), {"a": (0, 0)})),
     ]
     nodes = {node.label: node for node in survey_recipe(tiles, Settings())}
-    read = {(source.node, source.name) for source in nodes["a/overlap"].inputs.values()}  # type: ignore[union-attr]
+    read = {(source.node.label, source.name) for source in nodes["a/overlap"].inputs.values()}  # type: ignore[union-attr]
     assert read == {("a/reach", "cloud"), ("b/reach", "cloud")}
