@@ -111,6 +111,11 @@ class Thing:
     index: Ints
 
     @property
+    def box(self) -> Rectangle:
+        """Its box in plan."""
+        return Rectangle(self.centre[0], self.centre[1], self.heading, self.length, self.width)
+
+    @property
     def corners(self) -> F64:
         """(4, 2) of its box, anticlockwise, local metres."""
         along = np.array([np.cos(self.heading), np.sin(self.heading)])
@@ -198,9 +203,8 @@ def no_vehicles(scan: Scan, found: Sequence[Thing]) -> Ints:
     if found:
         tree = cKDTree(scan.xyz[:, :2])
         for thing in found:
-            box = Rectangle(thing.centre[0], thing.centre[1], thing.heading, thing.length, thing.width)
             near = np.array(tree.query_ball_point(thing.centre[:2], thing.length / 2 + 1.5), np.int64)
-            told[near[box.inside(scan.xyz[near, :2], SKIN)]] = False
+            told[near[thing.box.inside(scan.xyz[near, :2], SKIN)]] = False
     wrong = told & (scan.ground | (scan.height < FEET))
     for cluster in clusters(scan.xyz, told & ~wrong):
         box = rectangle(scan.xyz[cluster, :2])
@@ -232,9 +236,12 @@ def people(scan: Scan) -> list[Thing]:
 
 def no_people(scan: Scan) -> Ints:
     """Indices of points that are told to be persons', in things of their size that most votes take for another."""
-    found = [thing.index for thing in _of_a_persons_size(scan) if not _is_person(scan, thing)]
-    index = np.unique(np.concatenate([*found, np.zeros(0, np.int64)]))
-    return index[scan.label[index] == CODE["person"]]
+    told = np.flatnonzero(scan.label == CODE["person"])
+    wrong = np.zeros(len(told), bool)
+    for thing in _of_a_persons_size(scan):
+        if not _is_person(scan, thing):
+            wrong |= thing.box.inside(scan.xyz[told, :2], SKIN) & (scan.height[told] < thing.height + 0.1)
+    return told[wrong]
 
 
 def _is_person(scan: Scan, thing: Thing) -> bool:
