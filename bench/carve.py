@@ -21,7 +21,7 @@ import numpy as np
 from scan2sim.data_samples.layout import lay_out
 from scan2sim.data_samples.scanner import plan_drive, scan
 from scan2sim.data_samples.scene import Scene
-from scan2sim.flows.recipe import scanner_path
+from scan2sim.flows.recipes.tile import scanner_path
 from scan2sim.pipeline.classes import CODE, name_of
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.step import silent

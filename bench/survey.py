@@ -24,7 +24,7 @@ import numpy as np
 from bench.measure import measure
 from scan2sim.data_samples.photos import Effects
 from scan2sim.data_samples.street import generate
-from scan2sim.flows.cut import Options, cut_survey
+from scan2sim.flows.commands.cut import Options, cut_survey
 from scan2sim.pipeline.io.tile import read_tile
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -39,7 +39,7 @@ RUNS = {  # part: options of `scan2sim survey`
 }
 COARSE = ("voxel.size=0.2", "unwrap.texel=0.04", "visibility.pixels=500000", "pictures.width=640")
 EMPTY = """
-import scan2sim.flows.prefect_settings
+import scan2sim.flows.deployed.prefect_settings
 from prefect import flow
 flow(lambda: None, name="empty")()
 """

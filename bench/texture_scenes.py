@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from scan2sim.flows.recipe import scanner_path
+from scan2sim.flows.recipes.tile import scanner_path
 from scan2sim.pipeline.classes import GROUPS
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.tile import read_tile

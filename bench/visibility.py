@@ -32,11 +32,11 @@ from scan2sim.data_samples.layout import FRAME, lay_out
 from scan2sim.data_samples.scanner import plan_drive
 from scan2sim.data_samples.scene import Scene
 from scan2sim.data_samples.street import generate
-from scan2sim.flows.execute import execute
-from scan2sim.flows.graph import NodeId, needed
-from scan2sim.flows.planning import plan
-from scan2sim.flows.recipe import recipe
-from scan2sim.flows.settings import Settings
+from scan2sim.flows.engine.execution import execute
+from scan2sim.flows.engine.planning import plan
+from scan2sim.flows.recipes.graph import NodeId, needed
+from scan2sim.flows.recipes.settings import Settings
+from scan2sim.flows.recipes.tile import recipe
 from scan2sim.pipeline import visibility
 from scan2sim.pipeline.classes import CLASSES, GROUPS
 from scan2sim.pipeline.io.tile import read_tile

@@ -1,6 +1,6 @@
 """What a step is: a pure function on files with frozen parameters, a name and a version.
 
-To add one: a function, its `Params`, one line in `flows/recipe.py`, one test.
+To add one: a function, its `Params`, one line in `flows/recipes/tile.py`, one test.
 """
 
 from __future__ import annotations

@@ -141,7 +141,7 @@ def load(weights, device):
 
 
 def test_a_feature_is_one_file(add: Add) -> None:
-    from scan2sim.flows.slam import Options, _tracker
+    from scan2sim.flows.commands.slam import Options, _tracker
     from scan2sim.pipeline.types import Camera
 
     add(features, "blobs", """

@@ -16,9 +16,9 @@ import pytest
 import typer
 from pydantic import BaseModel, ValidationError
 
-from scan2sim.flows.cli import app
-from scan2sim.flows.prepare import Drive
-from scan2sim.flows.recipe import STEPS
+from scan2sim.flows.cli import COMMANDS, app, loaded
+from scan2sim.flows.commands.drive import Drive
+from scan2sim.flows.recipes.tile import STEPS
 from scan2sim.pipeline.classes import SURFACES
 from scan2sim.pipeline.io.survey import SurveyFile
 from scan2sim.pipeline.io.tile import TileFile
@@ -53,6 +53,8 @@ def commands(group: Any, name: tuple[str, ...] = ("scan2sim",)) -> Iterator[tupl
 
 
 OPTIONS = dict(commands(typer.main.get_command(app)))
+for command in COMMANDS:
+    OPTIONS |= dict(commands(loaded(command), ("scan2sim", command)))
 ALL = set().union(*OPTIONS.values())
 
 

@@ -53,8 +53,8 @@ def test_the_missing_library_and_its_package_are_named(monkeypatch: pytest.Monke
 
 
 def test_a_run_says_so_before_it_starts(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, small_street: Path) -> None:
-    from scan2sim.flows.run import run_tile
-    from scan2sim.flows.settings import Settings
+    from scan2sim.flows.commands.run import run_tile
+    from scan2sim.flows.recipes.settings import Settings
 
     lacking_usb(monkeypatch)
     with pytest.raises(UnavailableError, match=r"libusb-1\.0\.so\.0"):

@@ -7,7 +7,7 @@ import io
 import pytest
 from rich.console import Console
 
-from scan2sim.flows import display
+from scan2sim.flows.commands import display
 
 
 @pytest.mark.parametrize("width", [80, 120])

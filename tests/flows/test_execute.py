@@ -17,9 +17,11 @@ from pathlib import Path
 import pytest
 
 import scan2sim
-from scan2sim.flows.execute import check_version, execute, locked, versions
-from scan2sim.flows.graph import NodeId
-from scan2sim.flows.planning import Reason, plan
+from scan2sim.flows.engine.execution import execute
+from scan2sim.flows.engine.lock import locked
+from scan2sim.flows.engine.planning import Reason, plan
+from scan2sim.flows.engine.versions import check_version, versions
+from scan2sim.flows.recipes.graph import NodeId
 from scan2sim.pipeline.errors import BusyError, DataError, StepError, UnavailableError
 from scan2sim.pipeline.extras import EXTRA_OF
 from scan2sim.pipeline.store import Digests, Manifest, Store, _seal, digest
@@ -218,8 +220,9 @@ def test_a_bug_and_a_killed_process_become_step_errors(run: Run) -> None:
 @pytest.mark.parametrize("how", ["litter", "bug", "SIGINT"])
 def test_whatever_ends_a_run_nothing_but_its_message_is_shown(tmp_path: Path, source: Path, how: str) -> None:
     script = (
-        "import sys; from pathlib import Path; from scan2sim.flows.execute import *\n"
-        "from scan2sim.flows.planning import plan; from tests.flows.toy import chain\n"
+        "import sys; from pathlib import Path; from scan2sim.flows.engine.execution import *\n"
+        "from scan2sim.flows.engine.planning import *; from scan2sim.pipeline.errors import *\n"
+        "from tests.flows.toy import chain\n"
         f"p, does = Path({str(tmp_path)!r}), {'hang' if how == 'SIGINT' else how!r}\n"
         "store = Store(p / 'store')\n"
         "nodes = chain(p / 'source.txt', p / 'log', b={'does': does}, c={'does': 'hang'})\n"
@@ -243,9 +246,9 @@ def test_whatever_ends_a_run_nothing_but_its_message_is_shown(tmp_path: Path, so
 
 def test_ctrl_c_before_anything_runs_is_quiet_too(tmp_path: Path, source: Path) -> None:
     script = (
-        "import os, signal, sys; from scan2sim.flows import execute\n"
+        "import os, signal, sys; from scan2sim.flows.engine import processes\n"
         "try:\n"
-        "    execute._processes(); os.killpg(0, signal.SIGINT); import time; time.sleep(20)\n"
+        "    processes._processes(); os.killpg(0, signal.SIGINT); import time; time.sleep(20)\n"
         "except KeyboardInterrupt: sys.exit('interrupted')\n"
     )
     child = subprocess.run(
@@ -274,8 +277,8 @@ def test_two_runs_do_not_share_a_folder(tmp_path: Path) -> None:
 
 def test_kill_9_leaves_nothing_half_made_and_no_process_behind(tmp_path: Path, source: Path, run: Run) -> None:
     script = (
-        "from pathlib import Path; from scan2sim.flows.execute import *; from scan2sim.flows.planning import plan\n"
-        "from tests.flows.toy import chain\n"
+        "from pathlib import Path; from scan2sim.flows.engine.execution import *\n"
+        "from scan2sim.flows.engine.planning import plan; from tests.flows.toy import chain\n"
         f"p = Path({str(tmp_path)!r}); s = Store(p / 'store')\n"
         "execute(plan(chain(p / 'source.txt', p / 'log', b={'does': 'hang'}), s), s, jobs=1, watch=lambda *_: None)\n"
     )

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from scan2sim.flows.findings import findings
-from scan2sim.flows.run import WORST, show_findings
+from scan2sim.flows.commands.shown import WORST, show_findings
+from scan2sim.flows.reports.findings import findings
 from scan2sim.pipeline.store import Manifest
 
 GOOD: dict[str, dict[str, Any]] = {

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from scan2sim.flows import gazebo
+from scan2sim.flows.reports import gazebo
 
 
 @pytest.mark.parametrize(("program", "release"), [("gz", "Garden and later"), ("ign", "Fortress")])

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from scan2sim.flows.execute import execute
-from scan2sim.flows.memory import parse, share
-from scan2sim.flows.planning import plan
+from scan2sim.flows.engine.execution import execute
+from scan2sim.flows.engine.memory import parse, share
+from scan2sim.flows.engine.planning import plan
 from scan2sim.pipeline.errors import ScanError, SettingError
 from scan2sim.pipeline.store import Store
 from tests.conftest import ROOT
@@ -64,7 +64,8 @@ def test_more_than_there_is_runs_alone() -> None:
 def test_a_killed_process_gives_its_share_back(tmp_path: Path) -> None:
     script = (
         f"import tempfile, time; tempfile.tempdir = {str(tmp_path)!r}\n"
-        "from scan2sim.flows.memory import share\nwith share(1.0, 1.0): print('held', flush=True); time.sleep(60)"
+        "from scan2sim.flows.engine.memory import share\n"
+        "with share(1.0, 1.0): print('held', flush=True); time.sleep(60)"
     )
     child = subprocess.Popen([sys.executable, "-c", script], cwd=ROOT, stdout=subprocess.PIPE)
     assert child.stdout and child.stdout.readline()
@@ -105,7 +106,7 @@ def test_the_queue_is_its_users_alone(tmp_path: Path) -> None:
 def test_steps_that_do_not_fit_together_run_one_after_the_other(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("scan2sim.flows.execute.need", lambda *_: 3.0)
+    monkeypatch.setattr("scan2sim.flows.engine.execution.need", lambda *_: 3.0)
     (tmp_path / "source.txt").write_text("1")
     running, most = set(), []
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from scan2sim.flows.prepare import read_drive, survey_of
+from scan2sim.flows.commands.drive import read_drive, survey_of
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.io.survey import read_survey
 
@@ -49,7 +49,7 @@ def test_a_drive_says_how_it_is_cut_unless_it_is_said_otherwise(corridor: Path, 
 def test_newer_code_cuts_again(corridor: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     survey = Path(survey_of(corridor, tmp_path / "out", length=6.0, buffer=2.0))
     before = survey.stat().st_ino
-    monkeypatch.setattr("scan2sim.flows.cut.VERSION", 1000)
+    monkeypatch.setattr("scan2sim.flows.commands.cut.VERSION", 1000)
     survey_of(corridor, tmp_path / "out", length=6.0, buffer=2.0)
     assert survey.stat().st_ino != before
 
@@ -73,10 +73,10 @@ def test_a_path_and_a_corridor_are_made_again_by_newer_code_and_of_other_files(
         made.append("sweeps")
         out.mkdir(exist_ok=True)
 
-    monkeypatch.setattr("scan2sim.flows.slam.slam_video", slam)
+    monkeypatch.setattr("scan2sim.flows.commands.slam.slam_video", slam)
     monkeypatch.setattr("scan2sim.pipeline.io.sweeps.import_sweeps", sweeps)
     monkeypatch.setattr("scan2sim.pipeline.io.sweeps.camera_of_photos", lambda *_, **__: None)
-    monkeypatch.setattr("scan2sim.flows.prepare._cut", lambda corridor, *_: corridor)
+    monkeypatch.setattr("scan2sim.flows.commands.drive._cut", lambda corridor, *_: corridor)
 
     def again() -> list[str]:
         made.clear()
@@ -84,7 +84,7 @@ def test_a_path_and_a_corridor_are_made_again_by_newer_code_and_of_other_files(
         return list(made)
 
     assert again() == ["slam", "sweeps"] and again() == []
-    monkeypatch.setattr("scan2sim.slam.track.VERSION", 1000)
+    monkeypatch.setattr("scan2sim.flows.commands.drive.TRACK", 1000)
     assert again() == ["slam"] and again() == []
     monkeypatch.setattr("scan2sim.pipeline.io.sweeps.VERSION", 1000)
     assert again() == ["sweeps"] and again() == []
@@ -117,8 +117,8 @@ def test_what_no_drive_says_is_told(tmp_path: Path, text: str, told: str) -> Non
 
 
 def test_two_at_once_are_told(corridor: Path, tmp_path: Path) -> None:
-    from scan2sim.flows.execute import locked
-    from scan2sim.flows.prepare import PREPARED
+    from scan2sim.flows.commands.drive import PREPARED
+    from scan2sim.flows.engine.lock import locked
     from scan2sim.pipeline.errors import BusyError
 
     with locked(tmp_path / "out" / PREPARED), pytest.raises(BusyError):

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scan2sim.flows.graph import Node
-from scan2sim.flows.planning import Planned
-from scan2sim.flows.report import telling, write_report
+from scan2sim.flows.engine.planning import Planned
+from scan2sim.flows.recipes.graph import Node
+from scan2sim.flows.reports.tile import telling, write_report
 from scan2sim.pipeline.io import image
 from scan2sim.pipeline.step import Done, Params, Step
 from scan2sim.pipeline.store import Manifest, Store

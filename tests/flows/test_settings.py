@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import get_args, get_type_hints
 
 import pytest
-from typer.main import get_command
 from typer.testing import CliRunner
 
-from scan2sim.flows.cli import app
-from scan2sim.flows.numbers import Numbers
-from scan2sim.flows.recipe import STEPS
-from scan2sim.flows.settings import Settings
+from scan2sim.flows.cli import COMMANDS, app, loaded
+from scan2sim.flows.commands.numbers import Numbers
+from scan2sim.flows.recipes.settings import Settings
+from scan2sim.flows.recipes.tile import STEPS
 from scan2sim.pipeline.errors import SettingError
 from scan2sim.pipeline.ranges import told
 from scan2sim.pipeline.step import Params
@@ -131,11 +129,9 @@ def test_the_page_of_settings_tells_their_ranges() -> None:
 
 
 def test_every_number_that_a_command_takes_has_a_range() -> None:
-    def commands(group: Any) -> Iterator[Any]:
-        for one in group.commands.values():
-            yield from commands(one) if hasattr(one, "commands") else [one]
-
-    hints = [get_type_hints(one.callback) for one in commands(get_command(app))]
+    found = [loaded(name) for name in COMMANDS]
+    single = [one for some in found for one in getattr(some, "commands", {"": some}).values()]
+    hints = [get_type_hints(one.callback) for one in single]
     numbers = {name for of in hints for name, kind in of.items() if {int, float} & {kind, *get_args(kind)}}
     assert len(numbers) > 15 and numbers <= Numbers.model_fields.keys()
 

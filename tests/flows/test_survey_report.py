@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scan2sim.flows import survey_report
-from scan2sim.flows.survey_report import TileState, overview, rows, write_survey_report
+from scan2sim.flows.reports.survey import DATA, PAGE, TileState, overview, rows, write_survey_report
 from scan2sim.pipeline.cells import cells, outline
 from scan2sim.pipeline.errors import SpaceError
 from scan2sim.pipeline.io import image
@@ -169,4 +168,4 @@ def test_a_page_is_written_whole_or_not_at_all(tmp_path: Path, monkeypatch: pyte
     with pytest.raises(SpaceError):
         write_survey_report(tmp_path, "town", tiles(3))
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
-    assert survey_report.PAGE in before and survey_report.DATA in before
+    assert PAGE in before and DATA in before

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from scan2sim.flows.cut import Options, cut_survey
+from scan2sim.flows.commands.cut import Options, cut_survey
 from scan2sim.pipeline.classes import GROUPS, group_of
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.tile import read_tile
@@ -127,7 +127,7 @@ def contents(out: Path) -> dict[str, str]:
 
 
 def test_two_runs_do_not_share_a_store(survey: Path, made: Path) -> None:
-    from scan2sim.flows.execute import locked
+    from scan2sim.flows.engine.lock import locked
 
     with locked(made):
         bad(scan2sim("survey", survey, "--out", made, *SMALL), 8, "another run")

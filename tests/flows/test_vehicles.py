@@ -14,8 +14,8 @@ from scan2sim.data_samples.layout import FRAME, lay_out
 from scan2sim.data_samples.scene import build
 from scan2sim.data_samples.street import generate
 from scan2sim.flows.cli import app
-from scan2sim.flows.recipe import recipe
-from scan2sim.flows.settings import Settings
+from scan2sim.flows.recipes.settings import Settings
+from scan2sim.flows.recipes.tile import recipe
 from scan2sim.pipeline.classes import CODE
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.step import silent

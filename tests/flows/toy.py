@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 from typing import Literal
 
-from scan2sim.flows.graph import Node, NodeId, Output
+from scan2sim.flows.recipes.graph import Node, NodeId, Output
 from scan2sim.pipeline.errors import DataError
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 

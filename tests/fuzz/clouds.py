@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from random import Random
 
-from scan2sim.flows.inspect import inspect_path
+from scan2sim.flows.commands.inspect import inspect_path
 from scan2sim.pipeline.io import clouds
 from scan2sim.pipeline.io.las_csv import import_las
 from scan2sim.pipeline.types import Frame

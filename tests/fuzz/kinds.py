@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from scan2sim.flows.inspect import inspect_path
+from scan2sim.flows.commands.inspect import inspect_path
 from scan2sim.pipeline.io.tile import read_tile
 from tests.fuzz import clouds, models, tables
 from tests.fuzz.damage import Damage

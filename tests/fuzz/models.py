@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from scan2sim.flows.inspect import inspect_path
+from scan2sim.flows.commands.inspect import inspect_path
 from scan2sim.pipeline.errors import DataError
 from scan2sim.pipeline.io import image
 from scan2sim.pipeline.io.import_model import import_model

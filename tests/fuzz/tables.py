@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 import tomli_w
 
-from scan2sim.flows.prepare import read_drive
-from scan2sim.flows.recipe import STEPS
-from scan2sim.flows.settings import Settings
+from scan2sim.flows.commands.drive import read_drive
+from scan2sim.flows.recipes.settings import Settings
+from scan2sim.flows.recipes.tile import STEPS
 from scan2sim.pipeline.io import gps as gps_io
 from scan2sim.pipeline.io import sweeps
 from scan2sim.pipeline.io import trajectory as trajectory_io

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from laspy.vlrs.known import ClassificationLookupVlr
 
-from scan2sim.flows.cut import Options, cut_survey
+from scan2sim.flows.commands.cut import Options, cut_survey
 from scan2sim.pipeline.classes import CODE, code_of, parse
 from scan2sim.pipeline.errors import InputError, SettingError
 from scan2sim.pipeline.io import clouds

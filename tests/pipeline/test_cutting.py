@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 import tomli_w
 
-from scan2sim.flows import cut as cutting
-from scan2sim.flows.cut import Options, cut_survey
+from scan2sim.flows.commands import cut as cutting
+from scan2sim.flows.commands.cut import Options, cut_survey
 from scan2sim.pipeline.cutting import members, seeds
 from scan2sim.pipeline.errors import DataError, InputError, SettingError
 from scan2sim.pipeline.io import clouds

@@ -13,9 +13,10 @@ import pytest
 from typer.testing import CliRunner
 
 from scan2sim.flows.cli import app
-from scan2sim.flows.run import run_tile, show_plan
-from scan2sim.flows.settings import Settings
-from scan2sim.flows.surveying import run_source
+from scan2sim.flows.commands.plan import show_plan
+from scan2sim.flows.commands.run import run_tile
+from scan2sim.flows.commands.survey import run_source
+from scan2sim.flows.recipes.settings import Settings
 from scan2sim.pipeline.errors import InputError, SettingError, UnavailableError, exit_code
 from scan2sim.pipeline.extras import EXTRA_OF
 from tests.conftest import ROOT

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from scan2sim.flows.execute import execute
-from scan2sim.flows.planning import plan
+from scan2sim.flows.engine.execution import execute
+from scan2sim.flows.engine.planning import plan
 from scan2sim.pipeline.errors import InputError, UnavailableError
 from scan2sim.pipeline.io.remote import CACHE, Remote, is_remote, likeness
 from scan2sim.pipeline.store import Store

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 import scan2sim.slam.track as tracking
 from scan2sim.flows.cli import app
-from scan2sim.flows.slam import Options, _mark, _tracker
+from scan2sim.flows.commands.slam import Options, _mark, _tracker
 from scan2sim.pipeline.errors import InputError, ScanError
 from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.types import Camera
@@ -150,7 +150,7 @@ def test_an_interrupted_run_goes_on_only_from_what_the_same_code_made_of_the_sam
     assert mark() != before
     video.write_bytes(b"one")
     assert mark() == before != mark(every=2)
-    monkeypatch.setattr("scan2sim.flows.slam.VERSION", VERSION + 1)
+    monkeypatch.setattr("scan2sim.flows.commands.slam.VERSION", VERSION + 1)
     assert mark() != before
 
 

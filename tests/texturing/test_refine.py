@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
-from scan2sim.flows.graph import NodeId, Output
-from scan2sim.flows.recipe import recipe
-from scan2sim.flows.settings import Settings
+from scan2sim.flows.recipes.graph import NodeId, Output
+from scan2sim.flows.recipes.settings import Settings
+from scan2sim.flows.recipes.tile import recipe
 from scan2sim.pipeline.cameras import inside, project
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.tile import read_tile

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from scan2sim.flows.execute import check_version, versions
+from scan2sim.flows.engine.versions import check_version, versions
 from scan2sim.pipeline.errors import UnavailableError, exit_code
 from tests.conftest import ROOT
 from tests.flows.prefect.conftest import Server, free_port, kill, on, processes, serving, wait_for
@@ -62,7 +62,7 @@ def test_all_deployments_and_automations_are_taken(server: Server) -> None:
             assert made["work_pool_name"] == pool
             assert set(made["job_variables"]) <= set(known)
             assert made["job_variables"]["env"]["PREFECT_FLOWS_HEARTBEAT_FREQUENCY"] == "30"
-            assert made["entrypoint"] == f"scan2sim.flows.{name}.{name}" and not made["pull_steps"]
+            assert made["entrypoint"] == f"scan2sim.flows.deployed.{name}.{name}" and not made["pull_steps"]
             assert not set(made["parameters"]) - set(made["parameter_openapi_schema"]["properties"])
     nightly = server.deployment("reprocess", "reprocess")
     assert nightly["parameters"]["source"] == "/data/drive" and nightly["parameters"]["out"] == "/data/worlds"

@@ -13,10 +13,10 @@ from typing import Any
 
 import pytest
 
-from scan2sim.flows.dispatch import dispatch
-from scan2sim.flows.execute import run_apart
-from scan2sim.flows.graph import NodeId
-from scan2sim.flows.planning import Planned
+from scan2sim.flows.engine.dispatch import dispatch
+from scan2sim.flows.engine.execution import run_apart
+from scan2sim.flows.engine.planning import Planned
+from scan2sim.flows.recipes.graph import NodeId
 from scan2sim.pipeline.store import Store
 from tests.conftest import ROOT
 from tests.flows.prefect.conftest import Server, environment, kill, on, processes, wait_for

@@ -6,12 +6,13 @@ import sys
 from pathlib import Path
 from unittest.mock import patch
 
-import scan2sim.flows.prefect_settings  # noqa: F401  # isort: skip
+import scan2sim.flows.deployed.prefect_settings  # noqa: F401  # isort: skip
 from prefect import flow
 from prefect.states import Completed, State
 
-from scan2sim.flows.execute import locked, versions
-from scan2sim.flows.tile import by_tasks
+from scan2sim.flows.deployed.tile import by_tasks
+from scan2sim.flows.engine.lock import locked
+from scan2sim.flows.engine.versions import versions
 from scan2sim.pipeline.errors import BusyError
 from scan2sim.pipeline.store import Store
 from tests.flows.prefect.toy_steps import STEPS, planned
@@ -19,7 +20,8 @@ from tests.flows.prefect.toy_steps import STEPS, planned
 
 def toy_tiles(folder: str, tiles: int, gate: str | None, runner: str, pretend: str | None) -> int:
     """All tiles; returns the sum of what came out."""
-    with patch("scan2sim.flows.tile.versions", lambda: versions() | ({"scan2sim": pretend} if pretend else {})):
+    told = versions() | ({"scan2sim": pretend} if pretend else {})
+    with patch("scan2sim.flows.deployed.tile.versions", lambda: told):
         run = by_tasks(runner, 2)
     outcome = run(planned(Path(folder), tiles, gate and Path(gate)), Store(Path(folder) / "steps"))
     outcome.check()

@@ -7,8 +7,8 @@ import os
 import time
 from pathlib import Path
 
-from scan2sim.flows.graph import Node, Output
-from scan2sim.flows.planning import Planned, plan
+from scan2sim.flows.engine.planning import Planned, plan
+from scan2sim.flows.recipes.graph import Node, Output
 from scan2sim.pipeline.step import Done, Inputs, Report, Step
 from scan2sim.pipeline.store import Store
 from tests.flows.toy import ToyParams, toy

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from scan2sim.flows.inspect import inspect_path
+from scan2sim.flows.commands.inspect import inspect_path
 from scan2sim.pipeline.errors import DataError, InputError
 from scan2sim.pipeline.io import clouds, image
 from scan2sim.pipeline.io.clouds import las

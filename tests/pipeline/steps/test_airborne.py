@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scan2sim.flows.recipe import recipe
-from scan2sim.flows.settings import Settings
+from scan2sim.flows.recipes.settings import Settings
+from scan2sim.flows.recipes.tile import recipe
 from scan2sim.pipeline.classes import CODE
 from scan2sim.pipeline.errors import DataError, InputError
 from scan2sim.pipeline.io import footprints

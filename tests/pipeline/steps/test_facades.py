@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from scan2sim.flows.recipe import recipe
-from scan2sim.flows.settings import Settings
+from scan2sim.flows.recipes.settings import Settings
+from scan2sim.flows.recipes.tile import recipe
 from scan2sim.pipeline.cameras import unproject
 from scan2sim.pipeline.classes import CODE
 from scan2sim.pipeline.facades import Rays

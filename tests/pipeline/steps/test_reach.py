@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scan2sim.flows.recipe import recipe, survey_recipe
-from scan2sim.flows.settings import Settings
+from scan2sim.flows.recipes.settings import Settings
+from scan2sim.flows.recipes.survey import survey_recipe
+from scan2sim.flows.recipes.tile import recipe
 from scan2sim.pipeline.cells import Cell
 from scan2sim.pipeline.classes import CODE
 from scan2sim.pipeline.io import views as views_io

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scan2sim.flows.recipe import recipe
-from scan2sim.flows.settings import Settings
+from scan2sim.flows.recipes.settings import Settings
+from scan2sim.flows.recipes.tile import recipe
 from scan2sim.pipeline.classes import CODE
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.step import silent

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-import scan2sim.flows.prefect_settings  # noqa: F401  # isort: skip  # before prefect
+import scan2sim.flows.deployed.prefect_settings  # noqa: F401  # isort: skip  # before prefect
 from prefect import flow, get_run_logger
 from prefect.states import Completed, State
 
-from scan2sim.flows.settings import Settings
-from scan2sim.flows.survey import prepare, survey
-from scan2sim.flows.surveying import changes
+from scan2sim.flows.commands.survey import changes
+from scan2sim.flows.deployed.survey import prepare, survey
+from scan2sim.flows.recipes.settings import Settings
 from scan2sim.pipeline.errors import BusyError
 
 

@@ -14,8 +14,8 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Column
 
-from scan2sim.flows.execute import Event
-from scan2sim.flows.graph import Node
+from scan2sim.flows.engine.frontier import Event
+from scan2sim.flows.recipes.graph import Node
 from scan2sim.pipeline.errors import printable
 from scan2sim.pipeline.step import Report
 

@@ -7,19 +7,28 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Annotated, Literal
 
-from scan2sim.flows import workers
-from scan2sim.flows.display import console, progress, warn
-from scan2sim.flows.execute import Executor, Outcome, limit_cores, locked, versions
-from scan2sim.flows.finish import TILES, Made, finish, is_finished
-from scan2sim.flows.graph import NodeId
-from scan2sim.flows.memory import parse
-from scan2sim.flows.planning import Planned, Reason, drop_damaged, plan
-from scan2sim.flows.prepare import survey_of
-from scan2sim.flows.publish import to_read
-from scan2sim.flows.recipe import check_here, survey_recipe
-from scan2sim.flows.run import STORE, Log, default_jobs, execute_shown, show_results
-from scan2sim.flows.settings import Settings
+import typer
+
+from scan2sim.flows.commands.app import App, Config, HoldOut, Sets, settings_of
+from scan2sim.flows.commands.display import console, progress, warn
+from scan2sim.flows.commands.drive import survey_of
+from scan2sim.flows.commands.log import Log
+from scan2sim.flows.commands.shown import default_jobs, execute_shown, show_results
+from scan2sim.flows.engine import workers
+from scan2sim.flows.engine.execution import Executor, limit_cores
+from scan2sim.flows.engine.frontier import Outcome
+from scan2sim.flows.engine.lock import locked
+from scan2sim.flows.engine.memory import parse
+from scan2sim.flows.engine.planning import STORE, Planned, Reason, drop_damaged, plan
+from scan2sim.flows.engine.versions import versions
+from scan2sim.flows.recipes.graph import NodeId
+from scan2sim.flows.recipes.settings import Settings
+from scan2sim.flows.recipes.survey import survey_recipe
+from scan2sim.flows.recipes.tile import check_here
+from scan2sim.flows.reports.finish import TILES, Made, finish, is_finished
+from scan2sim.flows.reports.publish import to_read
 from scan2sim.pipeline import libraries
 from scan2sim.pipeline.errors import ScanError, SettingError, SpaceError, StepError
 from scan2sim.pipeline.extras import need
@@ -29,15 +38,47 @@ from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.store import Digests, Manifest, Store
 from scan2sim.pipeline.types import Tile
 
+app = App()
+
+
+@app.command()
+def survey(
+    context: typer.Context,
+    source: Annotated[
+        str, typer.Argument(metavar="SOURCE", help="A survey.toml, tile.toml or drive.toml, or its folder.")
+    ],
+    out: Annotated[
+        str, typer.Option("--out", "-o", help="Folder for worlds, reports and kept results, or its s3:// URL.")
+    ],
+    length: Annotated[float | None, typer.Option(help="Metres of road a tile, where it is cut here.")] = None,
+    buffer: Annotated[float | None, typer.Option(help="Metres of overlap, where it is cut here.")] = None,
+    set_: Sets = None,
+    config: Config = None,
+    hold_out: HoldOut = None,
+    jobs: Annotated[int, typer.Option(min=0, help="Steps at a time; 0: as the cores allow.")] = 0,
+    memory: Annotated[str | None, typer.Option(help="What steps may need together, as 20GB.")] = None,
+    runner: Annotated[
+        Literal["processes", "threads", "dask", "ray"], typer.Option(help="The last three: through Prefect.")
+    ] = "processes",
+    address: Annotated[str | None, typer.Option(help="Of a Dask scheduler or Ray cluster.")] = None,
+    cores: Annotated[int | None, typer.Option(min=1, help="That a step may use; default: all.")] = None,
+) -> None:
+    """Make the worlds of all tiles of a survey, which meet, and one of them all."""
+    run_source(
+        source, out, settings_of(set_, config, hold_out), length=length, buffer=buffer, jobs=jobs, memory=memory,
+        runner=runner, address=address, cores=cores,
+        prefect=context.obj,
+    )  # fmt: skip
+
 
 def run_source(
     source: str, target: str, settings: Settings, *, length: float | None, buffer: float | None, jobs: int,
-    memory: str | None, runner: str, address: str | None, cores: int | None,
+    memory: str | None, runner: str, address: str | None, cores: int | None, prefect: Callable[..., object],
 ) -> None:  # fmt: skip
     """`scan2sim survey`: in processes of this machine, or through Prefect on a runner that is named.
 
     Args:
-        source: a drive, a corridor or a survey (`flows.prepare`).
+        source: a drive, a corridor or a survey (`commands.drive`).
         target: folder for all that is made; both may be in object storage.
         length, buffer: metres, of tiles that are cut here; default: as the drive says, or 100 and 5.
         jobs: steps at a time; 0: as the cores allow.
@@ -45,6 +86,7 @@ def run_source(
         runner: "processes", or Prefect's "threads", "dask", "ray".
         address: of a Dask scheduler or a Ray cluster.
         cores: that a step may use.
+        prefect: makes a survey as a flow of Prefect (`flows.cli`).
 
     Raises:
         StepError: tiles failed; all others are finished.
@@ -54,10 +96,7 @@ def run_source(
     if runner != "processes":
         need(f"--runner {runner}", "prefect")
         workers.check(runner)
-        from scan2sim.flows.survey import meet_server, survey
-
-        meet_server()
-        survey(source, target, length, buffer, settings.values, runner, jobs, memory, cores, address)
+        prefect(source, target, length, buffer, settings.values, runner, jobs, memory, cores, address)
         return
     limit_cores(cores)
     libraries.check()
@@ -95,7 +134,7 @@ def make_survey(place: str | Path, target: str | Path, settings: Settings, run: 
         store = _store(place, target)
         digests = Digests(store.root / "digests.json")
         made = _make(survey, settings, store, run, digests, out)
-        report = finish(survey, made, store, out, settings, digests)
+        report = finish(survey, made, store, out, settings, digests, warn)
         digests.save()
         failed = [one for one in made if one.error is not None]
         for one in failed:

@@ -25,7 +25,7 @@ def guard() -> None:
     mark = os.environ[FLOW] = f"{os.getpid()}-{secrets.token_hex(8)}"
     end, _ = os.pipe()  # the other end, which only this process holds open, is closed by its death
     subprocess.Popen(
-        [sys.executable, "-P", "-m", "scan2sim.flows.ephemeral", mark],
+        [sys.executable, "-P", "-m", "scan2sim.flows.deployed.ephemeral", mark],
         stdin=end,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,

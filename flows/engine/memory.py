@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from scan2sim.pipeline.errors import SettingError, UnavailableError, from_os_error
 
 if TYPE_CHECKING:
-    from scan2sim.flows.planning import Planned
+    from scan2sim.flows.engine.planning import Planned
     from scan2sim.pipeline.store import Store
 
 SLOT = 0.25  # GB; memory is shared out in pieces of it

@@ -5,15 +5,31 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Annotated
 
+import typer
 from rich.markup import escape
 from rich.table import Table
 
-from scan2sim.flows.display import console
+from scan2sim.flows.commands.app import App
+from scan2sim.flows.commands.display import console
+from scan2sim.pipeline.classes import name_of
 from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.io import files, xml
+from scan2sim.pipeline.io import clouds, files, xml
+from scan2sim.pipeline.io.crs import name as crs_name
+from scan2sim.pipeline.io.tile import read_tile
+from scan2sim.pipeline.types import Frame
 
 Facts = list[tuple[str, str]]
+
+
+app = App()
+
+
+@app.command()
+def inspect(path: Annotated[Path, typer.Argument(help="A cloud, a tile, a mesh, or a world.")]) -> None:
+    """Show one screen of facts."""
+    inspect_path(path)
 
 
 def inspect_path(path: Path) -> None:
@@ -32,8 +48,6 @@ def inspect_path(path: Path) -> None:
 
 
 def _reader(path: Path) -> Callable[[Path], tuple[str, Facts]]:
-    from scan2sim.pipeline.io import clouds
-
     if path.is_dir():
         if (path / "ept.json").is_file():
             return lambda p: _cloud(p / "ept.json")
@@ -68,11 +82,6 @@ def _bounds(low: object, high: object) -> str:
 def _cloud(path: Path) -> tuple[str, Facts]:
     import numpy as np
 
-    from scan2sim.pipeline.classes import name_of
-    from scan2sim.pipeline.io import clouds
-    from scan2sim.pipeline.io.crs import name as crs_name
-    from scan2sim.pipeline.types import Frame
-
     header = clouds.read_header(path)
     low = tuple(np.floor(header.low).tolist())
     cloud = clouds.read(path, Frame(origin=low))  # type: ignore[arg-type]
@@ -101,10 +110,6 @@ def _cloud(path: Path) -> tuple[str, Facts]:
 
 
 def _tile(path: Path) -> tuple[str, Facts]:
-    from scan2sim.pipeline.io import clouds
-    from scan2sim.pipeline.io.crs import name as crs_name
-    from scan2sim.pipeline.io.tile import read_tile
-
     tile = read_tile(path)
     count = sum(clouds.read_header(p).count for p in tile.clouds)
     missing = sum(not view.photo.is_file() for view in tile.views)

@@ -7,10 +7,10 @@ import shutil
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from scan2sim.flows.execute import versions
-from scan2sim.flows.planning import Planned
-from scan2sim.flows.report import PAGES, SCRIPTS
-from scan2sim.flows.settings import Settings
+from scan2sim.flows.engine.planning import Planned
+from scan2sim.flows.engine.versions import versions
+from scan2sim.flows.recipes.settings import Settings
+from scan2sim.flows.reports.tile import PAGES, SCRIPTS
 from scan2sim.pipeline.errors import DamagedError
 from scan2sim.pipeline.io.worlds import EDITED, STAMP, link, same_file, same_unless_edited, swap
 from scan2sim.pipeline.store import Manifest, Store

@@ -10,16 +10,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from scan2sim.flows import gazebo
-from scan2sim.flows.execute import versions
-from scan2sim.flows.findings import findings
-from scan2sim.flows.planning import Planned
+from scan2sim.flows.engine.planning import Planned
+from scan2sim.flows.engine.versions import versions
+from scan2sim.flows.reports import gazebo
+from scan2sim.flows.reports.findings import findings
 from scan2sim.pipeline.classes import SURFACES
 from scan2sim.pipeline.io import crs
 from scan2sim.pipeline.store import Manifest, Store
 from scan2sim.pipeline.types import Tile
 
-TEMPLATE = "report.html.j2"
+TEMPLATE = "tile.html.j2"
 PAGES = Path(__file__).parent / "pages"
 SCRIPTS = "report_files"
 """Folder beside the page: what it loads to show the world."""

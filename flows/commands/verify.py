@@ -6,18 +6,32 @@ import os
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import Annotated
 
-from scan2sim.flows.display import console, progress, warn
-from scan2sim.flows.execute import locked
-from scan2sim.flows.finish import TILES
-from scan2sim.flows.publish import PLACES
-from scan2sim.flows.run import STORE
+import typer
+
+from scan2sim.flows.commands.app import App
+from scan2sim.flows.commands.display import console, progress, warn
+from scan2sim.flows.engine.lock import locked
+from scan2sim.flows.engine.planning import STORE
+from scan2sim.flows.reports.finish import TILES
+from scan2sim.flows.reports.publish import PLACES
 from scan2sim.pipeline.errors import DamagedError, InputError
 from scan2sim.pipeline.io.worlds import EDITED, STAMP
 from scan2sim.pipeline.store import TEMPORARY, Manifest, damaged, digest, read_manifest
 
+app = App()
 
-def verify(out: Path) -> None:
+
+@app.command()
+def verify(
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="The folder that run or survey was given as --out.")],
+) -> None:
+    """Read all that was made, and say what is damaged; the next run makes that anew."""
+    verify_results(out)
+
+
+def verify_results(out: Path) -> None:
     """Digest all kept results and published worlds below a run's or survey's folder, and print what is damaged.
 
     What users edit (`pipeline.io.worlds.EDITED`) may be as they left it: it is printed where it was changed.

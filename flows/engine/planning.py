@@ -7,10 +7,13 @@ from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 
-from scan2sim.flows.graph import Node, NodeId, Output
+from scan2sim.flows.recipes.graph import Node, NodeId, Output
 from scan2sim.pipeline import libraries
 from scan2sim.pipeline.errors import DamagedError
 from scan2sim.pipeline.store import Manifest, Store, digest, key_of
+
+STORE = "steps"
+"""Folder of kept results, below that of a run."""
 
 
 class Reason(Enum):

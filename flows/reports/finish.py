@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -11,13 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from scan2sim.flows.display import warn
-from scan2sim.flows.findings import findings
-from scan2sim.flows.planning import Planned
-from scan2sim.flows.publish import publish, published, to_read
-from scan2sim.flows.report import figures, write_report
-from scan2sim.flows.settings import Settings
-from scan2sim.flows.survey_report import TileState, write_survey_report
+from scan2sim.flows.engine.planning import Planned
+from scan2sim.flows.recipes.settings import Settings
+from scan2sim.flows.reports.findings import findings
+from scan2sim.flows.reports.publish import publish, published, to_read
+from scan2sim.flows.reports.survey import TileState, write_survey_report
+from scan2sim.flows.reports.tile import figures, write_report
 from scan2sim.pipeline.cells import outline
 from scan2sim.pipeline.errors import ScanError
 from scan2sim.pipeline.io import clouds, geotiff, stac, worlds
@@ -26,6 +25,7 @@ from scan2sim.pipeline.store import Digests, Manifest, Store
 from scan2sim.pipeline.types import Tile
 
 TILES, PICTURE = "tiles", "picture.jpg"
+Warn = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,9 @@ class Made:
         return all(item.reason is None for item in self.planned)
 
 
-def finish(survey: Survey, made: Sequence[Made], store: Store, out: Path, settings: Settings, digests: Digests) -> Path:
+def finish(
+    survey: Survey, made: Sequence[Made], store: Store, out: Path, settings: Settings, digests: Digests, warn: Warn
+) -> Path:
     """Write all that users look at below `out`; returns the survey's page.
 
     Raises:
@@ -60,13 +62,13 @@ def finish(survey: Survey, made: Sequence[Made], store: Store, out: Path, settin
     """
     whole = [one for one in made if one.done is not None]
     for one in whole:
-        _finish_tile(one, store.within(one.name), out / TILES / one.name, settings)
+        _finish_tile(one, store.within(one.name), out / TILES / one.name, settings, warn)
     if whole:
-        _together(survey, whole, out, digests)
+        _together(survey, whole, out, digests, warn)
     return write_survey_report(out, survey.name, [_state(one, out) for one in made])
 
 
-def _finish_tile(one: Made, store: Store, out: Path, settings: Settings) -> None:
+def _finish_tile(one: Made, store: Store, out: Path, settings: Settings, warn: Warn) -> None:
     """A tile's folder, as `scan2sim run` leaves it; what is no longer of use is removed from the store."""
     assert one.tile is not None and one.done is not None
     planned, done = list(one.planned), dict(one.done)
@@ -90,7 +92,7 @@ def is_finished(store: Store, planned: Sequence[Planned], out: Path) -> bool:
     return (out / "report.json").is_file() and (out / "report.html").is_file() and published(store, planned, out)
 
 
-def _together(survey: Survey, done: Sequence[Made], out: Path, digests: Digests) -> None:
+def _together(survey: Survey, done: Sequence[Made], out: Path, digests: Digests, warn: Warn) -> None:
     """The world of all tiles, the STAC catalogue, the virtual point cloud and rasters."""
     tiles, items = [], []
     for one in done:

@@ -16,9 +16,9 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from scan2sim.flows import gazebo
-from scan2sim.flows.execute import versions
-from scan2sim.flows.report import write_whole
+from scan2sim.flows.engine.versions import versions
+from scan2sim.flows.reports import gazebo
+from scan2sim.flows.reports.tile import write_whole
 from scan2sim.pipeline.classes import SURFACES
 from scan2sim.pipeline.errors import from_os_error
 

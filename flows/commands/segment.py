@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+import typer
 
-from scan2sim.flows.display import console, progress
-from scan2sim.flows.execute import locked
-from scan2sim.flows.graph import NodeId, needed
-from scan2sim.flows.planning import drop_damaged, plan
-from scan2sim.flows.recipe import recipe
-from scan2sim.flows.run import STORE, Log, execute_shown, show_warnings
-from scan2sim.flows.settings import Settings
+from scan2sim.flows.commands.app import App, Config, Sets, TilePath, settings_of
+from scan2sim.flows.commands.display import console, progress
+from scan2sim.flows.commands.log import Log
+from scan2sim.flows.commands.shown import execute_shown, show_warnings
+from scan2sim.flows.engine.lock import locked
+from scan2sim.flows.engine.planning import STORE, drop_damaged, plan
+from scan2sim.flows.recipes.graph import NodeId, needed
+from scan2sim.flows.recipes.settings import Settings
+from scan2sim.flows.recipes.tile import recipe
 from scan2sim.pipeline.errors import DataError, SettingError
 from scan2sim.pipeline.extras import need
 from scan2sim.pipeline.io import image
@@ -22,12 +26,56 @@ from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.las_classes import write_classified
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.store import Store
-from scan2sim.pipeline.types import U8, PointCloud, Tile
+from scan2sim.pipeline.types import U8, Camera, PointCloud, Tile
+from scan2sim.segmentation.backends import load
+from scan2sim.segmentation.label import LABEL
+from scan2sim.segmentation.labelled import pairs, read, read_channels
+from scan2sim.segmentation.labels import CLASSES, IGNORED, code_of_index
+from scan2sim.segmentation.photos import Labeller, labels_of
 from scan2sim.segmentation.score import confusion
 from scan2sim.segmentation.segment import OWN, SHAPE
 from scan2sim.segmentation.things import THINGS
 
 CLOUDS = (".las", ".laz", ".copc")
+
+
+app = App("Classes of a tile's points and photos: `segment TILE --out DIR`.", first=True)
+
+
+@app.command("tile")
+def segment_a_tile(
+    tile: TilePath,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for clouds, labels, masks and kept results.")],
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Tell classes anew where the cloud has some.")] = False,
+    set_: Sets = None,
+    config: Config = None,
+) -> None:
+    """Classify a tile's points from its photos; write LAZ, label pictures and masks."""
+    segment_tile(tile, out, settings_of([*(set_ or []), *(["segment.overwrite=true"] if overwrite else [])], config))
+
+
+@app.command("train")
+def segment_train(
+    folder: Annotated[Path, typer.Argument(help="Of images/ and labels/ (docs/segmentation.md).")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="ONNX file of the weights.")] = Path("street.onnx"),
+    minutes: Annotated[float, typer.Option(help="At most; 0: no limit.")] = 0,
+    steps: Annotated[int, typer.Option(help="Of the optimiser.")] = 3000,
+    seed: Annotated[int, typer.Option(help="Of weights, crops and looks.")] = 0,
+    start: Annotated[Path | None, typer.Option(help="Weights (safetensors) to go on from.")] = None,
+) -> None:
+    """Train the project's own network on labelled photos."""
+    train_network(folder, out, minutes=minutes, steps=steps, seed=seed, start=start)
+
+
+@app.command("evaluate")
+def segment_evaluate(
+    path: Annotated[Path, typer.Argument(help="A tile whose cloud has classes, or a folder of labelled photos.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for a tile's results.")] = Path("segment-out"),
+    set_: Sets = None,
+    config: Config = None,
+) -> None:
+    """Print how classes that are told compare with those that are known."""
+    evaluate(path, out, settings_of([*(set_ or []), "segment.overwrite=true"], config))
 
 
 def segment_tile(path: Path, out: Path, settings: Settings) -> None:
@@ -111,9 +159,6 @@ def _write_clouds(tile: Tile, out: Path, code: np.ndarray, confidence: np.ndarra
 
 def _write_pictures(views: Path, labels: Path, out: Path) -> None:
     """Codes of every pixel, and masks: 0 on vehicles, people and the sky, 255 elsewhere."""
-    from scan2sim.segmentation.labels import CLASSES, code_of_index
-    from scan2sim.segmentation.photos import labels_of
-
     away = np.isin(np.arange(len(CLASSES)), [CLASSES.index(name) for name in ("vehicle", "person", "sky")])
     for folder in (out / "labels", out / "masks"):
         folder.mkdir(exist_ok=True)
@@ -160,13 +205,6 @@ def evaluate(path: Path, out: Path, settings: Settings) -> None:
 
 def _pixels(folder: Path, settings: Settings) -> dict[str, float]:
     """Intersection over union of a network's pixels, by class; photos taken as they are, with channels if there are."""
-    from scan2sim.pipeline.types import Camera
-    from scan2sim.segmentation.backends import load
-    from scan2sim.segmentation.label import LABEL
-    from scan2sim.segmentation.labelled import pairs, read, read_channels
-    from scan2sim.segmentation.labels import CLASSES, IGNORED, code_of_index
-    from scan2sim.segmentation.photos import Labeller, labels_of
-
     given = settings.params(LABEL)
     network = load(given.network, given.weights, given.device)
     labeller = Labeller(network, str(given.weights or network.facts.name))

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
-from scan2sim.flows.graph import Node, NodeId, Output
-from scan2sim.flows.settings import Settings
+from scan2sim.flows.recipes.graph import Node, NodeId, Output
+from scan2sim.flows.recipes.settings import Settings
 from scan2sim.pipeline.classes import GROUPS
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.step import Step
@@ -257,29 +257,6 @@ def check_here(settings: Settings) -> None:
     for step in STEPS:
         if step.check:
             step.check(settings.params(step))
-
-
-def survey_recipe(tiles: Sequence[Tile], settings: Settings) -> list[Node]:
-    """The graph of several tiles of a survey, which meet.
-
-    Each node comes after those that it reads; else tile after tile, so that the first are finished early.
-
-    Raises:
-        SettingError: as `recipe`.
-    """
-    names = [tile.name for tile in tiles]
-    nodes = {node.id: node for tile in tiles for node in recipe(tile, settings, names)}
-    ordered: dict[NodeId, Node] = {}
-
-    def add(node: Node) -> None:
-        for source in node.inputs.values():
-            if isinstance(source, Output) and source.node not in ordered:
-                add(nodes[source.node])
-        ordered.setdefault(node.id, node)
-
-    for node in nodes.values():
-        add(node)
-    return list(ordered.values())
 
 
 def _weights(settings: Settings) -> dict[str, Path | Output]:

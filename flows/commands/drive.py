@@ -14,14 +14,19 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict
 
-from scan2sim.flows.execute import locked
-from scan2sim.flows.numbers import Buffer, Focal, Length, Pixels, Range, Rate, Shift
+from scan2sim.flows.commands import cut, slam
+from scan2sim.flows.commands.numbers import Buffer, Focal, Length, Pixels, Range, Rate, Shift
+from scan2sim.flows.engine.lock import locked
+from scan2sim.flows.recipes.settings import Settings
 from scan2sim.pipeline.errors import InputError, from_os_error
+from scan2sim.pipeline.io import sweeps as io
 from scan2sim.pipeline.io import toml
 from scan2sim.pipeline.io.remote import is_remote, likeness
+from scan2sim.pipeline.io.tile import sources_of
 from scan2sim.pipeline.ranges import Voxel
 from scan2sim.pipeline.step import Report, silent
 from scan2sim.pipeline.store import Digests
+from scan2sim.slam.track import VERSION as TRACK
 
 Say = Callable[[str], None]
 PREPARED = "prepared"
@@ -175,28 +180,22 @@ def _corridor(drive: Drive, source: Path, out: Path, once: _Once, say: Say, repo
 
 
 def _slam(entry: SlamEntry, here: Path, out: Path, once: _Once) -> Path:
-    from scan2sim.flows.settings import Settings
-    from scan2sim.flows.slam import Options, slam_video
-    from scan2sim.slam.track import VERSION
-
-    options = Options(
+    options = slam.Options(
         gps=entry.gps and here / entry.gps, gps_offset=entry.gps_offset, mask=entry.mask and here / entry.mask,
         camera=entry.camera, focal=entry.focal, centre=entry.centre, fps=entry.fps,
     )  # fmt: skip
     sources = [here / path for path in (entry.video, entry.gps, entry.mask) if path is not None]
 
     def make() -> None:
-        slam_video(sources[0], out, options, Settings())
+        slam.slam_video(sources[0], out, options, Settings())
 
-    once(out, VERSION, sources, entry.model_dump(), make)
+    once(out, TRACK, sources, entry.model_dump(), make)
     return out / "trajectory.csv"
 
 
 def _sweeps(
     entry: SweepsEntry, here: Path, poses: Path | None, out: Path, once: _Once, say: Say, report: Report
 ) -> Path:
-    from scan2sim.pipeline.io import sweeps as io
-
     place = poses or here / (entry.poses or "")
     files = sorted((here / entry.folder).glob("*")) + sorted((here / entry.photos).glob("*") if entry.photos else [])
     camera = Path(entry.camera) if entry.camera.endswith(".toml") else None
@@ -224,11 +223,8 @@ def _sweeps(
 
 
 def _cut(corridor: Path, out: Path, entry: TilesEntry, once: _Once, say: Say, report: Report) -> Path:
-    from scan2sim.flows.cut import VERSION, Options, cut_survey
-    from scan2sim.pipeline.io.tile import sources_of
-
     def make() -> None:
-        cut_survey(corridor, out, Options(entry.length, entry.buffer), overwrite=True, report=report, warn=say)
+        cut.cut_survey(corridor, out, cut.Options(entry.length, entry.buffer), overwrite=True, report=report, warn=say)
 
-    once(out, VERSION, sources_of(corridor), entry.model_dump(), make)
+    once(out, cut.VERSION, sources_of(corridor), entry.model_dump(), make)
     return out / "survey.toml"

@@ -8,9 +8,9 @@ from functools import partial
 from queue import SimpleQueue
 from typing import Any, Protocol
 
-from scan2sim.flows.execute import Frontier, Outcome
-from scan2sim.flows.graph import NodeId
-from scan2sim.flows.planning import Planned
+from scan2sim.flows.engine.frontier import Frontier, Outcome
+from scan2sim.flows.engine.planning import Planned
+from scan2sim.flows.recipes.graph import NodeId
 from scan2sim.pipeline.errors import DamagedError, ScanError, StepError
 from scan2sim.pipeline.store import Store
 

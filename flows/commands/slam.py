@@ -8,13 +8,15 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
 from functools import partial
 from pathlib import Path
-from typing import TypeVar, get_args
+from typing import Annotated, TypeVar, get_args
 
 import numpy as np
+import typer
 
-from scan2sim.flows.display import console, progress
-from scan2sim.flows.execute import locked
-from scan2sim.flows.settings import Settings
+from scan2sim.flows.commands.app import App, Config, Sets, settings_of
+from scan2sim.flows.commands.display import console, progress
+from scan2sim.flows.engine.lock import locked
+from scan2sim.flows.recipes.settings import Settings
 from scan2sim.pipeline.errors import InputError, SettingError
 from scan2sim.pipeline.extras import need
 from scan2sim.pipeline.io import gps as gps_io
@@ -87,6 +89,83 @@ class Options:
     loops: bool = False
     adjust: bool = False
     view: bool = False
+
+
+app = App("Where the camera of a video went: `slam VIDEO --out DIR`.", first=True)
+
+
+@app.command("video")
+def slam_a_video(
+    video: Annotated[Path, typer.Argument(metavar="VIDEO", help="A video file, or a folder of pictures.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the trajectory.")],
+    gps: Annotated[
+        Path | None, typer.Option(help="GPX, NMEA, CSV, or a GoPro video: ties the scale, and places it.")
+    ] = None,
+    gps_offset: Annotated[float | None, typer.Option(help="Seconds to add to its times; first frame at 0.")] = None,
+    local: Annotated[bool, typer.Option("--local", help="Don't place it where GPS says: scale alone.")] = False,
+    mask: Annotated[Path | None, typer.Option(help="Picture: 0 where the car itself is seen.")] = None,
+    camera: Annotated[str, typer.Option(help="auto, equirectangular or pinhole.")] = "auto",
+    focal: Annotated[float | None, typer.Option(help="Pixels, of a pinhole camera.")] = None,
+    centre: Annotated[tuple[float, float] | None, typer.Option(help="Pixels; default: the middle.")] = None,
+    tile: Annotated[Path | None, typer.Option(help="Take the camera of this tile that has the video's size.")] = None,
+    fps: Annotated[float, typer.Option(help="Of a folder of pictures.")] = 10.0,
+    times: Annotated[Path | None, typer.Option(help="Of a folder's pictures: seconds, one a line.")] = None,
+    every: Annotated[int, typer.Option(min=1, help="Take every Nth frame.")] = 1,
+    until: Annotated[float, typer.Option(help="Seconds of the video; 0: all.")] = 0.0,
+    backend: Annotated[str, typer.Option(help="lm, or adam: the mission's.")] = "lm",
+    features: Annotated[str, typer.Option(help="corners (tracked), orb, rootsift, superpoint, aliked.")] = "corners",
+    matcher: Annotated[str, typer.Option(help="nearest, superglue, lightglue.")] = "nearest",
+    weights: Annotated[Path | None, typer.Option(help="Your file of the features' weights.")] = None,
+    matcher_weights: Annotated[Path | None, typer.Option(help="Your file of the matcher's.")] = None,
+    colmap: Annotated[bool, typer.Option("--colmap", help="Write the map as a COLMAP model, too.")] = False,
+    loops: Annotated[bool, typer.Option("--loops", help="Recognise places that were passed before.")] = False,
+    adjust: Annotated[bool, typer.Option("--adjust", help="Adjust all keyframes at once in the end.")] = False,
+    view: Annotated[bool, typer.Option("--view", help="Record what is tracked, and where: view.mp4.")] = False,
+    set_: Sets = None,
+    config: Config = None,
+) -> None:
+    """Poses of a video's frames: TUM, KITTI, CSV, GeoJSON."""
+    options = Options(
+        gps=gps, gps_offset=gps_offset, georeference=not local, mask=mask, camera=camera, focal=focal, centre=centre,
+        tile=tile, fps=fps, times=times, every=every, until=until or None, backend=backend,
+        features=features, matcher=matcher, weights=weights, matcher_weights=matcher_weights,
+        colmap=colmap, loops=loops, adjust=adjust, view=view,
+    )  # fmt: skip
+    slam_video(video, out, options, settings_of(set_, config))
+
+
+@app.command("evaluate")
+def slam_evaluate(
+    trajectory: Annotated[Path, typer.Argument(help="CSV, TUM or KITTI file.")],
+    truth: Annotated[Path, typer.Argument(help="Another, or a GPS track.")],
+    segment: Annotated[float, typer.Option(help="Metres of the local error's segments.")] = 400.0,
+    alignment: Annotated[str, typer.Option(help="similarity2d, rigid2d or similarity3d.")] = "similarity2d",
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="PNG of path and errors.")] = None,
+) -> None:
+    """Print how far a trajectory is from the truth: D3.2's errors, ATE, RPE, drift."""
+    evaluate_trajectory(trajectory, truth, segment=segment, alignment=alignment, out=out)
+
+
+@app.command("study")
+def slam_study(
+    source: Annotated[Path, typer.Argument(metavar="DRIVE", help="A drive's folder, a video, or its frames.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of cells, tables and plots.")],
+    truth: Annotated[Path | None, typer.Option(help="Trajectory or GPS track; default: the drive's.")] = None,
+    gps: Annotated[Path | None, typer.Option(help="Track for the scale; default: the drive's.")] = None,
+    mask: Annotated[Path | None, typer.Option(help="Picture: 0 where the car is; default: the drive's.")] = None,
+    heights: Annotated[str, typer.Option(help="Pixels.")] = "512,768,1024,1536",
+    bitrates: Annotated[str, typer.Option(help="Mbit/s.")] = "1,2,5,10,20,40",
+    rates: Annotated[str, typer.Option(help="Frames a second.")] = "30,15",
+    jobs: Annotated[int, typer.Option(min=1, help="Cells at a time.")] = 1,
+    backend: Annotated[str, typer.Option(help="lm, or adam: the mission's.")] = "lm",
+    set_: Sets = None,
+    config: Config = None,
+) -> None:
+    """What resolution, bit rate and frame rate of the video cost: D3.2's tables 4 and 5."""
+    study_compression(
+        source, out, truth=truth, gps=gps, mask=mask, heights=heights, bitrates=bitrates, rates=rates, jobs=jobs,
+        backend=backend, settings=settings_of(set_, config),
+    )  # fmt: skip
 
 
 def slam_video(path: Path, out: Path, options: Options, settings: Settings) -> Tracked:

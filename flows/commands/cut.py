@@ -11,11 +11,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import typer
 
-from scan2sim.flows.numbers import check
+from scan2sim.flows.commands.app import App
+from scan2sim.flows.commands.display import progress
+from scan2sim.flows.commands.numbers import check
 from scan2sim.pipeline.cells import Cell, Seed, cells
 from scan2sim.pipeline.classes import strangers
 from scan2sim.pipeline.cutting import dense, members, seeds, sees
@@ -103,6 +106,31 @@ class Corridor:
         low, high = np.min([h.low for h in headers], axis=0), np.max([h.high for h in headers], axis=0)
         notes = tuple(f"{c.name}: {note}" for c, h in zip(tile.clouds, headers, strict=True) for note in h.notes)
         return cls(tile, spec, low, high, tuple(h.count for h in headers), notes)
+
+
+app = App()
+
+
+@app.command()
+def tile(
+    corridor: Annotated[Path, typer.Argument(metavar="CORRIDOR", help="A tile.toml too long for one tile.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The survey's folder.")],
+    length: Annotated[float, typer.Option(help="Metres of road a tile.")] = 100.0,
+    buffer: Annotated[float, typer.Option(help="Metres that tiles' clouds reach beyond their borders.")] = 5.0,
+    reach: Annotated[float, typer.Option(help="Metres from the trajectory beyond which points are left out.")] = 60.0,
+    photo_reach: Annotated[float, typer.Option(help="Metres beyond a tile up to which photos are taken.")] = 40.0,
+    name: Annotated[str | None, typer.Option(help="The survey's name; default: the corridor's.")] = None,
+    copy: Annotated[bool, typer.Option("--copy", help="Copy photos into the tiles instead of naming them.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a survey that is there already.")] = False,
+) -> None:
+    """Cut a long corridor into tiles that overlap: a survey."""
+    told: list[str] = []
+    options = Options(length, buffer, reach, photo_reach, copy)
+    with progress("tile") as report:
+        path = cut_survey(corridor, out, options, name=name, overwrite=overwrite, report=report, warn=told.append)
+    for warning in told:
+        typer.secho(f"warning: {warning}", fg="yellow", err=True)
+    typer.echo(f"Survey: {path}")
 
 
 def cut_survey(

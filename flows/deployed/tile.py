@@ -7,18 +7,20 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import scan2sim.flows.prefect_settings  # noqa: F401  # isort: skip  # before prefect
+import scan2sim.flows.deployed.prefect_settings  # noqa: F401  # isort: skip  # before prefect
 from prefect import flow, get_run_logger, task
 from prefect.artifacts import create_progress_artifact, update_progress_artifact
 from prefect.cache_policies import NO_CACHE
 
-from scan2sim.flows.dispatch import dispatch
-from scan2sim.flows.execute import Executor, Outcome, run_on_worker, versions
-from scan2sim.flows.memory import parse
-from scan2sim.flows.planning import Planned, check
-from scan2sim.flows.run import run_tile
-from scan2sim.flows.settings import Settings
-from scan2sim.flows.workers import workers
+from scan2sim.flows.commands.run import run_tile
+from scan2sim.flows.engine.dispatch import dispatch
+from scan2sim.flows.engine.execution import Executor, run_on_worker
+from scan2sim.flows.engine.frontier import Outcome
+from scan2sim.flows.engine.memory import parse
+from scan2sim.flows.engine.planning import Planned, check
+from scan2sim.flows.engine.versions import versions
+from scan2sim.flows.engine.workers import workers
+from scan2sim.flows.recipes.settings import Settings
 from scan2sim.pipeline.store import Manifest, Store
 
 
@@ -40,7 +42,7 @@ def by_tasks(
     """Runs plans as tasks of the flow that it is called in.
 
     Args:
-        runner, count, address: of the workers (`flows.workers`), which are there while there is work.
+        runner, count, address: of the workers (`engine.workers`), which are there while there is work.
         memory: what steps on one machine may need together, "20GB".
         cores: that a step may use.
 

@@ -9,19 +9,19 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import scan2sim.flows.prefect_settings  # noqa: F401  # isort: skip  # before prefect
+import scan2sim.flows.deployed.prefect_settings  # noqa: F401  # isort: skip  # before prefect
 from prefect import flow, get_run_logger, task
 from prefect.artifacts import create_image_artifact, create_markdown_artifact, create_table_artifact
 from prefect.cache_policies import NO_CACHE
 from prefect.client.orchestration import get_client
 from prefect.settings import PREFECT_API_URL
 
-from scan2sim.flows.ephemeral import guard
-from scan2sim.flows.prepare import survey_of
-from scan2sim.flows.settings import Settings
-from scan2sim.flows.survey_report import overview, rows
-from scan2sim.flows.surveying import make_survey
-from scan2sim.flows.tile import artifact_key, by_tasks
+from scan2sim.flows.commands.drive import survey_of
+from scan2sim.flows.commands.survey import make_survey
+from scan2sim.flows.deployed.ephemeral import guard
+from scan2sim.flows.deployed.tile import artifact_key, by_tasks
+from scan2sim.flows.recipes.settings import Settings
+from scan2sim.flows.reports.survey import overview, rows
 from scan2sim.pipeline.errors import INTERRUPTED, StepError, UnavailableError, exit_code
 from scan2sim.pipeline.io.remote import likeness
 
@@ -78,11 +78,11 @@ def survey(
     """Make a survey's worlds, a task per tile and step; what an earlier run has finished is kept.
 
     Args:
-        source: a drive, a corridor or a survey (`flows.prepare`).
+        source: a drive, a corridor or a survey (`commands.drive`).
         out: folder for the worlds, the reports and kept results.
         length, buffer: metres, of tiles that are cut here; default: as the drive says, or 100 and 5.
         settings: by step, as in a settings file.
-        runner: "threads", "dask" or "ray": where steps run (`flows.workers`).
+        runner: "threads", "dask" or "ray": where steps run (`engine.workers`).
         workers: steps at a time.
         memory: what steps on one machine may need together, "20GB".
         cores: that a step may use; default: all.

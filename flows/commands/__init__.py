@@ -1,0 +1,1 @@
+"""The `scan2sim` command, a file a command; without Prefect."""

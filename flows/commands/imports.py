@@ -1,0 +1,198 @@
+"""`scan2sim import`: a tile from a user's files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from scan2sim.flows.commands.app import App, Classes, Crs, Link, Name, Overwrite, TileOut
+from scan2sim.flows.commands.display import progress
+from scan2sim.pipeline.classes import parse
+from scan2sim.pipeline.errors import SettingError
+from scan2sim.pipeline.io import sweeps as sweeps_io
+from scan2sim.pipeline.io.import_model import import_model
+from scan2sim.pipeline.io.kitti import import_kitti_raw
+from scan2sim.pipeline.io.kitti_odometry import import_kitti_odometry
+from scan2sim.pipeline.io.las_csv import import_las
+
+app = App("Make a tile from your files.")
+
+
+@app.command("kitti-raw")
+def import_kitti(
+    drive: Annotated[Path, typer.Argument(help="A drive's folder (..._sync), or one that holds it.")],
+    out: TileOut,
+    poses: Annotated[Path | None, typer.Option(help="Sweep poses instead of OXTS: row-major 3x4 a line.")] = None,
+    camera: Annotated[list[str] | None, typer.Option(help="Its folder; several times for several.")] = None,
+    max_range: Annotated[float, typer.Option(help="Metres; returns from further away are left out.")] = 50.0,
+    rigid: Annotated[bool, typer.Option("--rigid", help="Sweeps are motion-compensated already.")] = False,
+    name: Name = None,
+    link: Link = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """KITTI raw: merge sweeps by OXTS or a pose file, colour points from the photos."""
+    with progress("import") as report:
+        path = import_kitti_raw(
+            drive, out, poses=poses, cameras=camera or ["image_02"], max_range=max_range, deskew=not rigid,
+            name=name, link=link, overwrite=overwrite, report=report,
+        )  # fmt: skip
+    _imported(path)
+
+
+@app.command("kitti-odometry")
+def import_kitti_sequence(
+    sequence: Annotated[Path, typer.Argument(help="A sequence's folder: velodyne, image_2, calib.txt, times.txt.")],
+    out: TileOut,
+    poses: Annotated[Path | None, typer.Option(help="Of camera 0, 3x4 a line; default: poses.txt in it.")] = None,
+    camera: Annotated[list[str] | None, typer.Option(help="Its folder; several times for several.")] = None,
+    max_range: Annotated[float, typer.Option(help="Metres; returns from further away are left out.")] = 50.0,
+    name: Name = None,
+    link: Link = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """KITTI odometry: merge a sequence's sweeps by its poses, colour points from the photos."""
+    with progress("import") as report:
+        path = import_kitti_odometry(
+            sequence, out, poses=poses, cameras=camera or ["image_2"], max_range=max_range, name=name, link=link,
+            overwrite=overwrite, report=report,
+        )  # fmt: skip
+    _imported(path)
+
+
+def _import_model(kind: str, about: str) -> None:
+    """`scan2sim import KIND`: the same options for every program's posed photos."""
+
+    def command(
+        model: Annotated[Path, typer.Argument(help="The program's file or folder, as above.")],
+        images: Annotated[Path, typer.Argument(help="Folder of the photos.")],
+        out: TileOut,
+        cloud: Annotated[Path | None, typer.Option(help="Dense cloud; default: the sparse points.")] = None,
+        crs: Annotated[
+            str | None, typer.Option(help="To bring it to; or that it is in, where it isn't georeferenced.")
+        ] = None,
+        gps: Annotated[bool, typer.Option("--gps", help="Place it by the GPS in the photos' EXIF.")] = False,
+        upright: Annotated[bool, typer.Option("--upright", help="Turn it so that photos stand upright.")] = False,
+        scale: Annotated[float, typer.Option(help="Metres per unit of the model.")] = 1.0,
+        classes: Classes = "",
+        name: Name = None,
+        link: Link = False,
+        overwrite: Overwrite = False,
+    ) -> None:
+
+        told: list[str] = []
+        with progress("import") as report:
+            path = import_model(
+                kind, model, images, out, cloud=cloud, crs=crs, gps=gps, up="photos" if upright else None, scale=scale,
+                classes=parse(classes), name=name, link=link, overwrite=overwrite, warn=told.append, report=report,
+            )  # fmt: skip
+        _imported(path, told)
+
+    app.command(kind, help=about)(command)
+
+
+_import_model("colmap", "COLMAP: a folder of cameras, images and points3D, .txt or .bin (often sparse/0).")
+_import_model("opensfm", "OpenSfM or OpenDroneMap: a reconstruction.json, or the project's folder.")
+_import_model("metashape", "Agisoft Metashape: a cameras.xml (Export Cameras, Agisoft XML); needs a --cloud.")
+_import_model("bundler", "Bundler: a bundle.out, with its list.txt beside it.")
+_import_model("nvm", "VisualSFM: a .nvm file (NVM_V3).")
+
+
+@app.command("las", hidden=True)  # what it was called when it read LAS and PLY alone
+@app.command("clouds")
+def import_plain_clouds(
+    clouds: Annotated[
+        list[Path], typer.Argument(help="LAS, LAZ, COPC, PLY, E57, PCD, XYZ, CSV files, or an ept.json.")
+    ],
+    out: TileOut,
+    photos: Annotated[Path | None, typer.Option(help="CSV of photos and poses (docs/formats.md).")] = None,
+    cameras: Annotated[Path | None, typer.Option(help="CSV of cameras, where the photos' lacks them.")] = None,
+    images: Annotated[Path | None, typer.Option(help="Folder of the photos; default: the CSV's.")] = None,
+    crs: Crs = None,
+    units: Annotated[str | None, typer.Option(help="m, ft or us-ft, where the CRS doesn't say.")] = None,
+    trajectory: Annotated[Path | None, typer.Option(help="CSV of the scanner's path: time,x,y,z.")] = None,
+    orthophoto: Annotated[
+        Path | None, typer.Option(help="GeoTIFF, or JPEG, PNG with a world file: drapes what it covers.")
+    ] = None,
+    footprints: Annotated[
+        Path | None, typer.Option(help="GeoJSON or GeoPackage of buildings: where walls stand.")
+    ] = None,
+    classes: Classes = "",
+    name: Name = None,
+    link: Link = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """Plain clouds, with a CSV of photos if there are any."""
+    told: list[str] = []
+    with progress("import") as report:
+        path = import_las(
+            clouds, out, photos=photos, cameras=cameras, images=images, crs=crs, units=units, trajectory=trajectory,
+            classes=parse(classes), orthophoto=orthophoto, footprints=footprints, name=name, link=link,
+            overwrite=overwrite, warn=told.append, report=report,
+        )  # fmt: skip
+    _imported(path, told)
+
+
+@app.command("sweeps")
+def import_sweeps_and_poses(
+    sweeps: Annotated[Path, typer.Argument(help="Folder of sweeps in scanner axes: .bin, .pcd, .ply, .las, .laz.")],
+    poses: Annotated[Path, typer.Argument(help="Trajectory, of `slam` for example: .csv, .tum, .kitti; z-up.")],
+    out: TileOut,
+    extrinsics: Annotated[
+        Path | None, typer.Option(help="T_camera_scanner, 3 or 4 rows, or KITTI's calibration: poses are the camera's.")
+    ] = None,
+    scanner_poses: Annotated[
+        bool, typer.Option("--scanner-poses", help="Poses are the scanner's all the same.")
+    ] = False,
+    times: Annotated[
+        Path | None, typer.Option(help="Of sweeps, seconds, one a line; default: names, or order.")
+    ] = None,
+    time_offset: Annotated[float, typer.Option(help="Seconds to add to times of sweeps and photos.")] = 0.0,
+    photos: Annotated[Path | None, typer.Option(help="Folder of photos: they colour the points.")] = None,
+    photo_times: Annotated[Path | None, typer.Option(help="Of photos, likewise.")] = None,
+    camera: Annotated[str, typer.Option(help="auto, pinhole, equirectangular, or a TOML like a tile's.")] = "auto",
+    focal: Annotated[float | None, typer.Option(help="Pixels, of a pinhole camera.")] = None,
+    centre: Annotated[tuple[float, float] | None, typer.Option(help="Pixels; default: the middle.")] = None,
+    mask: Annotated[Path | None, typer.Option(help="Of all photos: 0 where the car itself is seen.")] = None,
+    max_range: Annotated[float, typer.Option(help="Metres; returns from further away are left out.")] = 50.0,
+    min_range: Annotated[float, typer.Option(help="Metres; nearer returns, the car's own, are left out.")] = 1.0,
+    deskew: Annotated[str, typer.Option(help="kitti: points by the pose of their own moment; or none.")] = "none",
+    period: Annotated[
+        float | None, typer.Option(help="Seconds of the scanner's turn; default: between sweeps.")
+    ] = None,
+    voxel: Annotated[float | None, typer.Option(help="Keep one point in so many metres.")] = None,
+    keep_unsure: Annotated[bool, typer.Option("--keep-unsure", help="Take unsure stretches of the path, too.")] = False,
+    crs: Crs = "local",
+    name: Name = None,
+    link: Link = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """A scanner's sweeps placed by a trajectory, with photos if there are any."""
+    if deskew not in ("none", "kitti"):
+        raise SettingError("deskew", f"there is no {deskew!r}", "Use kitti, or none")
+    known = None if extrinsics is None else sweeps_io.read_extrinsics(extrinsics)
+    pictures = None
+    if photos is not None:
+        file = Path(camera) if camera.endswith(".toml") or Path(camera).exists() else None
+        shape = sweeps_io.camera_of_photos(
+            photos, model="auto" if file else camera, focal=focal, centre=centre, file=file
+        )
+        beside = None if extrinsics is None else sweeps_io.photo_extrinsics(extrinsics, photos)
+        pictures = sweeps_io.Pictures(photos, shape, photo_times, mask, beside)
+    told: list[str] = []
+    with progress("import") as report:
+        path = sweeps_io.import_sweeps(
+            sweeps, poses, out, extrinsics=known, of="scanner" if scanner_poses else None, times=times,
+            offset=time_offset, photos=pictures, max_range=max_range, min_range=min_range,
+            deskew="kitti" if deskew == "kitti" else "none", period=period, voxel=voxel, keep_unsure=keep_unsure,
+            crs=crs or "local", name=name, link=link, overwrite=overwrite, warn=told.append, report=report,
+        )  # fmt: skip
+    _imported(path, told)
+
+
+def _imported(path: Path, warnings: Sequence[str] = ()) -> None:
+    for warning in warnings:
+        typer.secho(f"warning: {warning}", fg="yellow", err=True)
+    typer.echo(f"Tile: {path}")

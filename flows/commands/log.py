@@ -1,0 +1,34 @@
+"""`run.log`: what was asked for, what ran when, what steps told, and the details of errors."""
+
+from __future__ import annotations
+
+import time
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from scan2sim.pipeline.errors import ScanError, from_os_error
+
+
+class Log:
+    """`run.log`: what was asked for, what ran when, what steps told, and the details of errors."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def write(self, *lines: str) -> None:
+        """Append lines, the first with the time."""
+        with open(self.path, "a", encoding="utf-8") as file:
+            file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} " + "".join(f"{line.rstrip()}\n" for line in lines))
+
+    @contextmanager
+    def errors(self, out: Path) -> Iterator[None]:
+        """Write down what goes wrong within, and pass it on; an error of the system becomes one of ours about `out`."""
+        try:
+            yield
+        except ScanError as error:
+            self.write(f"error: {error}", *getattr(error, "__notes__", traceback.format_exception(error)))
+            raise
+        except OSError as error:
+            raise from_os_error(error, out) from error

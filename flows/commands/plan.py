@@ -1,0 +1,63 @@
+"""`scan2sim plan`: what `run` would run, and why."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.table import Table
+
+from scan2sim.flows.commands.app import App, Config, Force, From, HoldOut, OutDir, Sets, TilePath, settings_of
+from scan2sim.flows.commands.display import console
+from scan2sim.flows.engine.planning import STORE, Planned, check
+from scan2sim.flows.engine.planning import plan as plan_nodes
+from scan2sim.flows.recipes.settings import Settings
+from scan2sim.flows.recipes.tile import recipe
+from scan2sim.pipeline.errors import SettingError
+from scan2sim.pipeline.io.tile import read_tile
+from scan2sim.pipeline.store import Store
+from scan2sim.pipeline.types import Tile
+
+app = App()
+
+
+@app.command()
+def plan(
+    tile: TilePath,
+    out: OutDir = Path("out"),
+    set_: Sets = None,
+    config: Config = None,
+    hold_out: HoldOut = None,
+    force: Force = False,
+    from_: From = None,
+) -> None:
+    """Show what `run` would run, and why."""
+    show_plan(tile, out, settings_of(set_, config, hold_out), force=force, start=from_)
+
+
+def show_plan(path: Path, out: Path, settings: Settings, *, force: bool = False, start: str | None = None) -> None:
+    """Print each step of the tile, whether it would run, and why.
+
+    Raises:
+        ScanError: see `pipeline.errors`; also if a step couldn't run here.
+    """
+    planned, _ = plan_tile(read_tile(path), out, settings, force, start)
+    check(planned)
+    table = Table("step", "would run", "why", box=None, header_style="bold")
+    for item in planned:
+        runs, why = ("yes", item.reason.value) if item.reason else ("no", "kept: same input, settings and version")
+        table.add_row(item.node.label, runs, why, style=None if item.reason else "dim")
+    console.print(table)
+
+
+def plan_tile(tile: Tile, out: Path, settings: Settings, force: bool, start: str | None) -> tuple[list[Planned], Store]:
+    """What would run of a tile, and the store that keeps its results.
+
+    Raises:
+        SettingError: as `recipe`; there is no step `start`.
+    """
+    nodes = recipe(tile, settings)
+    names = {node.step.name for node in nodes}
+    if start is not None and start not in names:
+        raise SettingError(f"--from {start}", "there is no such step", f"Steps are: {', '.join(sorted(names))}")
+    store = Store(out / STORE)
+    return plan_nodes(nodes, store, force=force, start=start), store

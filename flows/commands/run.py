@@ -1,0 +1,89 @@
+"""`scan2sim run`: a tile to a world and its report, in processes, without Prefect."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from scan2sim.flows.commands.app import App, Config, Force, From, HoldOut, OutDir, Sets, TilePath, settings_of
+from scan2sim.flows.commands.display import console, warn
+from scan2sim.flows.commands.log import Log
+from scan2sim.flows.commands.plan import plan_tile
+from scan2sim.flows.commands.shown import execute_shown, show_findings, show_results
+from scan2sim.flows.engine.execution import Executor
+from scan2sim.flows.engine.lock import locked
+from scan2sim.flows.engine.planning import drop_damaged
+from scan2sim.flows.engine.versions import versions
+from scan2sim.flows.recipes.settings import Settings
+from scan2sim.flows.reports.publish import publish, to_read
+from scan2sim.flows.reports.tile import write_report
+from scan2sim.pipeline.io.tile import read_tile
+
+app = App()
+
+
+@app.command()
+def run(
+    tile: TilePath,
+    out: OutDir,
+    set_: Sets = None,
+    config: Config = None,
+    hold_out: HoldOut = None,
+    force: Force = False,
+    from_: From = None,
+    jobs: Annotated[int, typer.Option(min=0, help="Steps at a time; 0: as the cores allow.")] = 0,
+) -> None:
+    """Make a world of a tile; what an earlier run has finished is kept."""
+    run_tile(tile, out, settings_of(set_, config, hold_out), force=force, start=from_, jobs=jobs)
+
+
+def run_tile(
+    path: Path,
+    out: Path,
+    settings: Settings,
+    *,
+    force: bool = False,
+    start: str | None = None,
+    jobs: int = 0,
+    run: Executor | None = None,
+) -> Path:
+    """Make the world of the tile at `path` in `out`; returns the report's path.
+
+    `out` gets: `world/`, `report.html`, `report.json`, `config.json` (all settings as resolved),
+    `run.log`, and `steps/` (kept results).
+
+    Args:
+        run: runs the steps; by default up to `jobs` processes at a time.
+
+    Raises:
+        ScanError: see `pipeline.errors`; earlier results stay.
+    """
+    began = time.perf_counter()
+    tile = read_tile(path)
+    with locked(out):
+        planned, store = plan_tile(tile, out, settings, force, start)
+        if drop_damaged(planned, store, to_read(store, planned, out)):
+            planned, store = plan_tile(tile, out, settings, force, start)
+        log = Log(out / "run.log")
+        log.write(f"tile {tile.path}, settings {json.dumps(settings.values)}, versions {json.dumps(versions())}")
+        missing = sum(p.reason is not None for p in planned)
+        with log.errors(out):
+            outcome = run(planned, store) if run else execute_shown(planned, store, log, jobs)
+            outcome.check()
+            done = outcome.of_tile()
+            changed = publish(store, planned, done, out, tile, settings)
+            report = write_report(tile, planned, done, store, out, seconds=time.perf_counter() - began)
+        store.sweep({p.node.id.name: p.key for p in planned})
+    for warning in changed:
+        warn(warning)
+    show_findings(done)
+    show_results(out / "world" / f"{tile.name}.sdf", report)
+    if missing == 0:
+        console.print(
+            f"[dim]nothing to do: all is as the tile and the settings say ({time.perf_counter() - began:.1f} s)"
+        )
+    return report

@@ -1,0 +1,38 @@
+"""`scan2sim sample`: the synthetic street with its ground truth."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from scan2sim.data_samples import SMALL
+from scan2sim.data_samples.street import generate
+from scan2sim.flows.commands.app import App, Overwrite
+from scan2sim.flows.commands.display import progress
+from scan2sim.pipeline import libraries
+from scan2sim.pipeline.io.importing import tile_folder
+
+app = App()
+
+
+@app.command()
+def sample(
+    out: Annotated[Path, typer.Argument(help="The tile's folder.")],
+    small: Annotated[bool, typer.Option("--small", help="The street of 26 m that comes along, at once.")] = False,
+    length: Annotated[float, typer.Option(help="Metres of road.")] = 100.0,
+    points: Annotated[float, typer.Option(help="Points of the cloud.")] = 9e6,
+    photos: Annotated[int, typer.Option(help="Photos in all.")] = 40,
+    seed: Annotated[int, typer.Option(help="Another seed, another street.")] = 0,
+    overwrite: Overwrite = False,
+) -> None:
+    """Generate a synthetic street with its ground truth."""
+    with progress("street") as report, tile_folder(out, overwrite) as folder:
+        if small:
+            shutil.copytree(SMALL, folder, dirs_exist_ok=True)
+        else:
+            libraries.check()
+            generate(folder, length=length, points=points, photos=photos, seed=seed, report=report)
+    typer.echo(f"Tile: {out / 'tile.toml'}")

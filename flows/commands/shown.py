@@ -1,0 +1,74 @@
+"""A plan that is run, and what came of it, on the screen."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+from scan2sim.flows.commands.display import RunDisplay, console, warn
+from scan2sim.flows.commands.log import Log
+from scan2sim.flows.engine.execution import execute
+from scan2sim.flows.engine.frontier import Event, Outcome
+from scan2sim.flows.engine.planning import Planned
+from scan2sim.flows.recipes.graph import Node
+from scan2sim.flows.reports import gazebo
+from scan2sim.flows.reports.findings import findings
+from scan2sim.pipeline.store import Manifest, Store
+
+WORST = 3
+"""Findings that are shown on the screen."""
+
+
+def execute_shown(
+    planned: list[Planned],
+    store: Store,
+    log: Log,
+    jobs: int = 0,
+    to_the_end: bool = False,
+    memory: float | None = None,
+) -> Outcome:
+    """`execute`, with bars on the screen and lines in the log."""
+    with RunDisplay(len(planned)) as display:
+
+        def watch(node: Node, event: Event, fraction: float, message: str) -> None:
+            display.watch(node, event, fraction, message)
+            if event != "progress":
+                log.write(f"{node.label}: {event}{': ' if message else ''}{message}")
+
+        jobs = jobs or default_jobs()
+        outcome = execute(planned, store, jobs=jobs, watch=watch, to_the_end=to_the_end, memory=memory)
+    for node, manifest in outcome.done.items():
+        told = [manifest.facts["told"]] if "told" in manifest.facts else []
+        for line in told + [f"warning: {text}" for text in manifest.warnings]:
+            log.write(f"{node}: {line}")
+    return outcome
+
+
+def show_results(world: Path, report: Path) -> None:
+    """Where the world and the report are, and how to open them, on the screen."""
+    told = [*gazebo.lines(world), f"Report: {report}"]
+    console.print("\n".join(told), highlight=False, soft_wrap=True, markup=False)
+
+
+def show_findings(done: Mapping[str, Manifest]) -> None:
+    """The worst of what is wrong with the world, on the screen; the report has all of it."""
+    found = findings(done)
+    if found and found[0].level == "unusable":
+        console.print("[bold red]This world can't be used as it is:[/]")
+    for one in found[:WORST]:
+        warn(f"{one.about}: {one.text}")
+    if len(found) > WORST:
+        console.print(f"[dim]{len(found) - WORST} more in the report")
+
+
+def show_warnings(done: Mapping[str, Manifest]) -> None:
+    """What the steps warned of, on the screen."""
+    for label, manifest in done.items():
+        for warning in manifest.warnings:
+            warn(f"{label}: {warning}")
+
+
+def default_jobs() -> int:
+    """Steps at a time: two, three where there are six cores or more (there are three classes)."""
+    return 3 if (os.cpu_count() or 1) >= 6 else 2

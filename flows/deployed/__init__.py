@@ -1,0 +1,1 @@
+"""Flows of Prefect over the same recipes: the only files that import it."""

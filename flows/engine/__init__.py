@@ -1,0 +1,1 @@
+"""Runs graphs of steps: what of them would run, and why; in processes, on workers, within memory."""

@@ -1,0 +1,130 @@
+"""Runs a plan: what is missing, in processes; every result is kept in the store."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import ForkServerProcess
+
+from scan2sim.flows.engine import processes
+from scan2sim.flows.engine.frontier import Frontier, Outcome, Watch
+from scan2sim.flows.engine.memory import need, share
+from scan2sim.flows.engine.planning import Planned, check
+from scan2sim.flows.engine.versions import check_version
+from scan2sim.pipeline import libraries
+from scan2sim.pipeline.errors import DamagedError, ScanError
+from scan2sim.pipeline.store import Manifest, Store
+
+Executor = Callable[[list[Planned], Store], Outcome]
+"""Runs what a plan says is missing."""
+
+
+def execute(
+    planned: Sequence[Planned],
+    store: Store,
+    *,
+    jobs: int,
+    watch: Watch,
+    to_the_end: bool = False,
+    memory: float | None = None,
+) -> Outcome:
+    """Run what the plan says is missing, up to `jobs` nodes at a time, each in a process of its own.
+
+    Args:
+        to_the_end: run all that doesn't depend on what has failed, rather than stop at the first failure.
+        memory: GB that nodes may need together (`engine.memory`); one that needs more runs alone.
+
+    Raises:
+        ScanError: of a node that can't run here, before any does.
+        KeyboardInterrupt: what was finished is kept.
+    """
+    check(planned)
+    front = Frontier(planned, store, watch)
+    running: dict[Connection, tuple[Planned, ForkServerProcess, float]] = {}
+    try:
+        while front or running:
+            for item in front.ready():
+                if len(running) >= jobs:
+                    break
+                try:
+                    needed = 0.0 if memory is None else need(item, store)
+                    if memory is not None and running and sum(r[2] for r in running.values()) + needed > memory:
+                        continue
+                    started, process = processes.start(item, store)
+                except DamagedError as error:
+                    front.again(item, error)
+                    break
+                front.take(item)
+                watch(item.node, "start", 0.0, "")
+                running[started] = (item, process, needed)
+            for connection in wait(list(running), timeout=1.0) if running else ():
+                assert isinstance(connection, Connection)
+                item, process, _ = running[connection]
+                try:
+                    manifest = processes.receive(connection, item, process, watch)
+                except DamagedError as error:
+                    front.again(item, error)
+                except ScanError as error:
+                    front.fail(item, error)
+                    if not to_the_end:
+                        return front.outcome
+                else:
+                    if manifest is None:
+                        continue
+                    front.end(item, manifest)
+                process.join()
+                del running[connection]
+    finally:
+        for _, process, _ in running.values():
+            processes.stop(process)
+    return front.outcome
+
+
+def limit_cores(cores: int | None) -> None:
+    """Let steps that this process starts use so many cores each; None: all. Counts from the first step on."""
+    if cores is not None:
+        for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENCV_FOR_THREADS_NUM", "OPENBLAS_NUM_THREADS"):
+            os.environ[name] = str(cores)
+
+
+def run_apart(item: Planned, store: Store, watch: Watch) -> Manifest:
+    """Run one node in a process of its own and wait for it; a result that is there by now is kept.
+
+    Raises:
+        ScanError: as `run_node`.
+    """
+    kept = item.kept(store)
+    if kept is not None:
+        return kept
+    connection, process = processes.start(item, store)
+    try:
+        while True:
+            manifest = processes.receive(connection, item, process, watch)
+            if manifest is not None:
+                process.join()
+                return manifest
+    finally:
+        processes.stop(process)
+
+
+def run_on_worker(
+    item: Planned, store: Store, memory: float | None, cores: int | None, wanted: Mapping[str, str]
+) -> Manifest:
+    """Run one node as a worker that serves a flow elsewhere.
+
+    Args:
+        memory: GB that steps on one machine may need together (`engine.memory`).
+        cores: that the step may use.
+        wanted: the flow's `versions()`.
+
+    Raises:
+        UnavailableError: this worker has other versions, or lacks libraries.
+        ScanError: as `run_node`.
+    """
+    check_version(item, wanted)
+    libraries.check()
+    limit_cores(cores)
+    os.environ.pop("MALLOC_TRIM_THRESHOLD_", None)  # Dask's, for processes that live on: it slows steps down
+    with share(memory, need(item, store)):
+        return run_apart(item, store, lambda *_: None)

@@ -1,0 +1,31 @@
+"""One run at a time in a folder."""
+
+from __future__ import annotations
+
+import fcntl
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from scan2sim.pipeline.errors import BusyError, from_os_error
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Hold a folder for one run at a time.
+
+    Raises:
+        BusyError: another run holds it.
+        SpaceError: it can't be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        file = open(folder / ".lock", "w")
+    except OSError as error:
+        raise from_os_error(error, folder) from None
+    with file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise BusyError(folder, "another run is writing here", "Wait for it, or choose another --out") from None
+        yield

@@ -1,0 +1,71 @@
+"""Runs one node in this process, and keeps its result."""
+
+from __future__ import annotations
+
+import resource
+import shutil
+import time
+from pathlib import Path
+
+from scan2sim.flows.engine.planning import Planned
+from scan2sim.pipeline.errors import ScanError, StepError, from_os_error
+from scan2sim.pipeline.step import Report, silent
+from scan2sim.pipeline.store import Manifest, Store
+
+
+def run_node(item: Planned, store: Store, inputs: dict[str, Path], report: Report = silent) -> Manifest:
+    """Run one node in this process and keep its result.
+
+    Raises:
+        DamagedError: a result that it reads isn't as it was made.
+        ScanError: as the step says; a full disk as `SpaceError`; anything else as `StepError`.
+    """
+    node = item.node
+    item.check(store)
+    fed = item.fed(store)
+    folder = store.begin(node.label)
+    start = time.perf_counter()
+    _forget_peak()
+    try:
+        result = node.step.run(inputs, node.params, folder, report)
+        about = {
+            "version": node.step.version,
+            "params": node.params.model_dump(mode="json"),
+            "inputs": item.keys,
+            "fed": fed,
+            "seconds": round(time.perf_counter() - start, 3),
+            "peak_mb": _peak_mb(),
+        }
+        return store.commit(node.label, item.key, folder, result, about)
+    except ScanError:
+        raise
+    except OSError as error:
+        raise from_os_error(error, folder) from error
+    except MemoryError as error:
+        raise StepError(node.label, "ran out of memory", "Use a smaller tile, or larger voxels") from error
+    except Exception as error:
+        raise StepError(
+            node.label,
+            f"failed unexpectedly ({type(error).__name__}: {error})",
+            "The log holds the details; please report it",
+        ) from error
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)  # moved away by now, unless it failed
+
+
+def _forget_peak() -> None:
+    try:
+        Path("/proc/self/clear_refs").write_text("5")
+    except OSError:
+        pass  # not Linux: the peak is then that of the process so far
+
+
+def _peak_mb() -> float:
+    """Peak resident memory of this process and of its largest child, MB."""
+    own = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    try:
+        status = Path("/proc/self/status").read_text()
+        own = int(status.split("VmHWM:")[1].split()[0])
+    except (OSError, IndexError):
+        pass
+    return round((own + resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss) / 1024, 1)

@@ -1,0 +1,1 @@
+"""What a person looks at: a tile's page, a survey's, what is wrong with them."""
