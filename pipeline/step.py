@@ -73,10 +73,9 @@ class Done:
     warnings: list[str] = field(default_factory=list)
 
 
-class Run(Protocol):
-    """The function of a step: reads `inputs`, writes below the folder `out`, nowhere else."""
-
-    def __call__(self, inputs: Inputs, params: Any, out: Path, report: Report) -> Done: ...
+Run = Callable[..., Done]
+"""The function of a step, `run(inputs, params, out, report)`: reads `inputs`, writes below the folder `out` only. Of a
+step that `resumes` it gets a folder `checkpoint`, too: what it leaves there is there again after it was killed."""
 
 
 @dataclass(frozen=True)
@@ -93,6 +92,7 @@ class Step:
         check: given parameters, which then need defaults, raises a ScanError if the step can't run with them on this
             machine (a package is missing, say); called before any step runs, and quick. None: it always can.
         per_class: whether it is run for each class apart.
+        resumes: whether it goes on where it was killed.
         memory: GB at least, and GB for every GB that it reads (photos not counted), as measured on generated streets
             (docs/scale.md).
     """
@@ -104,4 +104,5 @@ class Step:
     class_defaults: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     check: Callable[[Any], None] | None = None
     per_class: bool = False
+    resumes: bool = False
     memory: tuple[float, float] = (0.5, 6)

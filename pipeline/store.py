@@ -3,6 +3,7 @@
 ```
 ROOT/poisson.terrain/3f9a.../manifest.json   what was run, on what, how long, with which outputs
                             /mesh.npz        the outputs
+ROOT/track/.part-81c2.../                    how far a step has come that was killed, where it says so itself
 ```
 A result is written to a temporary folder and moved into place, so that a killed run leaves nothing
 half-made. A result counts as present while all its files are there with the sizes that the
@@ -33,7 +34,7 @@ from scan2sim.pipeline.io.remote import Remote
 from scan2sim.pipeline.step import Done, Params, Step
 
 KEY_LENGTH = 24
-TEMPORARY = ".tmp-"
+TEMPORARY, PART = ".tmp-", ".part-"
 
 
 @dataclass(frozen=True)
@@ -68,10 +69,15 @@ class Manifest:
 
 
 def digest(path: Path) -> str:
-    """SHA-256 of a source file; "missing" where it isn't there (the step says what that means)."""
+    """SHA-256 of a source file, or of a folder's files by their names; "missing" where it isn't there.
+
+    The step says what that means.
+    """
     try:
+        if path.is_dir():
+            return content_of({file.name: digest(file) for file in path.iterdir() if file.is_file()})
         if path.exists() and not path.is_file():
-            return "missing"  # a folder, or a pipe, which would be waited on for ever
+            return "missing"  # a pipe, which would be waited on for ever
         with open(path, "rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except FileNotFoundError:
@@ -99,6 +105,8 @@ class Digests:
             stat = path.stat()
         except OSError:
             return digest(path)
+        if path.is_dir():
+            return content_of({file.name: self(file) for file in path.iterdir() if file.is_file()})
         mark = [stat.st_size, stat.st_mtime_ns, stat.st_ino]
         known = self._known.get(str(path))
         found = known[3] if known and known[:3] == mark else digest(path)
@@ -122,11 +130,6 @@ def content_of(digests: Mapping[str, str]) -> str:
     for name in sorted(digests):
         together.update(f"{name}\0{digests[name]}\n".encode())
     return together.hexdigest()
-
-
-def contents(path: Path) -> str:
-    """One digest of a file, or of all files of a folder by their names."""
-    return content_of({file.name: digest(file) for file in path.iterdir()}) if path.is_dir() else digest(path)
 
 
 def _seal(body: Mapping[str, Any]) -> str:
@@ -263,6 +266,15 @@ class Store:
         except OSError as error:
             raise from_os_error(error, self.root) from None
 
+    def checkpoint(self, label: str, key: str) -> Path:
+        """A folder that outlives a killed run: what the same step left there of the same inputs and parameters."""
+        place = self.root / label / f"{PART}{key}"
+        try:
+            place.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise from_os_error(error, self.root) from None
+        return place
+
     def commit(self, label: str, key: str, folder: Path, done: Done, about: Mapping[str, Any]) -> Manifest:
         """Move a finished result into place, replacing an incomplete one of the same key.
 
@@ -283,6 +295,7 @@ class Store:
             **about,
         )
         self._place(manifest, key, folder)
+        shutil.rmtree(self.root / label / f"{PART}{key}", ignore_errors=True)
         return manifest
 
     def contents(self, label: str) -> set[str]:

@@ -30,7 +30,7 @@ from scan2sim.pipeline.extras import need
 from scan2sim.pipeline.io.trajectory import replacing
 from scan2sim.pipeline.io.video import Encoder
 from scan2sim.pipeline.step import Report, silent
-from scan2sim.pipeline.store import contents
+from scan2sim.pipeline.store import digest
 from scan2sim.pipeline.types import U8, Camera, GpsTrack, Trajectory
 from scan2sim.slam import solvers
 from scan2sim.slam.evaluate import SEGMENT, evaluate, way
@@ -237,7 +237,7 @@ def _identity(shared: Source) -> dict[str, Any]:
 
     return {
         "version": [VERSION, TRACK_VERSION],
-        "source": contents(shared.video.path),
+        "source": digest(shared.video.path),
         "truth": mark(_plain(shared.truth)),
         "gps": mark(_plain(shared.gps)),
         "mask": mark(_plain(shared.mask)),

@@ -23,7 +23,7 @@ from scan2sim.pipeline.io import gps as gps_io
 from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.io.image import read_rgb
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.pipeline.store import contents
+from scan2sim.pipeline.store import digest
 from scan2sim.pipeline.types import Camera, GpsTrack, Trajectory
 from scan2sim.slam import output, solvers
 from scan2sim.slam.adjust import adjust
@@ -233,8 +233,8 @@ def _need(options: Options) -> None:
 def _mark(path: Path, camera: Camera, options: Options, params: OdometryParams) -> str:
     """Of all that a run depends on: the code's version, the contents of files, options and parameters."""
     given = {f.name: getattr(options, f.name) for f in fields(options) if f.name != "tile"}  # which gave the camera
-    asked = {name: contents(value) if isinstance(value, Path) else value for name, value in given.items()}
-    whole = [VERSION, contents(path), asdict(camera), asked, params.model_dump(mode="json")]
+    asked = {name: digest(value) if isinstance(value, Path) else value for name, value in given.items()}
+    whole = [VERSION, digest(path), asdict(camera), asked, params.model_dump(mode="json")]
     return hashlib.sha256(json.dumps(whole).encode()).hexdigest()[:12]
 
 

@@ -27,7 +27,8 @@ def run_node(item: Planned, store: Store, inputs: dict[str, Path], report: Repor
     start = time.perf_counter()
     _forget_peak()
     try:
-        result = node.step.run(inputs, node.params, folder, report)
+        kept = {"checkpoint": store.checkpoint(node.label, item.key)} if node.step.resumes else {}
+        result = node.step.run(inputs, node.params, folder, report, **kept)
         about = {
             "version": node.step.version,
             "params": node.params.model_dump(mode="json"),

@@ -21,9 +21,10 @@ from scan2sim.flows.engine.execution import execute
 from scan2sim.flows.engine.lock import locked
 from scan2sim.flows.engine.planning import Reason, plan
 from scan2sim.flows.engine.versions import check_version, versions
-from scan2sim.flows.recipes.graph import NodeId
+from scan2sim.flows.recipes.graph import Node, NodeId
 from scan2sim.pipeline.errors import BusyError, DataError, StepError, UnavailableError
 from scan2sim.pipeline.extras import EXTRA_OF
+from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.store import Digests, Manifest, Store, _seal, digest
 from tests.conftest import ROOT
 from tests.flows.toy import chain
@@ -118,6 +119,60 @@ def test_a_failure_is_noted_and_the_rest_goes_on(tmp_path: Path, source: Path, r
     outcome = execute(plan(nodes, store), store, jobs=1, watch=lambda *_: None, to_the_end=True)
     assert set(outcome.of_tile()) == {"a", "c"} and set(outcome.failed) == {NodeId("b")}
     assert ran() == "abc"
+
+
+class CountParams(Params):
+    """Counts to `to`; is killed on the way unless it began above `above`."""
+
+    to: int = 4
+    above: int = 0
+
+
+def count(inputs: Inputs, params: CountParams, out: Path, report: Report, checkpoint: Path) -> Done:
+    """Count from where it was killed."""
+    known = checkpoint / "known.txt"
+    first = int(known.read_text()) if known.exists() else 0
+    for number in range(first, params.to):
+        known.write_text(str(number + 1))
+        if number == 1 and first <= params.above:
+            os.kill(os.getpid(), signal.SIGKILL)
+    (out / "number.txt").write_text(str(params.to))
+    return Done({"number": out / "number.txt"}, {"began": first})
+
+
+def test_a_long_step_goes_on_where_it_was_killed_with_the_same_input_alone(tmp_path: Path, source: Path) -> None:
+    store, step = Store(tmp_path / "store"), Step("count", 1, count, CountParams, resumes=True)
+
+    def run(**params: int) -> Manifest:
+        nodes = [Node(step, CountParams(**params), {"source": source})]
+        outcome = execute(plan(nodes, store), store, jobs=1, watch=lambda *_: None)
+        outcome.check()
+        return outcome.of_tile()["count"]
+
+    with pytest.raises(StepError, match="killed"):
+        run()
+    assert run(above=-1).facts == {"began": 0}, "other parameters begin anew"
+    assert len(list((store.root / "count").glob(".part-*"))) == 1
+    assert run().facts == {"began": 2} and not list((store.root / "count").glob(".part-*"))
+    with pytest.raises(StepError, match="killed"):
+        run(to=5)
+    source.write_text("another")
+    with pytest.raises(StepError, match="killed"):
+        run(to=5)
+    parts = list((store.root / "count").glob(".part-*"))
+    assert len(parts) == 2
+    store.sweep({"count": "another key"})
+    assert not list((store.root / "count").iterdir())
+
+
+def test_a_folder_is_a_source_by_its_files(tmp_path: Path) -> None:
+    folder, digests = tmp_path / "frames", Digests(tmp_path / "digests.json")
+    folder.mkdir()
+    (folder / "1.png").write_bytes(b"one")
+    before = digest(folder)
+    assert digests(folder) == before != digest(tmp_path / "absent")
+    (folder / "1.png").rename(folder / "2.png")
+    assert digests(folder) == digest(folder) != before
 
 
 def test_a_deleted_output_is_rebuilt_and_nothing_else(run: Run, ran: Callable[[], str], tmp_path: Path) -> None:
