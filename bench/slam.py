@@ -98,6 +98,7 @@ def kitti_camera(folder: Path) -> Camera:
 def kitti(out: Path) -> dict[str, float | None]:
     """ATE on 51 real frames, and the time against pycolmap's incremental mapping."""
     from scan2sim.slam.adjust import adjust
+    from scan2sim.slam.mapped import Mapped
 
     folder = DATA / "kitti_odo06_vo51"
     truth = np.loadtxt(folder / "poses.txt").reshape(-1, 3, 4)[:, :, 3]
@@ -113,7 +114,7 @@ def kitti(out: Path) -> dict[str, float | None]:
     seconds = time.perf_counter() - began
     alone = _ate(odometry, truth)
     began = time.perf_counter()
-    adjust(odometry)
+    adjust(Mapped.of(odometry, []))
     adjusting = time.perf_counter() - began
     adjusted = _ate(odometry, truth)
     theirs, their_seconds, registered = pycolmap_reference(folder, camera, out / "pycolmap", truth)
@@ -223,7 +224,7 @@ from scan2sim.pipeline.types import Camera
 from scan2sim.slam.odometry import Odometry, OdometryParams
 from scan2sim.slam.video import open_video
 video = open_video(Path(sys.argv[1]))
-odometry, offset, count = Odometry(Camera("equirectangular", 512, 256), OdometryParams(features=300)), 0.0, 0
+odometry, offset, count = Odometry(Camera("equirectangular", 512, 256), OdometryParams(count=300)), 0.0, 0
 import cv2
 while count < 10000:
     for frame in video.frames():

@@ -27,6 +27,17 @@ Share = Annotated[float, Field(ge=0, le=1)]
 Coordinate = Annotated[float, Field(ge=-1e8, le=1e8)]
 """Metres (or feet) in a CRS: two and a half times around the earth."""
 Place = tuple[Coordinate, Coordinate]
+Metres = Annotated[float, Field(ge=0, le=10_000)]
+Length = Annotated[float, Field(ge=1, le=100_000)]
+Buffer = Annotated[float, Field(ge=0, le=1000)]
+Range = Annotated[float, Field(ge=0.1, le=10_000)]
+Pixels = Annotated[float, Field(ge=-1_000_000, le=1_000_000)]
+Focal = Annotated[float, Field(ge=1, le=1_000_000)]
+"""Pixels."""
+Rate = Annotated[float, Field(ge=0.01, le=1000)]
+"""Frames a second."""
+Shift = Annotated[float, Field(ge=-1e10, le=1e10)]
+"""Seconds between two clocks, of which one may count from 1970."""
 Seconds = Annotated[float, Field(ge=0.001, le=604_800)]
 """Up to a week."""
 Seed = Annotated[int, Field(ge=0, le=2**32 - 1)]

@@ -16,7 +16,7 @@ from scan2sim.pipeline.io.colmap_writer import write as write_colmap
 from scan2sim.pipeline.similarity import umeyama
 from scan2sim.pipeline.types import Trajectory
 from scan2sim.slam.geometry import angles
-from scan2sim.slam.odometry import Odometry
+from scan2sim.slam.mapped import Mapped
 from scan2sim.slam.sparse import kept, move
 
 LOSS = 1.0
@@ -27,7 +27,7 @@ EDGE, POLE = 20.0, 0.9
 """Pixels from a 360 frame's seam, and sine of the elevation, beyond which observations are left out."""
 
 
-def adjust(odometry: Odometry) -> dict[str, float]:
+def adjust(mapped: Mapped) -> dict[str, float]:
     """Move the keyframes of an odometry that was told to `keep` to where all observations fit best; figures.
 
     The whole keeps its place, orientation and scale: those are the odometry's, or GPS's.
@@ -40,13 +40,13 @@ def adjust(odometry: Odometry) -> dict[str, float]:
 
     from scan2sim.pipeline.cameras import project
 
-    keyframes = odometry.map.keyframes
+    keyframes = mapped.map.keyframes
     poses = np.stack([k.T_world_cam for k in keyframes])
-    known = kept(odometry)
-    camera = odometry.map.camera
+    known = kept(mapped)
+    camera = mapped.map.camera
     uv, inside = project(camera, known.bearing)
     error = angles(poses[known.keyframe], known.xyz[known.point], known.bearing)
-    inside &= error < WRONG * odometry.map.gate
+    inside &= error < WRONG * mapped.map.gate
     if (
         camera.model == "equirectangular"
     ):  # pycolmap measures in pixels, which jump at the seam and stretch at the poles
@@ -78,7 +78,7 @@ def adjust(odometry: Odometry) -> dict[str, float]:
     xyz = known.xyz.copy()
     for i, point in model.points3D.items():
         xyz[i - 1] = point.xyz
-    move(odometry, known, placed, onto.apply(xyz))
+    move(mapped, known, placed, onto.apply(xyz))
     return {
         "adjusted_keyframes": len(poses), "adjusted_points": len(known.xyz),
         "reprojection_before_px": round(float(before), 4),

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from scan2sim.pipeline.types import F64, Frame, GpsTrack, Trajectory
 from scan2sim.slam import scale
 from scan2sim.slam.geometry import exp_so3
-from scan2sim.slam.odometry import Odometry
+from scan2sim.slam.mapped import Mapped
 
 DRIFT, TURN = 0.003, 2e-5
 """Of the way and radians a metre: how far tracked poses are off, one standard deviation (bench/slam.py measures it)."""
@@ -43,15 +43,15 @@ class Placing:
         return (xyz - before[at]) * steps[at, None] @ self.R.T + after.positions[at]
 
 
-def finish(odometry: Odometry, gps: GpsTrack | None, *, georeference: bool = True) -> tuple[Trajectory, Placing]:
+def finish(mapped: Mapped, gps: GpsTrack | None, *, georeference: bool = True) -> tuple[Trajectory, Placing]:
     """The trajectory, camera to a z-up world; `gps` in the frames' times ties its scale, and places it.
 
     Without GPS, the world begins at the first camera, its x axis along that camera's view.
     """
-    placed = odometry.placed
+    placed = mapped.placed
     times = np.array([p.time for p in placed])
     unsure = np.array([p.unsure for p in placed])
-    poses = np.stack([odometry.pose_of(p) for p in placed])
+    poses = np.stack([mapped.pose_of(p) for p in placed])
     R = upright(poses)
     positions, rotations = poses[:, :3, 3] @ R.T, R @ poses[:, :3, :3]
     factor, frame = np.ones(len(times) - 1), Frame()

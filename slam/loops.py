@@ -12,7 +12,7 @@ import numpy as np
 from scan2sim.pipeline.types import F32, F64, U8
 from scan2sim.slam.charts import Charts
 from scan2sim.slam.geometry import exp_so3, inverse, log_so3
-from scan2sim.slam.odometry import Odometry
+from scan2sim.slam.mapped import Mapped
 from scan2sim.slam.relocalise import Remembered, Seen, describe, relocalise
 from scan2sim.slam.sparse import kept, move
 
@@ -33,9 +33,7 @@ LOOP = (0.1, 2e-3)
 
 
 class Places:
-    """Remembers keyframes; give it to `Odometry` as `remember`."""
-
-    STATE = ("thumbnail", "seen")
+    """Remembers keyframes."""
 
     def __init__(self, charts: Charts) -> None:
         self.charts = charts
@@ -65,23 +63,23 @@ def alike(a: F32, b: F32, *, around: bool) -> float:
     return float(np.fft.irfft(spectrum.sum(axis=0), n=a.shape[1]).max())
 
 
-def close(odometry: Odometry, places: Places) -> dict[str, float]:
+def close(mapped: Mapped, places: Places) -> dict[str, float]:
     """Find loops and bend the keyframes' path; figures."""
-    keyframes = odometry.map.keyframes
+    keyframes = mapped.map.keyframes
     poses = np.stack([k.T_world_cam for k in keyframes])
     way = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))])
-    loops = _find(odometry, places, poses, way)
+    loops = _find(mapped, places, poses, way)
     if loops:
-        moved, known = pose_graph(poses, way, loops), kept(odometry)
+        moved, known = pose_graph(poses, way, loops), kept(mapped)
         first = np.zeros(len(known.xyz), np.int64)  # points go where the keyframe goes that saw them first
         first[known.point[::-1]] = known.keyframe[::-1]
         change = (moved @ inverse(poses))[first]
         xyz = np.einsum("pij,pj->pi", change[:, :3, :3], known.xyz) + change[:, :3, 3]
-        move(odometry, known, moved, xyz)
+        move(mapped, known, moved, xyz)
     return {"loops": len(loops)}
 
 
-def _find(odometry: Odometry, places: Places, poses: F64, way: F64) -> list[tuple[int, int, F64]]:
+def _find(mapped: Mapped, places: Places, poses: F64, way: F64) -> list[tuple[int, int, F64]]:
     """(earlier keyframe, later keyframe, pose (4, 4) of the later in the earlier's axes)."""
     rng = np.random.default_rng(0)
     around = not places.charts.whole
@@ -103,7 +101,7 @@ def _find(odometry: Odometry, places: Places, poses: F64, way: F64) -> list[tupl
             if scores[at] < ALIKE:
                 break
             pair = [Remembered(places.seen[i], poses[i]) for i in (j, j + 2)]
-            placed = relocalise(places.seen[k], pair[0], pair[1], sigma=odometry.map.sigma, rng=rng)
+            placed = relocalise(places.seen[k], pair[0], pair[1], sigma=mapped.map.sigma, rng=rng)
             if placed is not None:
                 found.append((j, k, inverse(poses[j]) @ placed))
                 last = k

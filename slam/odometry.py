@@ -40,14 +40,14 @@ class OdometryParams(MapParams):
     """How frames become poses, besides `MapParams`.
 
     Attributes:
-        features: followed at a time.
+        count: of features followed at a time.
         parallax: degrees; a keyframe where the median feature has moved so far, turning apart; None: 3 for a 360
             camera, 1 for others, in whose view little moves.
         survival: or where fewer than this share of the last keyframe's are still followed.
         seed: of random samples.
     """
 
-    features: int = Field(700, ge=50, le=20_000)
+    count: int = Field(700, ge=50, le=20_000)
     parallax: float | None = Field(None, ge=0.05, le=90)
     survival: float = Field(0.65, ge=0.01, le=0.99)
     seed: Seed = 0
@@ -70,7 +70,7 @@ class Odometry:
         "placed", "_rng", "_pose", "_time", "_velocity", "_started", "_blind", "_waiting", "_settled", "_lost_at",
         "_memory", "_known",
     )  # fmt: skip
-    PARTS = ("map", "tracker", "remember")
+    PARTS = ("map", "tracker")
 
     def __init__(
         self,
@@ -82,7 +82,6 @@ class Odometry:
         backend: str = "lm",
         tracker: Tracker | None = None,
         keep: bool = False,
-        remember: Callable[[int, list[U8]], None] | None = None,
         warn: Callable[[str], None] = lambda _: None,
     ) -> None:
         """Begin.
@@ -95,12 +94,11 @@ class Odometry:
             backend: name of one of `slam.solvers`.
             tracker: what follows features; default: corners.
             keep: keep all points and what keyframes see of them, for loops, adjustment and COLMAP.
-            remember: is shown every keyframe: its number and charts (`slam.loops.Places`).
             warn: receives what went wrong, and when.
         """
-        self.params, self.gps, self.warn, self.remember = params, gps, warn, remember
+        self.params, self.gps, self.warn = params, gps, warn
         self.charts = Charts(camera)
-        self.tracker = tracker or tracker_named("corners", self.charts, mask, params.features)
+        self.tracker = tracker or tracker_named("corners", self.charts, mask, params.count)
         self.map = LocalMap(camera, params, self.charts.pixel, gps=gps, backend=backend, keep=keep)
         self.placed: list[Placed] = []
         self._backend, self._rng = backend, np.random.default_rng(params.seed)
@@ -237,8 +235,6 @@ class Odometry:
         self._pose = self.map.keyframes[-1].T_world_cam
         self.placed[-1].keyframe, self.placed[-1].T_key_cam = len(self.map.keyframes) - 1, np.eye(4)
         self._memory = [*self._memory[-3:], (self.tracker.pictures, self._pose)]
-        if self.remember is not None:
-            self.remember(len(self.map.keyframes) - 1, self.tracker.pictures)
 
     def _settle(self) -> None:
         """Set the scale of a map that has just become so long that GPS knows it well."""

@@ -12,7 +12,7 @@ from scan2sim.pipeline.io.colmap_writer import SparseMap
 from scan2sim.pipeline.types import F64, I32, Trajectory
 from scan2sim.slam.finish import Placing
 from scan2sim.slam.localmap import Landmarks
-from scan2sim.slam.odometry import Odometry
+from scan2sim.slam.mapped import Mapped
 
 
 @dataclass(frozen=True)
@@ -33,9 +33,9 @@ class Kept:
     bearing: F64
 
 
-def kept(odometry: Odometry) -> Kept:
+def kept(mapped: Mapped) -> Kept:
     """What odometry, told to `keep`, knows of points: those that two keyframes or more see."""
-    known = odometry.map
+    known = mapped.map
     ids = np.concatenate([known.landmarks.ids, *(gone.ids for gone in known.retired)])
     xyz = np.concatenate([known.landmarks.xyz, *(gone.xyz for gone in known.retired)])
     ids, first = np.unique(ids, return_index=True)
@@ -54,23 +54,23 @@ def kept(odometry: Odometry) -> Kept:
     )
 
 
-def move(odometry: Odometry, known: Kept, poses: F64, xyz: F64) -> None:
+def move(mapped: Mapped, known: Kept, poses: F64, xyz: F64) -> None:
     """Put keyframes and the points of `known` elsewhere: (C, 4, 4), (P, 3)."""
-    for keyframe, pose in zip(odometry.map.keyframes, poses, strict=True):
+    for keyframe, pose in zip(mapped.map.keyframes, poses, strict=True):
         keyframe.T_world_cam = pose
-    alive = np.isin(known.ids, odometry.map.landmarks.ids)
-    odometry.map.landmarks = Landmarks(known.ids[alive], xyz[alive])
-    odometry.map.retired = [Landmarks(known.ids[~alive], xyz[~alive])]
+    alive = np.isin(known.ids, mapped.map.landmarks.ids)
+    mapped.map.landmarks = Landmarks(known.ids[alive], xyz[alive])
+    mapped.map.retired = [Landmarks(known.ids[~alive], xyz[~alive])]
 
 
-def sparse_map(odometry: Odometry, placing: Placing, trajectory: Trajectory) -> SparseMap:
+def sparse_map(mapped: Mapped, placing: Placing, trajectory: Trajectory) -> SparseMap:
     """The points in the trajectory's coordinates, seen from its poses."""
-    known = kept(odometry)
-    frame_of = np.searchsorted(trajectory.times, [k.time for k in odometry.map.keyframes])
-    uv, inside = project(odometry.map.camera, known.bearing)
+    known = kept(mapped)
+    frame_of = np.searchsorted(trajectory.times, [k.time for k in mapped.map.keyframes])
+    uv, inside = project(mapped.map.camera, known.bearing)
     frame = frame_of[known.keyframe]
     at: npt.NDArray[np.int64] = np.zeros(len(known.xyz), np.int64)
     at[known.point[::-1]] = frame[::-1]
-    before = np.stack([odometry.pose_of(p)[:3, 3] for p in odometry.placed])
+    before = np.stack([mapped.pose_of(p)[:3, 3] for p in mapped.placed])
     points = placing.points(known.xyz, at, before, trajectory)
     return SparseMap(points, known.point[inside], frame[inside].astype(np.int32), uv[inside].astype(np.float64))

@@ -34,7 +34,9 @@ from scan2sim.pipeline.store import digest
 from scan2sim.pipeline.types import U8, Camera, GpsTrack, Trajectory
 from scan2sim.slam import solvers
 from scan2sim.slam.evaluate import SEGMENT, evaluate, way
+from scan2sim.slam.finish import finish
 from scan2sim.slam.gps import smooth
+from scan2sim.slam.mapped import Mapped
 from scan2sim.slam.odometry import Odometry, OdometryParams
 from scan2sim.slam.track import VERSION as TRACK_VERSION
 from scan2sim.slam.track import camera_of, track
@@ -385,21 +387,21 @@ def measure(cell: Cell, shared: Source, file: Path, threads: int = 0) -> Result:
         free = np.where(mask > 0, np.uint8(255), np.uint8(0))
         free = cv2.resize(free, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
         mask = np.where(free == 255, np.uint8(255), np.uint8(0))
-    tracked = track(
+    run = track(
         made,
         lambda warn: Odometry(camera, shared.params, mask=mask, gps=shared.gps, backend=shared.backend, warn=warn),
-        gps=shared.gps, georeference=False,
-    )  # fmt: skip
-    lost = _lost(tracked.trajectory, shared.truth)
+    )
+    trajectory, _ = finish(Mapped.of(run.odometry, run.names), shared.gps, georeference=False)
+    lost = _lost(trajectory, shared.truth)
     figures: dict[str, Any] = {
         "width": camera.width,
         "mbit_s": round(8e-6 * file.stat().st_size / kept, 4),
         "lost_share": round(lost, 4),
-        **tracked.facts,
+        **run.facts(),
     }
     if lost > LOST:
         return Result(figures, f"lost for {100 * lost:.0f} % of the way")
-    compared = evaluate(tracked.trajectory, shared.truth, segment=shared.segment)
+    compared = evaluate(trajectory, shared.truth, segment=shared.segment)
     return Result(figures | compared.figures())
 
 

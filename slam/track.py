@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import time as clock
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +11,8 @@ import numpy as np
 
 from scan2sim.pipeline.errors import DataError, InputError
 from scan2sim.pipeline.step import Report, silent
-from scan2sim.pipeline.types import U8, Camera, Frame, GpsTrack, Trajectory
+from scan2sim.pipeline.types import U8, Camera
 from scan2sim.slam.features import Found
-from scan2sim.slam.finish import Placing, finish
 from scan2sim.slam.localmap import Keyframe, Landmarks
 from scan2sim.slam.odometry import Odometry, Placed
 from scan2sim.slam.relocalise import Remembered, Seen
@@ -32,33 +30,15 @@ VALUES = (Found, Keyframe, Landmarks, Placed, Remembered, Seen, SeenInChart, Tra
 """What states consist of."""
 
 
-@dataclass(frozen=True)
-class Tracked:
-    """What came out.
+class Run:
+    """A run over a video, as far as it has come.
 
     Attributes:
-        trajectory: camera to local coordinates of `frame`.
-        frame: where that is.
-        names: of the frames.
-        odometry: with all that it knows.
-        placing: from its world to the trajectory's.
-        alone: what odometry alone said, where loops or an adjustment came after it.
-        facts: figures.
+        names: of the frames that were taken.
         warnings: sentences a user should read.
+        seconds: that it took.
+        odometry: what it has found.
     """
-
-    trajectory: Trajectory
-    frame: Frame
-    names: list[str]
-    odometry: Odometry
-    placing: Placing
-    alone: Trajectory | None
-    facts: dict[str, Any]
-    warnings: list[str]
-
-
-class _Run:
-    """A run as far as it has come."""
 
     STATE = ("names", "warnings", "seconds")
     PARTS = ("odometry",)
@@ -67,36 +47,39 @@ class _Run:
         self.names: list[str] = []
         self.warnings: list[str] = []
         self.seconds = 0.0
-        self.odometry = start(self.warn)
+        self.odometry = start(self.warnings.append)
 
-    def warn(self, text: str) -> None:
-        self.warnings.append(text)
+    def facts(self) -> dict[str, Any]:
+        """Figures of it."""
+        found = self.odometry.map
+        return {
+            "frames": len(self.names),
+            "keyframes": len(found.keyframes),
+            "maps": found.part + 1,
+            "seconds": round(self.seconds, 2),
+            "fps": round(len(self.names) / max(self.seconds, 1e-9), 2),
+            **dict(zip(found.names, np.round(found.shared, 5).tolist(), strict=True)),
+        }
 
 
 def track(
     video: Video,
     start: Callable[[Callable[[str], None]], Odometry],
     *,
-    gps: GpsTrack | None = None,
-    georeference: bool = True,
     every: int = 1,
     until: float | None = None,
     state: Path | None = None,
     watch: Callable[[Odometry, U8], None] | None = None,
-    after: Sequence[Callable[[Odometry], dict[str, float]]] = (),
     report: Report = silent,
-) -> Tracked:
+) -> Run:
     """Run odometry over a video.
 
     Args:
         video: frames.
         start: makes the odometry, given where to send warnings.
-        gps: the track, in the frames' times.
-        georeference: put the trajectory where GPS says; otherwise GPS ties its scale alone.
         every: take every so manieth frame.
         until: stop after so many seconds of the video.
         state: file in which the state is kept every minute, and from which an interrupted run goes on.
-        after: what moves the keyframes once all are there (loops, adjustment), and its figures.
         watch: is shown odometry and frame after each.
         report: progress.
 
@@ -106,7 +89,7 @@ def track(
     kept = _begin(start, state)
     began, saved = clock.perf_counter() - kept.seconds, clock.perf_counter()
     last = kept.odometry.placed[-1].time if kept.odometry.placed else -np.inf
-    for frame in video.frames(every=every, warn=kept.warn):
+    for frame in video.frames(every=every, warn=kept.warnings.append):
         if frame.time <= last:
             continue
         if until is not None and frame.time > until:
@@ -123,45 +106,19 @@ def track(
     if len(kept.names) < 2:
         raise DataError(video.path, f"has {len(kept.names)} frames", "Give a longer video")
     kept.seconds = clock.perf_counter() - began
-    if gps is None:
-        kept.warnings.append("there is no GPS: lengths are in multiples of the first two keyframes' distance")
-    trajectory, placing = finish(kept.odometry, gps, georeference=georeference)
-    alone, facts = trajectory if after else None, _facts(kept, trajectory)
-    for work in after:
-        facts |= work(kept.odometry)
-    if after:
-        trajectory, placing = finish(kept.odometry, gps, georeference=georeference)
-    return Tracked(
-        trajectory, placing.frame, kept.names, kept.odometry, placing, alone, facts, list(dict.fromkeys(kept.warnings))
-    )
+    return kept
 
 
-def _facts(kept: _Run, trajectory: Trajectory) -> dict[str, Any]:
-    assert trajectory.unsure is not None
-    way = np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1)
-    shared = dict(zip(kept.odometry.map.names, np.round(kept.odometry.map.shared, 5).tolist(), strict=True))
-    return {
-        "frames": len(trajectory),
-        "keyframes": len(kept.odometry.map.keyframes),
-        "length_m": round(float(way.sum()), 2),
-        "unsure_share": round(float(trajectory.unsure.mean()), 4),
-        "maps": kept.odometry.map.part + 1,
-        "seconds": round(kept.seconds, 2),
-        "fps": round(len(trajectory) / max(kept.seconds, 1e-9), 2),
-        **shared,
-    }
-
-
-def _begin(start: Callable[[Callable[[str], None]], Odometry], state: Path | None) -> _Run:
+def _begin(start: Callable[[Callable[[str], None]], Odometry], state: Path | None) -> Run:
     """A run at its beginning, or where an earlier one was interrupted."""
     if state is None or not state.is_file():
-        return _Run(start)
+        return Run(start)
     try:
-        run = _Run(start)
+        run = Run(start)
         load(state, run, VALUES)
     except WrongState:
-        run = _Run(start)
-        run.warn(f"what an interrupted run left in {state.name} is damaged: begun anew")
+        run = Run(start)
+        run.warnings.append(f"what an interrupted run left in {state.name} is damaged: begun anew")
     return run
 
 

@@ -94,7 +94,7 @@ def load(path: Path | None, models: Sequence[Model], *, hint: str, device: str =
         InputError: it is missing, damaged, of another model, or holds more than tensors.
     """
     if path is None:
-        raise SettingError("slam.weights", f"{models[0].name} comes without weights", hint)
+        raise SettingError("track.weights", f"{models[0].name} comes without weights", hint)
     if not path.is_file():
         raise InputError(path, "is no file", f"{hint}; nothing is downloaded")
     state = _tensors(path, hint)

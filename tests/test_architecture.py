@@ -123,7 +123,7 @@ def test_the_recipe_is_planned_without_anything_heavy() -> None:
 
 
 def test_every_setting_is_documented() -> None:
-    from scan2sim.flows.recipes.tile import STEPS
+    from scan2sim.flows.recipes.steps import STEPS
 
     text = (ROOT / "docs" / "settings.md").read_text()
     for step in STEPS:

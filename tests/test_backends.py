@@ -141,8 +141,8 @@ def load(weights, device):
 
 
 def test_a_feature_is_one_file(add: Add) -> None:
-    from scan2sim.flows.commands.slam import Options, _tracker
     from scan2sim.pipeline.types import Camera
+    from scan2sim.slam.steps.track import TrackParams, tracker_of
 
     add(features, "blobs", """
 import cv2
@@ -163,7 +163,8 @@ def load(weights, count, upsample, device):
     return Blobs()
 """)  # fmt: skip
     grey = np.random.default_rng(0).integers(0, 255, (60, 80), np.uint8).repeat(4, 0).repeat(4, 1)
-    tracker = _tracker(Camera("pinhole", 320, 240, 200.0, 200.0, 159.5, 119.5), None, 100, Options(features="blobs"))
+    camera = Camera("pinhole", 320, 240, 200.0, 200.0, 159.5, 119.5)
+    tracker, _ = tracker_of(camera, None, TrackParams.model_validate({"count": 100, "features": "blobs"}), {})
     tracker.look(grey)
     assert tracker.refill() > 50
     assert tracker.look(grey) > 0.9

@@ -18,17 +18,16 @@ from pydantic import BaseModel, ValidationError
 
 from scan2sim.flows.cli import COMMANDS, app, loaded
 from scan2sim.flows.commands.drive import Drive
-from scan2sim.flows.recipes.tile import STEPS
+from scan2sim.flows.recipes.steps import STEPS
 from scan2sim.pipeline.classes import SURFACES
 from scan2sim.pipeline.io.survey import SurveyFile
 from scan2sim.pipeline.io.tile import TileFile
-from scan2sim.slam.odometry import OdometryParams
 from tests.conftest import ROOT
 
 ROOMS = ("pipeline", "segmentation", "texturing", "slam", "flows", "services", "data_samples")
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/*.md")), ROOT / "data_samples/README.md"]
 MODULES = sorted(path for room in ROOMS for path in (ROOT / room).rglob("*.py"))
-PARAMS: dict[str, type[BaseModel]] = {step.name: step.params for step in STEPS} | {"slam": OdometryParams}
+PARAMS: dict[str, type[BaseModel]] = {step.name: step.params for step in STEPS}
 OTHERS = re.compile(r"\b(prefect|docker|dask|ray|gz|pip|aws)\b")
 """Other programs, whose options a page may name once it has shown them in a command."""
 SUFFIXES = {"py", "json", "geojson", "csv", "obj", "laz", "png", "npz", "toml", "sdf", "dae", "mtl", "glb", "jpg"}

@@ -14,19 +14,19 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict
 
-from scan2sim.flows.commands import cut, slam
-from scan2sim.flows.commands.numbers import Buffer, Focal, Length, Pixels, Range, Rate, Shift
+from scan2sim.flows.commands import cut
+from scan2sim.flows.commands.slam import slam_video
 from scan2sim.flows.engine.lock import locked
 from scan2sim.flows.recipes.settings import Settings
+from scan2sim.flows.recipes.video import Video
 from scan2sim.pipeline.errors import InputError, from_os_error
 from scan2sim.pipeline.io import sweeps as io
 from scan2sim.pipeline.io import toml
 from scan2sim.pipeline.io.remote import is_remote, likeness
 from scan2sim.pipeline.io.tile import sources_of
-from scan2sim.pipeline.ranges import Voxel
+from scan2sim.pipeline.ranges import Buffer, Focal, Length, Pixels, Range, Voxel
 from scan2sim.pipeline.step import Report, silent
 from scan2sim.pipeline.store import Digests
-from scan2sim.slam.track import VERSION as TRACK
 
 Say = Callable[[str], None]
 PREPARED = "prepared"
@@ -34,19 +34,6 @@ PREPARED = "prepared"
 
 class _Strict(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class SlamEntry(_Strict):
-    """What SLAM is given; as the options of `scan2sim slam`."""
-
-    video: Path
-    gps: Path | None = None
-    gps_offset: Shift | None = None
-    mask: Path | None = None
-    camera: str = "auto"
-    focal: Focal | None = None
-    centre: tuple[Pixels, Pixels] | None = None
-    fps: Rate = 10.0
 
 
 class SweepsEntry(_Strict):
@@ -77,7 +64,7 @@ class Drive(_Strict):
     """All of `drive.toml`."""
 
     corridor: Path | None = None
-    slam: SlamEntry | None = None
+    slam: Video | None = None
     sweeps: SweepsEntry | None = None
     tiles: TilesEntry = TilesEntry.model_validate({})
 
@@ -174,22 +161,15 @@ def _corridor(drive: Drive, source: Path, out: Path, once: _Once, say: Say, repo
         return corridor / "tile.toml" if corridor.is_dir() else corridor
     poses = None
     if drive.slam is not None:
-        poses = _slam(drive.slam, here, out / "slam", once)
+        poses = _slam(drive.slam, here, out / "slam")
     assert drive.sweeps is not None
     return _sweeps(drive.sweeps, here, poses, out / "corridor", once, say, report)
 
 
-def _slam(entry: SlamEntry, here: Path, out: Path, once: _Once) -> Path:
-    options = slam.Options(
-        gps=entry.gps and here / entry.gps, gps_offset=entry.gps_offset, mask=entry.mask and here / entry.mask,
-        camera=entry.camera, focal=entry.focal, centre=entry.centre, fps=entry.fps,
-    )  # fmt: skip
-    sources = [here / path for path in (entry.video, entry.gps, entry.mask) if path is not None]
-
-    def make() -> None:
-        slam.slam_video(sources[0], out, options, Settings())
-
-    once(out, TRACK, sources, entry.model_dump(), make)
+def _slam(video: Video, here: Path, out: Path) -> Path:
+    """The trajectory of a drive's video; its files are relative to `here`."""
+    files = {name: here / value for name, value in video if isinstance(value, Path)}
+    slam_video(Video.model_validate(video.model_dump(exclude_unset=True) | files), out, Settings())
     return out / "trajectory.csv"
 
 

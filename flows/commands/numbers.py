@@ -7,20 +7,8 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from scan2sim.pipeline.ranges import Seed, Voxel
+from scan2sim.pipeline.ranges import Buffer, Focal, Length, Metres, Pixels, Range, Seed, Shift, Voxel
 from scan2sim.pipeline.step import Params
-
-Metres = Annotated[float, Field(ge=0, le=10_000)]
-Length = Annotated[float, Field(ge=1, le=100_000)]
-Buffer = Annotated[float, Field(ge=0, le=1000)]
-Range = Annotated[float, Field(ge=0.1, le=10_000)]
-Pixels = Annotated[float, Field(ge=-1_000_000, le=1_000_000)]
-Focal = Annotated[float, Field(ge=1, le=1_000_000)]
-"""Pixels."""
-Rate = Annotated[float, Field(ge=0.01, le=1000)]
-"""Frames a second."""
-Shift = Annotated[float, Field(ge=-1e10, le=1e10)]
-"""Seconds between two clocks, of which one may count from 1970."""
 
 
 class Numbers(Params):
@@ -38,13 +26,9 @@ class Numbers(Params):
     seed: Seed | None = None
     minutes: Annotated[float, Field(ge=0, le=100_000)] | None = None
     steps: Annotated[int, Field(ge=1, le=10_000_000)] | None = None
-    gps_offset: Shift | None = None
     time_offset: Shift | None = None
     focal: Focal | None = None
     centre: tuple[Pixels, Pixels] | None = None
-    fps: Rate | None = None
-    every: Annotated[int, Field(ge=1, le=1_000_000)] | None = None
-    until: Annotated[float, Field(ge=0, le=1e7)] | None = None
     segment: Annotated[float, Field(ge=1, le=1e7)] | None = None
     max_range: Range | None = None
     min_range: Metres | None = None

@@ -2,136 +2,64 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, fields
-from functools import partial
+import shutil
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, TypeVar, get_args
+from typing import Annotated, Any, TypeVar, get_args
 
-import numpy as np
 import typer
 
 from scan2sim.flows.commands.app import App, Config, Sets, settings_of
-from scan2sim.flows.commands.display import console, progress
+from scan2sim.flows.commands.display import console, progress, warn
+from scan2sim.flows.commands.log import Log
+from scan2sim.flows.commands.options import options
+from scan2sim.flows.commands.shown import execute_shown
 from scan2sim.flows.engine.lock import locked
+from scan2sim.flows.engine.planning import STORE, Planned, drop_damaged, plan
 from scan2sim.flows.recipes.settings import Settings
-from scan2sim.pipeline.errors import InputError, SettingError
-from scan2sim.pipeline.extras import need
+from scan2sim.flows.recipes.video import ALONE, STEPS, Video, recipe
+from scan2sim.pipeline.errors import SettingError
 from scan2sim.pipeline.io import gps as gps_io
 from scan2sim.pipeline.io import trajectory as trajectory_io
-from scan2sim.pipeline.io.image import read_rgb
-from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.pipeline.store import digest
-from scan2sim.pipeline.types import Camera, GpsTrack, Trajectory
-from scan2sim.slam import output, solvers
-from scan2sim.slam.adjust import adjust
-from scan2sim.slam.charts import Charts
+from scan2sim.pipeline.io.worlds import link
+from scan2sim.pipeline.store import Digests, Manifest, Store
+from scan2sim.pipeline.types import GpsTrack, Trajectory
 from scan2sim.slam.evaluate import AlignmentKind, Evaluation, evaluate, plot
-from scan2sim.slam.gps import smooth
-from scan2sim.slam.loops import Places
-from scan2sim.slam.loops import close as close_loops
-from scan2sim.slam.odometry import Odometry, OdometryParams
-from scan2sim.slam.sparse import sparse_map
-from scan2sim.slam.track import VERSION, Tracked, camera_of, track
-from scan2sim.slam.trackers import Tracker, named
-from scan2sim.slam.video import Video, open_video
+from scan2sim.slam.odometry import OdometryParams
+from scan2sim.slam.steps.track import TRACK, read_gps, read_mask
+from scan2sim.slam.video import open_video
 
 T = TypeVar("T", int, float)
-
-
-@dataclass(frozen=True)
-class Options:
-    """What the command was asked, besides parameters.
-
-    Attributes:
-        gps: file of the track.
-        gps_offset: seconds added to the track's times, first frame at 0; None: as the files' clocks say.
-        georeference: place the trajectory where GPS says.
-        mask: picture, 0 where the car is.
-        camera: "auto", "pinhole", "equirectangular".
-        focal: pixels.
-        centre: pixels.
-        tile: whose camera it is, and
-        tile_camera: the name of a photo of that camera there.
-        fps, times: of a folder of pictures.
-        every: take every so manieth frame.
-        until: seconds of the video to take; None: all.
-        backend: of `slam.solvers`.
-        features: "corners", or a backend of `slam.features`, with
-        matcher: one of `slam.matchers`, and
-        weights, matcher_weights: files of theirs, where they need any.
-        colmap: write the map as a COLMAP model, too.
-        loops: recognise places that were passed before.
-        adjust: adjust all keyframes at once in the end.
-        view: record a video of what is tracked.
-    """
-
-    gps: Path | None = None
-    gps_offset: float | None = None
-    georeference: bool = True
-    mask: Path | None = None
-    camera: str = "auto"
-    focal: float | None = None
-    centre: tuple[float, float] | None = None
-    tile: Path | None = None
-    fps: float = 10.0
-    times: Path | None = None
-    every: int = 1
-    until: float | None = None
-    backend: str = "lm"
-    features: str = "corners"
-    matcher: str = "nearest"
-    weights: Path | None = None
-    matcher_weights: Path | None = None
-    colmap: bool = False
-    loops: bool = False
-    adjust: bool = False
-    view: bool = False
-
+MADE = (
+    "trajectory.csv",
+    "trajectory.tum",
+    "trajectory.kitti",
+    "trajectory.geojson",
+    "odometry.csv",
+    "view.mp4",
+    "colmap",
+)
+"""What a run may leave beside `slam.json`."""
 
 app = App("Where the camera of a video went: `slam VIDEO --out DIR`.", first=True)
 
 
 @app.command("video")
+@options(Video)
 def slam_a_video(
-    video: Annotated[Path, typer.Argument(metavar="VIDEO", help="A video file, or a folder of pictures.")],
+    video: Video,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the trajectory.")],
-    gps: Annotated[
-        Path | None, typer.Option(help="GPX, NMEA, CSV, or a GoPro video: ties the scale, and places it.")
-    ] = None,
-    gps_offset: Annotated[float | None, typer.Option(help="Seconds to add to its times; first frame at 0.")] = None,
-    local: Annotated[bool, typer.Option("--local", help="Don't place it where GPS says: scale alone.")] = False,
-    mask: Annotated[Path | None, typer.Option(help="Picture: 0 where the car itself is seen.")] = None,
-    camera: Annotated[str, typer.Option(help="auto, equirectangular or pinhole.")] = "auto",
-    focal: Annotated[float | None, typer.Option(help="Pixels, of a pinhole camera.")] = None,
-    centre: Annotated[tuple[float, float] | None, typer.Option(help="Pixels; default: the middle.")] = None,
-    tile: Annotated[Path | None, typer.Option(help="Take the camera of this tile that has the video's size.")] = None,
-    fps: Annotated[float, typer.Option(help="Of a folder of pictures.")] = 10.0,
-    times: Annotated[Path | None, typer.Option(help="Of a folder's pictures: seconds, one a line.")] = None,
-    every: Annotated[int, typer.Option(min=1, help="Take every Nth frame.")] = 1,
-    until: Annotated[float, typer.Option(help="Seconds of the video; 0: all.")] = 0.0,
-    backend: Annotated[str, typer.Option(help="lm, or adam: the mission's.")] = "lm",
-    features: Annotated[str, typer.Option(help="corners (tracked), orb, rootsift, superpoint, aliked.")] = "corners",
-    matcher: Annotated[str, typer.Option(help="nearest, superglue, lightglue.")] = "nearest",
-    weights: Annotated[Path | None, typer.Option(help="Your file of the features' weights.")] = None,
-    matcher_weights: Annotated[Path | None, typer.Option(help="Your file of the matcher's.")] = None,
-    colmap: Annotated[bool, typer.Option("--colmap", help="Write the map as a COLMAP model, too.")] = False,
-    loops: Annotated[bool, typer.Option("--loops", help="Recognise places that were passed before.")] = False,
-    adjust: Annotated[bool, typer.Option("--adjust", help="Adjust all keyframes at once in the end.")] = False,
-    view: Annotated[bool, typer.Option("--view", help="Record what is tracked, and where: view.mp4.")] = False,
     set_: Sets = None,
     config: Config = None,
 ) -> None:
     """Poses of a video's frames: TUM, KITTI, CSV, GeoJSON."""
-    options = Options(
-        gps=gps, gps_offset=gps_offset, georeference=not local, mask=mask, camera=camera, focal=focal, centre=centre,
-        tile=tile, fps=fps, times=times, every=every, until=until or None, backend=backend,
-        features=features, matcher=matcher, weights=weights, matcher_weights=matcher_weights,
-        colmap=colmap, loops=loops, adjust=adjust, view=view,
-    )  # fmt: skip
-    slam_video(video, out, options, settings_of(set_, config))
+    done = slam_video(video, out, settings_of(set_, config))
+    figures = _figures(done)
+    for text in figures.pop("warnings"):
+        warn(text)
+    console.print(json.dumps(figures, indent=1), highlight=False, markup=False)
+    console.print(f"Trajectory: {out / 'trajectory.csv'}", highlight=False, soft_wrap=True, markup=False)
 
 
 @app.command("evaluate")
@@ -168,139 +96,66 @@ def slam_study(
     )  # fmt: skip
 
 
-def slam_video(path: Path, out: Path, options: Options, settings: Settings) -> Tracked:
-    """Write the trajectory of the camera that took a video, in all formats, and `slam.json`.
+def slam_video(video: Video, out: Path, settings: Settings) -> dict[str, Manifest]:
+    """Write the trajectory of the camera that took a video, in all formats, and `slam.json`; what is finished is kept.
+
+    Returns:
+        Results by the steps' names.
 
     Raises:
         ScanError: see `pipeline.errors`; earlier results stay.
     """
-    params = odometry_params(settings)
-    _need(options)
-    video = open_video(path, fps=options.fps, times=options.times)
-    camera, gps, mask = _camera(video, options), _gps(video, options), _mask(video, options)
-    with locked(out), progress("slam") as report:
-        state = out / f"state-{_mark(path, camera, options, params)}.npz"
-        watch = None
-        if options.view:
-            from scan2sim.slam.view import Recorder
-
-            watch = Recorder(out / "view.mp4", fps=video.fps / options.every)
-        places = Places(Charts(camera)) if options.loops else None
-        after: list[Callable[[Odometry], dict[str, float]]] = [adjust] if options.adjust else []
-        if places is not None:
-            after.append(partial(close_loops, places=places))
-        keep = options.colmap or options.adjust
-
-        def start(warn: Callable[[str], None]) -> Odometry:
-            return Odometry(
-                camera, params, mask=mask, gps=gps, backend=options.backend, keep=keep, remember=places, warn=warn,
-                tracker=_tracker(camera, mask, params.features, options),
-            )  # fmt: skip
-
-        tracked = track(
-            video, start, gps=gps, georeference=options.georeference, every=options.every, until=options.until,
-            state=state, watch=watch, after=after, report=report,
-        )  # fmt: skip
-        if watch is not None:
-            watch.close()
-        sparse = sparse_map(tracked.odometry, tracked.placing, tracked.trajectory) if options.colmap else None
-        output.write(out, tracked.trajectory, tracked.frame, camera=camera, names=tracked.names, sparse=sparse)
-        if tracked.alone is not None:
-            trajectory_io.write(out / "odometry.csv", tracked.alone, tracked.frame)
-        (out / "slam.json").write_text(json.dumps(tracked.facts | {"warnings": tracked.warnings}, indent=1) + "\n")
-        for left in out.glob("state-*"):  # those of other options, too: what they were to become is replaced
-            left.unlink()
-    for warning in tracked.warnings[:20]:
-        console.print(f"[yellow]warning:[/] {warning}", highlight=False, soft_wrap=True)
-    console.print(json.dumps(tracked.facts, indent=1), highlight=False, markup=False)
-    console.print(f"Trajectory: {out / 'trajectory.csv'}", highlight=False, soft_wrap=True, markup=False)
-    return tracked
+    nodes = recipe(video, settings)
+    with locked(out):
+        store = Store(out / STORE)
+        digests = Digests(store.root / "digests.json")
+        planned = plan(nodes, store, digest=digests)
+        if drop_damaged(planned, store, {node.id.name for node in nodes}):
+            planned = plan(nodes, store, digest=digests)
+        log = Log(out / "run.log")
+        log.write(f"slam {video.video}, settings {json.dumps(settings.values)}")
+        with log.errors(out):
+            outcome = execute_shown(planned, store, log)
+            outcome.check()
+            done = outcome.of_tile()
+            _publish(planned, done, store, out)
+        store.sweep({item.node.id.name: item.key for item in planned})
+        digests.save()
+    return done
 
 
-def _need(options: Options) -> None:
-    """Refuse at once what would fail for want of a package in the end.
+def _publish(planned: Iterable[Planned], done: dict[str, Manifest], store: Store, out: Path) -> None:
+    """Put what users look at beside the store; of an earlier run nothing stays."""
+    folder = {item.node.id.name: store.folder(item.node.label, item.key) for item in planned}
+    made = {path.name: path for path in (folder["place"] / "path").iterdir()}
+    if f"place.{ALONE}" in folder:
+        made["odometry.csv"] = folder[f"place.{ALONE}"] / "path" / "trajectory.csv"
+    if "view" in done["track"].files:
+        made["view.mp4"] = folder["track"] / "view.mp4"
+    for name in MADE:
+        place, source = out / name, made.get(name)
+        shutil.rmtree(place) if place.is_dir() else place.unlink(missing_ok=True)
+        if source is not None:
+            shutil.copytree(source, place, copy_function=link) if source.is_dir() else link(str(source), str(place))
+    (out / "slam.json").write_text(json.dumps(_figures(done), indent=1) + "\n", encoding="utf-8")
 
-    Raises:
-        UnavailableError: naming it.
-    """
-    if options.adjust:
-        need("--adjust", "pycolmap")
-    solvers.named(options.backend)
-    if options.view:
-        need("--view", "av")
 
-
-def _mark(path: Path, camera: Camera, options: Options, params: OdometryParams) -> str:
-    """Of all that a run depends on: the code's version, the contents of files, options and parameters."""
-    given = {f.name: getattr(options, f.name) for f in fields(options) if f.name != "tile"}  # which gave the camera
-    asked = {name: digest(value) if isinstance(value, Path) else value for name, value in given.items()}
-    whole = [VERSION, digest(path), asdict(camera), asked, params.model_dump(mode="json")]
-    return hashlib.sha256(json.dumps(whole).encode()).hexdigest()[:12]
+def _figures(done: dict[str, Manifest]) -> dict[str, Any]:
+    """All figures of a run, and its warnings."""
+    steps = [manifest for name, manifest in done.items() if name != f"place.{ALONE}"]
+    facts = {key: value for one in steps for key, value in one.facts.items()}
+    return facts | {"warnings": list(dict.fromkeys(text for one in steps for text in one.warnings))}
 
 
 def odometry_params(settings: Settings) -> OdometryParams:
-    """Of `--set slam.param=value`.
+    """Of `--set track.param=value`.
 
     Raises:
         SettingError: unknown, or out of range.
     """
-    for name in settings.values:
-        if name != "slam":
-            raise SettingError(name, "there is no such step here", "Write --set slam.param=value")
-    values = settings.values.get("slam", {})
-    if not isinstance(values, Mapping):
-        raise SettingError("slam", "must be a table of parameters", "Write --set slam.param=value")
-    return OdometryParams.of("slam", values, remedy="docs/slam.md lists them")
-
-
-def _tracker(camera: Camera, mask: np.ndarray | None, count: int, options: Options) -> Tracker:
-    """What follows features: corners by Lucas-Kanade, or descriptors from frame to frame (D3.2)."""
-    if options.features == "corners":
-        return named("corners", Charts(camera), mask, count)
-    from scan2sim.slam import features, matchers
-
-    detector = features.named(options.features, options.weights)
-    matcher = matchers.named(options.matcher, options.matcher_weights)
-    matchers.check(detector, matcher)
-    for part in (detector, matcher):
-        console.print(part.describe(), highlight=False, markup=False, soft_wrap=True)
-    return named("descriptors", Charts(camera), mask, count, detector, matcher)
-
-
-def _camera(video: Video, options: Options) -> Camera:
-    if options.tile is None:
-        return camera_of(video, options.camera, options.focal, options.centre)
-    for view in read_tile(options.tile).views:
-        if (view.camera.width, view.camera.height) == (video.width, video.height):
-            return view.camera
-    raise InputError(options.tile, f"has no camera of {video.width}x{video.height}", "Give --camera and --focal")
-
-
-def _gps(video: Video, options: Options) -> GpsTrack | None:
-    """The track in the frames' times, smoothed."""
-    if options.gps is None:
-        return None
-    track_ = gps_io.read(options.gps)
-    absolute = track_.times[0] > 1e8
-    if options.gps_offset is not None:
-        track_ = track_.shifted(options.gps_offset)
-    elif absolute and video.start is not None and abs(video.start - track_.times[0]) < 3600:
-        track_ = track_.shifted(-video.start)
-    elif absolute:
-        console.print("[yellow]warning:[/] no clock of the video's: its first frame is taken to be at the first fix")
-        track_ = track_.shifted(-float(track_.times[0]))
-    return smooth(track_)
-
-
-def _mask(video: Video, options: Options) -> np.ndarray | None:
-    if options.mask is None:
-        return None
-    import cv2
-
-    rgb = read_rgb(options.mask) if options.mask.is_file() else None
-    if rgb is None:
-        raise InputError(options.mask, "is no readable picture", "Give a mask: 0 where the car itself is seen")
-    return cv2.resize(rgb[..., 0], (video.width, video.height), interpolation=cv2.INTER_NEAREST)
+    settings.check(STEPS)
+    given = settings.params(TRACK)
+    return OdometryParams(**{name: getattr(given, name) for name in OdometryParams.model_fields})
 
 
 def evaluate_trajectory(estimate: Path, truth: Path, *, segment: float, alignment: str, out: Path | None) -> Evaluation:
@@ -347,11 +202,12 @@ def study_compression(
     if known is None:
         raise SettingError("--truth", "is missing", "Give a trajectory, or a GPS track, to compare with")
     video = open_video(source / "video.mp4" if (source / "video.mp4").is_file() else source)
-    options = Options(gps=found(gps, "gps.csv"), gps_offset=0.0, mask=found(mask, "mask.png"))
+    track = read_gps(video, found(gps, "gps.csv"), 0.0, warn)
+    free = read_mask(video, found(mask, "mask.png"))
     with progress("study") as report:
         table = study(
-            source, _truth(known), out, params=odometry_params(settings), gps=_gps(video, options),
-            mask=_mask(video, options), heights=_numbers("--heights", heights, int), jobs=jobs, backend=backend,
+            source, _truth(known), out, params=odometry_params(settings), gps=track, mask=free, jobs=jobs,
+            backend=backend, heights=_numbers("--heights", heights, int),
             bitrates=_numbers("--bitrates", bitrates, float), rates=_numbers("--rates", rates, float), report=report,
         )  # fmt: skip
     console.print(table.read_text(encoding="utf-8"), highlight=False, markup=False, soft_wrap=True)

@@ -12,7 +12,7 @@ from functools import cache
 
 from scan2sim import __version__
 from scan2sim.flows.engine.planning import Planned
-from scan2sim.flows.recipes.tile import STEPS
+from scan2sim.flows.recipes.steps import STEPS
 from scan2sim.pipeline.errors import UnavailableError
 
 APART = ("flows", "ray", "s3", "dev")

@@ -76,14 +76,14 @@ def named(
         UnavailableError: it can't run here.
         InputError: the weights are damaged, of another network, or unsafe to read.
     """
-    backend: Backend = backends.find(__name__, name, "slam.features")
+    backend: Backend = backends.find(__name__, name, "track.features")
     return backend.load(weights, count, upsample, device)
 
 
 def no_weights(name: str, weights: Path | None) -> None:
     """Raise SettingError if weights are given to a backend that has none."""
     if weights is not None:
-        raise SettingError("slam.weights", f"{name!r} takes no weights", "Leave them out, or choose a network")
+        raise SettingError("track.weights", f"{name!r} takes no weights", "Leave them out, or choose a network")
 
 
 def enlarged(picture: U8, mask: U8 | None, times: int) -> tuple[U8, U8 | None]:

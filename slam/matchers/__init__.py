@@ -61,7 +61,7 @@ def named(name: str, weights: Path | None = None, *, device: str = "auto") -> Ma
         UnavailableError: it can't run here.
         InputError: the weights are damaged, of another network, or unsafe to read.
     """
-    backend: Backend = backends.find(__name__, name, "slam.matchers")
+    backend: Backend = backends.find(__name__, name, "track.matcher")
     return backend.load(weights, device)
 
 
@@ -72,7 +72,7 @@ def check(features: Features, matcher: Matcher) -> None:
         made_for = f"{matcher.takes or 'features'} of {matcher.dimension} numbers"
         given = f"{features.name} of {features.dimension} {'bytes' if features.binary else 'numbers'}"
         raise SettingError(
-            "slam.matcher", f"{matcher.name!r} was made for {made_for}, not for {given}",
+            "track.matcher", f"{matcher.name!r} was made for {made_for}, not for {given}",
             "Choose others, or `nearest`, which takes any",
         )  # fmt: skip
 

@@ -22,5 +22,5 @@ def named(name: str) -> Solver:
         SettingError: there is none of that name.
         UnavailableError: it can't run here.
     """
-    solver: Solver = backends.find(__name__, name, "slam.backend")
+    solver: Solver = backends.find(__name__, name, "track.backend")
     return solver

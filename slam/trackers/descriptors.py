@@ -55,7 +55,7 @@ def load(charts: Charts, mask: U8 | None, count: int, features: Features | None,
         SettingError: features or matcher are missing, or not made for each other.
     """
     if features is None or matcher is None:
-        raise SettingError("slam.features", "descriptors need features and a matcher", "Name both")
+        raise SettingError("track.features", "descriptors need features and a matcher", "Name both")
     return DescriptorTracker(charts, mask, count, features, matcher)
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from scan2sim.flows.commands.drive import read_drive, survey_of
+from scan2sim.flows.recipes.video import Video
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.io.survey import read_survey
 
@@ -64,16 +65,15 @@ def test_a_path_and_a_corridor_are_made_again_by_newer_code_and_of_other_files(
     text = '[slam]\nvideo = "video.mp4"\n[sweeps]\nfolder = "velodyne"\nphotos = "image"\ncamera = "camera.toml"\n'
     place = drive(tmp_path, text)
 
-    def slam(path: Path, out: Path, *_: object) -> None:
-        made.append("slam")
+    def slam(video: Video, out: Path, *_: object) -> None:
         out.mkdir(parents=True, exist_ok=True)
-        (out / "trajectory.csv").write_text("path")
+        (out / "trajectory.csv").write_text(video.video.read_text())
 
     def sweeps(folder: Path, poses: Path, out: Path, **_: object) -> None:
         made.append("sweeps")
         out.mkdir(exist_ok=True)
 
-    monkeypatch.setattr("scan2sim.flows.commands.slam.slam_video", slam)
+    monkeypatch.setattr("scan2sim.flows.commands.drive.slam_video", slam)
     monkeypatch.setattr("scan2sim.pipeline.io.sweeps.import_sweeps", sweeps)
     monkeypatch.setattr("scan2sim.pipeline.io.sweeps.camera_of_photos", lambda *_, **__: None)
     monkeypatch.setattr("scan2sim.flows.commands.drive._cut", lambda corridor, *_: corridor)
@@ -83,15 +83,13 @@ def test_a_path_and_a_corridor_are_made_again_by_newer_code_and_of_other_files(
         survey_of(place, tmp_path / "out")
         return list(made)
 
-    assert again() == ["slam", "sweeps"] and again() == []
-    monkeypatch.setattr("scan2sim.flows.commands.drive.TRACK", 1000)
-    assert again() == ["slam"] and again() == []
+    assert again() == ["sweeps"] and again() == []
     monkeypatch.setattr("scan2sim.pipeline.io.sweeps.VERSION", 1000)
     assert again() == ["sweeps"] and again() == []
     (tmp_path / "camera.toml").write_text("another")
     assert again() == ["sweeps"]
     (tmp_path / "video.mp4").write_text("another")
-    assert again() == ["slam"]
+    assert again() == ["sweeps"], "another video, another path"
 
 
 def test_a_survey_is_itself(corridor: Path, tmp_path: Path) -> None:

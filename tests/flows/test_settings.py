@@ -11,14 +11,14 @@ from typer.testing import CliRunner
 from scan2sim.flows.cli import COMMANDS, app, loaded
 from scan2sim.flows.commands.numbers import Numbers
 from scan2sim.flows.recipes.settings import Settings
-from scan2sim.flows.recipes.tile import STEPS
+from scan2sim.flows.recipes.steps import STEPS
 from scan2sim.pipeline.errors import SettingError
 from scan2sim.pipeline.ranges import told
 from scan2sim.pipeline.step import Params
 from scan2sim.pipeline.steps.decimate import DECIMATE
 from scan2sim.pipeline.steps.split import SPLIT
 from scan2sim.pipeline.steps.trim import TRIM
-from scan2sim.slam.odometry import OdometryParams
+from scan2sim.slam.steps.track import Filmed
 from scan2sim.texturing.unwrap import UnwrapParams, check_size
 from tests.conftest import ROOT
 
@@ -80,7 +80,7 @@ def test_a_broken_file_is_refused(tmp_path: Path) -> None:
 # every setting: what is no number, or beyond all measure, is refused by its name and range, or is harmless
 
 MODELS: dict[str, type[Params]] = {
-    **{step.name: step.params for step in STEPS}, "slam": OdometryParams, "": Numbers,
+    **{step.name: step.params for step in STEPS}, "": Numbers,
 }  # fmt: skip
 SETTINGS = [(where, name) for where, model in MODELS.items() for name in model.model_fields]
 WILD = (
@@ -133,7 +133,7 @@ def test_every_number_that_a_command_takes_has_a_range() -> None:
     single = [one for some in found for one in getattr(some, "commands", {"": some}).values()]
     hints = [get_type_hints(one.callback) for one in single]
     numbers = {name for of in hints for name, kind in of.items() if {int, float} & {kind, *get_args(kind)}}
-    assert len(numbers) > 15 and numbers <= Numbers.model_fields.keys()
+    assert len(numbers) > 15 and numbers <= Numbers.model_fields.keys() | Filmed.model_fields.keys()
 
 
 @pytest.mark.parametrize(
@@ -145,7 +145,7 @@ def test_every_number_that_a_command_takes_has_a_range() -> None:
         (("slam", "v.mp4", "--focal", "inf"), "--focal"),
         (("slam", "v.mp4", "--centre", "nan", "3"), "--centre"),
         (("slam", "v.mp4", "--fps", "0"), "--fps"),
-        (("slam", "v.mp4", "--set", "slam.sigma=nan"), "slam.sigma"),
+        (("slam", "v.mp4", "--set", "track.sigma=nan"), "track.sigma"),
         (("run", "tile", "--hold-out", "1"), "views.hold_out"),
         (("run", "data_samples/tile", "--set", "export.world_origin=[nan, 0, 0]"), "export.world_origin"),
         (("run", "data_samples/tile", "--set", "export.world_origin=[1e300, 0, 0]"), "export.world_origin"),

@@ -12,7 +12,7 @@ import tomli_w
 
 from scan2sim.flows.commands.drive import read_drive
 from scan2sim.flows.recipes.settings import Settings
-from scan2sim.flows.recipes.tile import STEPS
+from scan2sim.flows.recipes.steps import STEPS
 from scan2sim.pipeline.io import gps as gps_io
 from scan2sim.pipeline.io import sweeps
 from scan2sim.pipeline.io import trajectory as trajectory_io

@@ -5,6 +5,7 @@ import json
 import os
 import pickle
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,16 +14,16 @@ from typer.testing import CliRunner
 
 import scan2sim.slam.track as tracking
 from scan2sim.flows.cli import app
-from scan2sim.flows.commands.slam import Options, _mark, _tracker
+from scan2sim.flows.engine.planning import plan
+from scan2sim.flows.recipes.settings import Settings
+from scan2sim.flows.recipes.video import Video, recipe
 from scan2sim.pipeline.errors import InputError, ScanError
 from scan2sim.pipeline.io import trajectory as trajectory_io
-from scan2sim.pipeline.types import Camera
-from scan2sim.slam.loops import Places
+from scan2sim.pipeline.store import Store
 from scan2sim.slam.odometry import Odometry, OdometryParams
+from scan2sim.slam.steps.track import TRACK, TrackParams, tracker_of
 from scan2sim.slam.track import VERSION, track
 from scan2sim.slam.video import open_video
-
-CAMERA = Camera("equirectangular", 256, 128)
 
 
 def command(*arguments):
@@ -37,7 +38,7 @@ def command(*arguments):
 def done(corridor, tmp_path_factory):
     out = tmp_path_factory.mktemp("slam") / "out"
     result = command(
-        "slam", corridor.folder / "video.mp4", "--out", out, "--colmap", "--adjust", "--set", "slam.features=300"
+        "slam", corridor.folder / "video.mp4", "--out", out, "--colmap", "--adjust", "--set", "track.count=300"
     )
     return out, result.output
 
@@ -51,7 +52,19 @@ def test_it_writes_the_trajectory_in_all_formats_and_says_that_there_is_no_gps(d
     assert "there is no GPS" in said
     assert not (out / "trajectory.geojson").exists()
     assert json.loads((out / "slam.json").read_text())["frames"] == len(found)
-    assert list(out.glob("state-*")) == []
+    assert list((out / "steps").rglob("state*")) == []
+
+
+def test_what_was_tracked_is_kept_when_only_its_placing_changes(corridor, tmp_path):
+    asked = ("slam", corridor.folder / "video.mp4", "--out", tmp_path, "--set", "track.count=300", "--until", "0.5")
+    command(*asked, "--view")
+    first = {path: path.stat().st_mtime_ns for path in tmp_path.glob("steps/track/*/*")}
+    assert first and (tmp_path / "view.mp4").is_file()
+    said = command(*asked, "--view", "--local").output
+    assert "1 of 2 results kept" in said.replace("\n", " ")
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.glob("steps/track/*/*")} == first
+    command(*asked)
+    assert not (tmp_path / "view.mp4").exists(), "of an earlier run nothing stays"
 
 
 def test_the_colmap_model_is_one(done):
@@ -73,13 +86,11 @@ def test_evaluate_prints_the_missions_errors(done, corridor, tmp_path):
 def test_an_interrupted_run_goes_on_and_ends_the_same(corridor, tmp_path, monkeypatch, features):
     monkeypatch.setattr(tracking, "KEEP_EVERY", 0.0)
     video, state = open_video(corridor.folder / "video.mp4"), tmp_path / "state.npz"
-    params = OdometryParams.model_validate({"features": 300})
-    places = []
+    params = TrackParams.model_validate({"count": 300, "features": features})
 
     def start(warn):
-        tracker = _tracker(corridor.camera, None, 300, Options(features=features))
-        places.append(Places(tracker.charts))
-        return Odometry(corridor.camera, params, tracker=tracker, keep=True, remember=places[-1], warn=warn)
+        tracker, _ = tracker_of(corridor.camera, None, params, {})
+        return Odometry(corridor.camera, params, tracker=tracker, keep=True, warn=warn)
 
     def interrupt(odometry, grey):
         if len(odometry.placed) == 20:
@@ -90,8 +101,8 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(corridor, tmp_path, monkey
     resumed = track(video, start, state=state)
     whole = track(video, start)
     assert resumed.names == whole.names
-    assert np.array_equal(resumed.trajectory.positions, whole.trajectory.positions)
-    assert places[1].seen.keys() == places[2].seen.keys()
+    paths = [[run.odometry.pose_of(placed) for placed in run.odometry.placed] for run in (resumed, whole)]
+    assert np.array_equal(*paths)
 
 
 class Trap:
@@ -120,7 +131,7 @@ def damages(path):
 def test_a_state_that_is_damaged_or_foreign_is_not_run_and_the_run_begins_anew(corridor, tmp_path, monkeypatch):
     monkeypatch.setattr(tracking, "KEEP_EVERY", 0.0)
     video, state = open_video(corridor.folder / "video.mp4"), tmp_path / "state.npz"
-    params = OdometryParams.model_validate({"features": 300})
+    params = OdometryParams.model_validate({"count": 300})
 
     def start(warn):
         return Odometry(corridor.camera, params, warn=warn)
@@ -137,8 +148,8 @@ def test_an_interrupted_run_goes_on_only_from_what_the_same_code_made_of_the_sam
     video, mask = tmp_path / "video.mp4", tmp_path / "mask.png"
 
     def mark(**changes):
-        given = {"mask": mask} | changes
-        return _mark(video, CAMERA, Options(**given), OdometryParams())
+        nodes = recipe(Video.model_validate({"video": video, "mask": mask} | changes), Settings())
+        return plan(nodes, Store(tmp_path / "steps"))[0].key
 
     video.write_bytes(b"one"), mask.write_bytes(b"mask")
     before, times = mark(), video.stat()
@@ -150,7 +161,7 @@ def test_an_interrupted_run_goes_on_only_from_what_the_same_code_made_of_the_sam
     assert mark() != before
     video.write_bytes(b"one")
     assert mark() == before != mark(every=2)
-    monkeypatch.setattr("scan2sim.flows.commands.slam.VERSION", VERSION + 1)
+    monkeypatch.setattr("scan2sim.flows.recipes.video.TRACK", replace(TRACK, version=VERSION + 1))
     assert mark() != before
 
 
@@ -160,8 +171,8 @@ def test_an_interrupted_run_goes_on_only_from_what_the_same_code_made_of_the_sam
         (lambda p: None, ("absent.mp4",), "is missing"),
         (lambda p: (p / "v.mp4").write_bytes(b"no video"), ("v.mp4",), "no readable video"),
         (lambda p: (p / "empty").mkdir(), ("empty",), "no pictures"),
-        (lambda p: None, ("VIDEO", "--backend", "magic"), "there is no `magic`"),
-        (lambda p: None, ("VIDEO", "--set", "slam.windows=3"), "slam.windows"),
+        (lambda p: None, ("VIDEO", "--backend", "magic"), "there is no 'magic'"),
+        (lambda p: None, ("VIDEO", "--set", "track.windows=3"), "track.windows"),
         (lambda p: None, ("VIDEO", "--camera", "pinhole"), "needs a camera"),
         (lambda p: (p / "m.png").write_bytes(b"x"), ("VIDEO", "--mask", "m.png"), "no readable picture"),
         (lambda p: (p / "g.csv").write_text("a,b\n1,2\n"), ("VIDEO", "--gps", "g.csv"), "g.csv"),

@@ -67,7 +67,7 @@ def test_cells_are_measured_kept_and_not_run_again(corridor: Drive, tmp_path: Pa
     assert study_module._kept(out / "cells", Cell(128, 1.0, 10.0), same) == Result(figures, None)
     cells[1].write_text(cells[1].read_text()[:100])  # killed while writing: but files appear whole
     assert study_module._kept(out / "cells", Cell(128, 1.0, 10.0), same) is None
-    other = source_of(corridor, gps=gps, params=OdometryParams.model_validate({"features": 300}))
+    other = source_of(corridor, gps=gps, params=OdometryParams.model_validate({"count": 300}))
     assert study_module._identity(other) != same == study_module._identity(source_of(corridor, gps=gps))
 
 

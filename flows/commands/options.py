@@ -1,0 +1,70 @@
+"""Options of a command that are the fields of parameters: their names, defaults, ranges and help are said once."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from typing import Annotated, Any, TypeVar, get_args, get_origin
+
+import typer
+from pydantic.fields import FieldInfo
+
+from scan2sim.pipeline.step import Params
+
+P = TypeVar("P", bound=Params)
+
+
+def options(model: type[P], **named: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Decorator of a command: its first parameter, a `model`, is given as arguments and options.
+
+    Args:
+        model: field by field an option, or an argument where it has no default; what is given is checked against its
+            ranges, and fields that aren't given aren't set.
+        named: what an argument is called in the help, by its field.
+    """
+
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        own = list(inspect.signature(command, eval_str=True).parameters.values())[1:]
+        fields = model.model_fields
+        taken = [_parameter(name, field, named.get(name)) for name, field in fields.items()]
+        taken.sort(key=lambda one: fields[one.name].is_required(), reverse=True)
+
+        def called(**given: Any) -> None:
+            values = {name: given.pop(name) for name in fields}
+            changed = {name: value for name, value in values.items() if value != fields[name].get_default()}
+            command(model.of("", changed, remedy="`--help` says what it means"), **given)
+
+        # arguments, then what the command itself must be given, then options
+        order = [*taken, *own]
+        signature = [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in order]
+        called.__name__, called.__doc__ = command.__name__, command.__doc__
+        called.__signature__ = inspect.Signature(signature)  # type: ignore[attr-defined]
+        called.__annotations__ = {one.name: one.annotation for one in signature}
+        return called
+
+    return decorate
+
+
+def _parameter(name: str, field: FieldInfo, named: str | None) -> inspect.Parameter:
+    """The field as Typer wants it: without its ranges, which the model checks."""
+    kind = _plain(field.annotation)
+    if field.is_required():
+        about: Any = typer.Argument(help=field.description, metavar=named or name.upper())
+        default = inspect.Parameter.empty
+    else:
+        flag = [f"--{name.replace('_', '-')}"]
+        about = typer.Option(*flag, help=field.description)
+        default = field.get_default()
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, about])
+
+
+def _plain(kind: Any) -> Any:
+    """A type without the ranges of its numbers."""
+    if get_origin(kind) is Annotated:
+        return _plain(get_args(kind)[0])
+    parts = get_args(kind)
+    if get_origin(kind) is tuple:
+        return tuple[tuple(_plain(part) for part in parts)]  # type: ignore[misc]
+    if parts and type(None) in parts:
+        return _plain(next(part for part in parts if part is not type(None))) | None
+    return kind

@@ -1,0 +1,8 @@
+"""All steps of all recipes."""
+
+from __future__ import annotations
+
+from scan2sim.flows.recipes import tile, video
+from scan2sim.pipeline.step import Step
+
+STEPS: tuple[Step, ...] = (*tile.STEPS, *video.STEPS)
