@@ -37,4 +37,4 @@ def close_loops(inputs: Inputs, params: LoopsParams, out: Path, report: Report) 
     return Done({"mapped": mapped.write(out / "mapped.npz")}, dict(facts))
 
 
-LOOPS = Step("loops", 1, close_loops, LoopsParams, memory=(1.5, 3))
+LOOPS = Step("loops", 1, close_loops, LoopsParams, memory=(1.0, 0))

@@ -162,4 +162,4 @@ def tracker_of(camera: Camera, mask: U8 | None, params: TrackParams, inputs: Inp
     return tracker, f"{detector.describe()}; {matcher.describe()}"
 
 
-TRACK = Step("track", VERSION, track_video, TrackParams, check=can_track, resumes=True, memory=(1.5, 0))
+TRACK = Step("track", VERSION, track_video, TrackParams, check=can_track, resumes=True, memory=(1.0, 0))
