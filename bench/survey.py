@@ -24,7 +24,7 @@ import numpy as np
 from bench.measure import measure
 from scan2sim.data_samples.photos import Effects
 from scan2sim.data_samples.street import generate
-from scan2sim.flows.commands.cut import Options, cut_survey
+from scan2sim.pipeline.corridor import CutParams, cut_survey
 from scan2sim.pipeline.io.tile import read_tile
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -81,7 +81,7 @@ def street(out: Path) -> Path:
         )  # fmt: skip
     if not (survey / "survey.toml").is_file():
         began = time.perf_counter()
-        cut_survey(corridor, survey, Options(length=100.0, buffer=5.0))
+        cut_survey(corridor, survey, CutParams.model_validate({"length": 100.0, "buffer": 5.0}))
         print(f"cut: {time.perf_counter() - began:.1f} s")
     return survey
 

@@ -17,7 +17,7 @@ import typer
 from pydantic import BaseModel, ValidationError
 
 from scan2sim.flows.cli import COMMANDS, app, loaded
-from scan2sim.flows.commands.drive import Drive
+from scan2sim.flows.recipes.drive import Drive
 from scan2sim.flows.recipes.steps import STEPS
 from scan2sim.pipeline.classes import SURFACES
 from scan2sim.pipeline.io.survey import SurveyFile

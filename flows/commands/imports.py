@@ -10,13 +10,14 @@ import typer
 
 from scan2sim.flows.commands.app import App, Classes, Crs, Link, Name, Overwrite, TileOut
 from scan2sim.flows.commands.display import progress
+from scan2sim.flows.commands.options import options
+from scan2sim.flows.recipes.drive import Sweeps
 from scan2sim.pipeline.classes import parse
-from scan2sim.pipeline.errors import SettingError
-from scan2sim.pipeline.io import sweeps as sweeps_io
 from scan2sim.pipeline.io.import_model import import_model
 from scan2sim.pipeline.io.kitti import import_kitti_raw
 from scan2sim.pipeline.io.kitti_odometry import import_kitti_odometry
 from scan2sim.pipeline.io.las_csv import import_las
+from scan2sim.pipeline.steps.import_sweeps import tile_of
 
 app = App("Make a tile from your files.")
 
@@ -136,58 +137,21 @@ def import_plain_clouds(
 
 
 @app.command("sweeps")
+@options(Sweeps, folder="SWEEPS")
 def import_sweeps_and_poses(
-    sweeps: Annotated[Path, typer.Argument(help="Folder of sweeps in scanner axes: .bin, .pcd, .ply, .las, .laz.")],
+    sweeps: Sweeps,
     poses: Annotated[Path, typer.Argument(help="Trajectory, of `slam` for example: .csv, .tum, .kitti; z-up.")],
     out: TileOut,
-    extrinsics: Annotated[
-        Path | None, typer.Option(help="T_camera_scanner, 3 or 4 rows, or KITTI's calibration: poses are the camera's.")
-    ] = None,
-    scanner_poses: Annotated[
-        bool, typer.Option("--scanner-poses", help="Poses are the scanner's all the same.")
-    ] = False,
-    times: Annotated[
-        Path | None, typer.Option(help="Of sweeps, seconds, one a line; default: names, or order.")
-    ] = None,
-    time_offset: Annotated[float, typer.Option(help="Seconds to add to times of sweeps and photos.")] = 0.0,
-    photos: Annotated[Path | None, typer.Option(help="Folder of photos: they colour the points.")] = None,
-    photo_times: Annotated[Path | None, typer.Option(help="Of photos, likewise.")] = None,
-    camera: Annotated[str, typer.Option(help="auto, pinhole, equirectangular, or a TOML like a tile's.")] = "auto",
-    focal: Annotated[float | None, typer.Option(help="Pixels, of a pinhole camera.")] = None,
-    centre: Annotated[tuple[float, float] | None, typer.Option(help="Pixels; default: the middle.")] = None,
-    mask: Annotated[Path | None, typer.Option(help="Of all photos: 0 where the car itself is seen.")] = None,
-    max_range: Annotated[float, typer.Option(help="Metres; returns from further away are left out.")] = 50.0,
-    min_range: Annotated[float, typer.Option(help="Metres; nearer returns, the car's own, are left out.")] = 1.0,
-    deskew: Annotated[str, typer.Option(help="kitti: points by the pose of their own moment; or none.")] = "none",
-    period: Annotated[
-        float | None, typer.Option(help="Seconds of the scanner's turn; default: between sweeps.")
-    ] = None,
-    voxel: Annotated[float | None, typer.Option(help="Keep one point in so many metres.")] = None,
-    keep_unsure: Annotated[bool, typer.Option("--keep-unsure", help="Take unsure stretches of the path, too.")] = False,
-    crs: Crs = "local",
     name: Name = None,
     link: Link = False,
     overwrite: Overwrite = False,
 ) -> None:
     """A scanner's sweeps placed by a trajectory, with photos if there are any."""
-    if deskew not in ("none", "kitti"):
-        raise SettingError("deskew", f"there is no {deskew!r}", "Use kitti, or none")
-    known = None if extrinsics is None else sweeps_io.read_extrinsics(extrinsics)
-    pictures = None
-    if photos is not None:
-        file = Path(camera) if camera.endswith(".toml") or Path(camera).exists() else None
-        shape = sweeps_io.camera_of_photos(
-            photos, model="auto" if file else camera, focal=focal, centre=centre, file=file
-        )
-        beside = None if extrinsics is None else sweeps_io.photo_extrinsics(extrinsics, photos)
-        pictures = sweeps_io.Pictures(photos, shape, photo_times, mask, beside)
     told: list[str] = []
     with progress("import") as report:
-        path = sweeps_io.import_sweeps(
-            sweeps, poses, out, extrinsics=known, of="scanner" if scanner_poses else None, times=times,
-            offset=time_offset, photos=pictures, max_range=max_range, min_range=min_range,
-            deskew="kitti" if deskew == "kitti" else "none", period=period, voxel=voxel, keep_unsure=keep_unsure,
-            crs=crs or "local", name=name, link=link, overwrite=overwrite, warn=told.append, report=report,
+        path = tile_of(
+            sweeps.inputs(Path()), sweeps.params(), out, link=link, overwrite=overwrite, name=name, warn=told.append,
+            report=report,
         )  # fmt: skip
     _imported(path, told)
 

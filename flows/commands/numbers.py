@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from scan2sim.pipeline.ranges import Buffer, Focal, Length, Metres, Pixels, Range, Seed, Shift, Voxel
+from scan2sim.pipeline.ranges import Buffer, Length, Range, Seed
 from scan2sim.pipeline.step import Params
 
 
@@ -20,20 +20,13 @@ class Numbers(Params):
     length: Length | None = None
     buffer: Buffer | None = None
     reach: Annotated[float, Field(ge=1, le=10_000)] | None = None
-    photo_reach: Metres | None = None
     points: Annotated[float, Field(ge=1000, le=1e9)] | None = None
     photos: Annotated[int, Field(ge=0, le=10_000)] | None = None
     seed: Seed | None = None
     minutes: Annotated[float, Field(ge=0, le=100_000)] | None = None
     steps: Annotated[int, Field(ge=1, le=10_000_000)] | None = None
-    time_offset: Shift | None = None
-    focal: Focal | None = None
-    centre: tuple[Pixels, Pixels] | None = None
     segment: Annotated[float, Field(ge=1, le=1e7)] | None = None
     max_range: Range | None = None
-    min_range: Metres | None = None
-    period: Annotated[float, Field(ge=0.0001, le=1000)] | None = None
-    voxel: Voxel | None = None
     scale: Annotated[float, Field(ge=1e-6, le=1e6)] | None = None
 
 

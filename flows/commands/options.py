@@ -19,20 +19,22 @@ def options(model: type[P], **named: str) -> Callable[[Callable[..., None]], Cal
 
     Args:
         model: field by field an option, or an argument where it has no default; what is given is checked against its
-            ranges, and fields that aren't given aren't set.
-        named: what an argument is called in the help, by its field.
+            ranges, and fields that aren't given aren't set. A parameter of the command's by a field's name declares it.
+        named: what an argument is called in the help, or an option on the command line, by its field.
     """
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         own = list(inspect.signature(command, eval_str=True).parameters.values())[1:]
         fields = model.model_fields
-        taken = [_parameter(name, field, named.get(name)) for name, field in fields.items()]
+        declared = {one.name for one in own}
+        taken = [_parameter(name, field, named.get(name)) for name, field in fields.items() if name not in declared]
         taken.sort(key=lambda one: fields[one.name].is_required(), reverse=True)
 
         def called(**given: Any) -> None:
-            values = {name: given.pop(name) for name in fields}
+            values = {name: given[name] for name in fields}
             changed = {name: value for name, value in values.items() if value != fields[name].get_default()}
-            command(model.of("", changed, remedy="`--help` says what it means"), **given)
+            rest = {name: value for name, value in given.items() if name in declared}
+            command(model.of("", changed, remedy="`--help` says what it means"), **rest)
 
         # arguments, then what the command itself must be given, then options
         order = [*taken, *own]
@@ -52,8 +54,7 @@ def _parameter(name: str, field: FieldInfo, named: str | None) -> inspect.Parame
         about: Any = typer.Argument(help=field.description, metavar=named or name.upper())
         default = inspect.Parameter.empty
     else:
-        flag = [f"--{name.replace('_', '-')}"]
-        about = typer.Option(*flag, help=field.description)
+        about = typer.Option(named or f"--{name.replace('_', '-')}", help=field.description)
         default = field.get_default()
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, about])
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args
 
@@ -118,14 +118,15 @@ def slam_video(video: Video, out: Path, settings: Settings) -> dict[str, Manifes
             outcome = execute_shown(planned, store, log)
             outcome.check()
             done = outcome.of_tile()
-            _publish(planned, done, store, out)
+            publish_path(planned, done, store, out)
         store.sweep({item.node.id.name: item.key for item in planned})
         digests.save()
     return done
 
 
-def _publish(planned: Iterable[Planned], done: dict[str, Manifest], store: Store, out: Path) -> None:
-    """Put what users look at beside the store; of an earlier run nothing stays."""
+def publish_path(planned: Iterable[Planned], done: Mapping[str, Manifest], store: Store, out: Path) -> None:
+    """Put the trajectory, and what came with it, where users look; of an earlier run nothing stays."""
+    out.mkdir(exist_ok=True)
     folder = {item.node.id.name: store.folder(item.node.label, item.key) for item in planned}
     made = {path.name: path for path in (folder["place"] / "path").iterdir()}
     if f"place.{ALONE}" in folder:
@@ -140,9 +141,9 @@ def _publish(planned: Iterable[Planned], done: dict[str, Manifest], store: Store
     (out / "slam.json").write_text(json.dumps(_figures(done), indent=1) + "\n", encoding="utf-8")
 
 
-def _figures(done: dict[str, Manifest]) -> dict[str, Any]:
+def _figures(done: Mapping[str, Manifest]) -> dict[str, Any]:
     """All figures of a run, and its warnings."""
-    steps = [manifest for name, manifest in done.items() if name != f"place.{ALONE}"]
+    steps = [done[step.name] for step in STEPS if step.name in done]
     facts = {key: value for one in steps for key, value in one.facts.items()}
     return facts | {"warnings": list(dict.fromkeys(text for one in steps for text in one.warnings))}
 

@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 import typer
 
 from scan2sim.flows.commands.app import App, Config, HoldOut, Sets, settings_of
-from scan2sim.flows.commands.display import console, progress, warn
+from scan2sim.flows.commands.display import console, warn
 from scan2sim.flows.commands.drive import survey_of
 from scan2sim.flows.commands.log import Log
 from scan2sim.flows.commands.shown import default_jobs, execute_shown, show_results
@@ -66,8 +66,7 @@ def survey(
     """Make the worlds of all tiles of a survey, which meet, and one of them all."""
     run_source(
         source, out, settings_of(set_, config, hold_out), length=length, buffer=buffer, jobs=jobs, memory=memory,
-        runner=runner, address=address, cores=cores,
-        prefect=context.obj,
+        runner=runner, address=address, cores=cores, prefect=context.obj,
     )  # fmt: skip
 
 
@@ -101,13 +100,12 @@ def run_source(
     limit_cores(cores)
     libraries.check()
     check_here(settings)
-    with progress("survey") as report:
-        path = survey_of(source, target, length=length, buffer=buffer, say=warn, report=report)
     log = Log(likeness(target) / "run.log")
 
     def run(planned: list[Planned], store: Store) -> Outcome:
         return execute_shown(planned, store, log, jobs, to_the_end=True, memory=gigabytes)
 
+    path = survey_of(source, target, run, length=length, buffer=buffer, say=warn)
     make_survey(path, target, settings, run)
 
 

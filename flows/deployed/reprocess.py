@@ -8,8 +8,10 @@ import scan2sim.flows.deployed.prefect_settings  # noqa: F401  # isort: skip  # 
 from prefect import flow, get_run_logger
 from prefect.states import Completed, State
 
+from scan2sim.flows.commands.drive import survey_of
 from scan2sim.flows.commands.survey import changes
-from scan2sim.flows.deployed.survey import prepare, survey
+from scan2sim.flows.deployed.survey import survey
+from scan2sim.flows.deployed.tile import by_tasks
 from scan2sim.flows.recipes.settings import Settings
 from scan2sim.pipeline.errors import BusyError
 
@@ -25,7 +27,8 @@ def reprocess(
     Does nothing where nothing changed, and where the last run is still going on.
     """
     try:
-        path = prepare(source, out, length, buffer)
+        run = by_tasks(runner, workers, address, memory, cores)
+        path = survey_of(source, out, run, length=length, buffer=buffer)
         found = changes(path, out, Settings(settings))
         for tile, reasons in found.items():
             get_run_logger().info(f"{tile}: {reasons}")

@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import scan2sim.flows.deployed.prefect_settings  # noqa: F401  # isort: skip  # before prefect
-from prefect import flow, get_run_logger, task
+from prefect import flow
 from prefect.artifacts import create_image_artifact, create_markdown_artifact, create_table_artifact
-from prefect.cache_policies import NO_CACHE
 from prefect.client.orchestration import get_client
 from prefect.settings import PREFECT_API_URL
 
@@ -54,12 +53,6 @@ def _end(*_: object) -> None:
     os._exit(exit_code(KeyboardInterrupt()))
 
 
-@task(name="prepare", task_run_name="import and cut", cache_policy=NO_CACHE)
-def prepare(source: str, out: str, length: float | None, buffer: float | None) -> str:
-    """SLAM, import and cut, where they are needed; returns the path of the `survey.toml`."""
-    return str(survey_of(source, out, length=length, buffer=buffer, say=get_run_logger().warning))
-
-
 def publish(out: Path) -> None:
     """Show how the tiles fare, their figures and a picture as artifacts of the flow run."""
     create_markdown_artifact(overview(out), key=artifact_key("survey", out.name), description="tiles by state")
@@ -89,7 +82,7 @@ def survey(
         address: of a Dask scheduler or a Ray cluster; default: started here.
     """
     run = by_tasks(runner, workers, address, memory, cores)
-    path = prepare(source, out, length, buffer)
+    path = survey_of(source, out, run, length=length, buffer=buffer)
     try:
         report = make_survey(path, out, Settings(settings), run)
     except StepError:  # tiles failed, the others are there

@@ -3,14 +3,23 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from scan2sim.flows.commands.drive import read_drive, survey_of
-from scan2sim.flows.recipes.video import Video
+from scan2sim.flows.commands.drive import plan_drive
+from scan2sim.flows.commands.drive import survey_of as made_of
+from scan2sim.flows.engine.execution import execute
+from scan2sim.flows.recipes.drive import Drive
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.io.survey import read_survey
+from scan2sim.pipeline.steps.cut import CUT
+from scan2sim.pipeline.steps.import_sweeps import IMPORT_SWEEPS
+
+
+def survey_of(place: Path | str, out: Path, **how: float) -> str:
+    return made_of(place, out, lambda planned, store: execute(planned, store, jobs=1, watch=lambda *_: None), **how)
 
 
 @pytest.fixture
@@ -27,18 +36,21 @@ def drive(folder: Path, text: str) -> Path:
 
 def test_a_corridor_is_cut_once_and_again_when_it_changes(corridor: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    survey = Path(survey_of(corridor, out, length=6.0, buffer=2.0))
-    assert len(read_survey(survey).tiles) == 2
-    before = survey.stat().st_ino
-    survey_of(corridor, out, length=6.0, buffer=2.0)
-    assert survey.stat().st_ino == before
-    survey_of(corridor, out, length=4.0, buffer=1.0)
-    assert len(read_survey(survey).tiles) > 2
-    before = survey.stat().st_ino
+
+    def cut(**how: float) -> tuple[Path, int]:
+        survey = Path(survey_of(corridor, out, **how))
+        assert (out / "prepared" / "survey" / "survey.toml").samefile(survey)
+        return survey, survey.stat().st_ino
+
+    first = cut(length=6.0, buffer=2.0)
+    assert len(read_survey(first[0]).tiles) == 2
+    assert cut(length=6.0, buffer=2.0) == first
+    finer = cut(length=4.0, buffer=1.0)
+    assert len(read_survey(finer[0]).tiles) > 2 and not first[0].exists()
     text = (corridor / "tile.toml").read_text()
     (corridor / "tile.toml").write_text(text.replace('name = "street"', 'name = "road"'))
-    survey_of(corridor, out, length=4.0, buffer=1.0)
-    assert survey.stat().st_ino != before and read_survey(survey).name == "road"
+    other = cut(length=4.0, buffer=1.0)
+    assert other != finer and read_survey(other[0]).name == "road"
 
 
 def test_a_drive_says_how_it_is_cut_unless_it_is_said_otherwise(corridor: Path, tmp_path: Path) -> None:
@@ -47,49 +59,32 @@ def test_a_drive_says_how_it_is_cut_unless_it_is_said_otherwise(corridor: Path, 
     assert len(read_survey(Path(survey_of(tmp_path, tmp_path / "out", length=4.0))).tiles) > 2
 
 
-def test_newer_code_cuts_again(corridor: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    survey = Path(survey_of(corridor, tmp_path / "out", length=6.0, buffer=2.0))
-    before = survey.stat().st_ino
-    monkeypatch.setattr("scan2sim.flows.commands.cut.VERSION", 1000)
-    survey_of(corridor, tmp_path / "out", length=6.0, buffer=2.0)
-    assert survey.stat().st_ino != before
-
-
-def test_a_path_and_a_corridor_are_made_again_by_newer_code_and_of_other_files(
+def test_steps_of_a_drive_are_done_again_by_newer_code_and_of_other_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made: list[str] = []
     for name in ("video.mp4", "camera.toml", "velodyne/0.bin", "image/0.png"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(name)
     text = '[slam]\nvideo = "video.mp4"\n[sweeps]\nfolder = "velodyne"\nphotos = "image"\ncamera = "camera.toml"\n'
-    place = drive(tmp_path, text)
+    place, known = drive(tmp_path, text), dict[str, str]()
 
-    def slam(video: Video, out: Path, *_: object) -> None:
-        out.mkdir(parents=True, exist_ok=True)
-        (out / "trajectory.csv").write_text(video.video.read_text())
+    def changed() -> set[str]:
+        keys = {item.node.id.name: item.key for item in plan_drive(place, tmp_path / "out")[0]}
+        others = {name for name, key in keys.items() if known.get(name) != key}
+        known.update(keys)
+        return others
 
-    def sweeps(folder: Path, poses: Path, out: Path, **_: object) -> None:
-        made.append("sweeps")
-        out.mkdir(exist_ok=True)
-
-    monkeypatch.setattr("scan2sim.flows.commands.drive.slam_video", slam)
-    monkeypatch.setattr("scan2sim.pipeline.io.sweeps.import_sweeps", sweeps)
-    monkeypatch.setattr("scan2sim.pipeline.io.sweeps.camera_of_photos", lambda *_, **__: None)
-    monkeypatch.setattr("scan2sim.flows.commands.drive._cut", lambda corridor, *_: corridor)
-
-    def again() -> list[str]:
-        made.clear()
-        survey_of(place, tmp_path / "out")
-        return list(made)
-
-    assert again() == ["sweeps"] and again() == []
-    monkeypatch.setattr("scan2sim.pipeline.io.sweeps.VERSION", 1000)
-    assert again() == ["sweeps"] and again() == []
-    (tmp_path / "camera.toml").write_text("another")
-    assert again() == ["sweeps"]
+    assert changed() == {"track", "place", "import_sweeps", "cut"} and changed() == set()
+    for step in (CUT, IMPORT_SWEEPS):
+        monkeypatch.setattr(f"scan2sim.flows.recipes.drive.{step.name.upper()}", replace(step, version=1000))
+        assert changed() == ({"cut"} if step is CUT else {"import_sweeps", "cut"})
+    for name in ("camera.toml", "velodyne/0.bin", "image/0.png"):
+        (tmp_path / name).write_text("another")
+        assert changed() == {"import_sweeps", "cut"}, name
+    (tmp_path / "velodyne/1.bin").write_text("one more")
+    assert changed() == {"import_sweeps", "cut"}
     (tmp_path / "video.mp4").write_text("another")
-    assert again() == ["sweeps"], "another video, another path"
+    assert changed() == {"track", "place", "import_sweeps", "cut"}
 
 
 def test_a_survey_is_itself(corridor: Path, tmp_path: Path) -> None:
@@ -111,7 +106,7 @@ def test_a_survey_is_itself(corridor: Path, tmp_path: Path) -> None:
 )
 def test_what_no_drive_says_is_told(tmp_path: Path, text: str, told: str) -> None:
     with pytest.raises(InputError, match=told):
-        read_drive(drive(tmp_path, text))
+        Drive.read(drive(tmp_path, text))
 
 
 def test_two_at_once_are_told(corridor: Path, tmp_path: Path) -> None:

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from scan2sim.flows.commands.cut import Options, cut_survey
 from scan2sim.pipeline.classes import GROUPS, group_of
+from scan2sim.pipeline.corridor import CutParams, cut_survey
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.types import Mesh
@@ -26,7 +26,7 @@ def survey(small_street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
     folder = tmp_path_factory.mktemp("survey")
     shutil.copytree(small_street, folder / "corridor")
     context = 3.0  # metres: what crowns and planes near a border are told from
-    cut_survey(folder / "corridor", folder / "tiles", Options(length=6.0, buffer=context))
+    cut_survey(folder / "corridor", folder / "tiles", CutParams(length=6.0, buffer=context))
     return folder / "tiles"
 
 

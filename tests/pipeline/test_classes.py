@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from laspy.vlrs.known import ClassificationLookupVlr
 
-from scan2sim.flows.commands.cut import Options, cut_survey
 from scan2sim.pipeline.classes import CODE, code_of, parse
+from scan2sim.pipeline.corridor import CutParams, cut_survey
 from scan2sim.pipeline.errors import InputError, SettingError
 from scan2sim.pipeline.io import clouds
 from scan2sim.pipeline.io.clouds import las
@@ -106,7 +106,7 @@ def test_clouds_that_become_laz_keep_their_survey_s_codes_until_a_tile_says_what
 def test_tiles_of_a_survey_hold_codes_as_the_corridor_says(tmp_path: Path) -> None:
     path = import_las([foreign(tmp_path / "a.las")], tmp_path / "tile", crs="local", classes={65: 69})
     told: list[str] = []
-    survey = read_survey(cut_survey(path, tmp_path / "survey", Options(length=100.0), warn=told.append))
+    survey = read_survey(cut_survey(path, tmp_path / "survey", CutParams(length=100.0), warn=told.append))
     assert len(told) == 1 and told[0].startswith("a.las: codes 200 (20.0%) are the survey's own")
     tile = read_tile(next(iter(survey.tiles.values())))
     codes = clouds.meanings(tile.clouds[0], tile.classes)[clouds.read(tile.clouds[0], tile.frame).label]

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 import tomli_w
 
-from scan2sim.flows.commands import cut as cutting
-from scan2sim.flows.commands.cut import Options, cut_survey
+from scan2sim.pipeline import corridor as cutting
+from scan2sim.pipeline.corridor import CutParams, cut_survey
 from scan2sim.pipeline.cutting import members, seeds
 from scan2sim.pipeline.errors import DataError, InputError, SettingError
 from scan2sim.pipeline.io import clouds
@@ -29,7 +29,7 @@ from scan2sim.pipeline.types import Camera, Frame, PointCloud, Tile, Trajectory
 UTM = Frame("EPSG:32632", (690_000.0, 5_335_000.0, 500.0))
 FEET = Frame("EPSG:2994", (200_000.0, 300_000.0, 30.0), 0.3048)
 RADIUS, ANGLE = 200.0, 1.5  # of the street, which bends to the left: 300 m of it
-CUT = Options(length=100, buffer=5, reach=20)
+CUT = CutParams(length=100, buffer=5, reach=20)
 CAMERA = Camera("pinhole", 64, 48, 32.0, 32.0, 31.5, 23.5)
 
 
@@ -314,7 +314,7 @@ def test_photos_go_to_the_tiles_that_they_see(bend: Path, cut: Path) -> None:
 
 def test_photos_are_copied_where_asked_for(bend: Path, tmp_path: Path) -> None:
     told: list[str] = []
-    survey = cut_survey(bend, tmp_path / "out", replace(CUT, copy=True), warn=told.append)
+    survey = cut_survey(bend, tmp_path / "out", CUT.model_copy(update={"copy_photos": True}), warn=told.append)
     view = tiles(survey)["bend_0001"].views[0]
     assert view.photo == tmp_path / "out/bend_0001/photos/95.jpg" and view.photo.is_file()
     assert view.mask == tmp_path / "out/bend_0001/masks/mask.png" and view.mask.is_file()
@@ -349,7 +349,7 @@ def test_without_a_trajectory_squares_meet_in_a_corner(tmp_path: Path) -> None:
     xyz = np.column_stack([rng.uniform(0, 100, (20_000, 2)), rng.uniform(0, 5, 20_000)]).astype(np.float32)
     las.write(tmp_path / "a.laz", PointCloud(UTM, xyz))
     write_tile(tmp_path / "corridor", name="field", crs=UTM.crs, clouds=["../a.laz"], cameras={})
-    made = tiles(cut_survey(tmp_path / "corridor", tmp_path / "out", Options(length=50)))
+    made = tiles(cut_survey(tmp_path / "corridor", tmp_path / "out", CutParams(length=50)))
     assert len(made) == 4
     for name, tile in made.items():
         assert tile.cell is not None and list(tile.cell.neighbours) == sorted(set(made) - {name})
@@ -426,7 +426,9 @@ def test_only_a_survey_is_overwritten_and_only_when_told(tmp_path: Path) -> None
     cut_survey(folder, tmp_path / "out", CUT)
     with pytest.raises(SettingError, match="exists and is not empty"):
         cut_survey(folder, tmp_path / "out", CUT)
-    assert len(tiles(cut_survey(folder, tmp_path / "out", replace(CUT, length=150), overwrite=True))) == 2
+    assert (
+        len(tiles(cut_survey(folder, tmp_path / "out", CUT.model_copy(update={"length": 150.0}), overwrite=True))) == 2
+    )
     with pytest.raises(SettingError, match="holds the corridor"):
         cut_survey(folder, folder, CUT, overwrite=True)
     shutil.copytree(folder, tmp_path / "other")
@@ -438,12 +440,12 @@ def test_only_a_survey_is_overwritten_and_only_when_told(tmp_path: Path) -> None
 
 @pytest.mark.parametrize(
     ("options", "field"),
-    [(Options(length=0), "length"), (Options(buffer=-1), "buffer"), (Options(length=10, buffer=6), "buffer"),
-     (Options(reach=float("nan")), "reach"), (Options(photo_reach=-1), "photo-reach")],
+    [({"length": 0}, "length"), ({"buffer": -1}, "buffer"), ({"length": 10, "buffer": 6}, "buffer"),
+     ({"reach": float("nan")}, "reach"), ({"photo_reach": -1}, "photo-reach")],
 )  # fmt: skip
-def test_options_out_of_range_are_refused(tmp_path: Path, options: Options, field: str) -> None:
+def test_options_out_of_range_are_refused(tmp_path: Path, options: dict[str, float], field: str) -> None:
     with pytest.raises(SettingError, match=field):
-        cut_survey(tmp_path, tmp_path / "out", options)
+        cut_survey(tmp_path, tmp_path / "out", CutParams.of("", options))
 
 
 def test_tiles_with_few_points_go_to_their_neighbours(tmp_path: Path) -> None:

@@ -1,0 +1,22 @@
+"""Cut: a corridor becomes the overlapping tiles of a survey."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from scan2sim.pipeline.corridor import VERSION, CutParams, cut_survey
+from scan2sim.pipeline.step import Done, Inputs, Report, Step
+
+
+def cut(inputs: Inputs, params: CutParams, out: Path, report: Report) -> Done:
+    """Cut the tile `corridor` (a `tile.toml`, or its folder); other inputs are what it names.
+
+    Raises:
+        ScanError: as `cut_survey`.
+    """
+    told: list[str] = []
+    survey = cut_survey(inputs["corridor"], out / "survey", params, report=report, warn=told.append)
+    return Done({"survey": survey.parent}, warnings=told)
+
+
+CUT = Step("cut", VERSION, cut, CutParams)
