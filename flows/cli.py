@@ -19,7 +19,7 @@ PAGES = Path(__file__).parents[1] / "docs"
 """Where the pages are that help and errors name as docs/NAME.md: they come with a wheel, too."""
 COMMANDS = {
     "run": ("run", "Make a world of a tile; what an earlier run has finished is kept."),
-    "plan": ("plan", "Show what `run` would run, and why."),
+    "plan": ("plan", "Show what `run` would run, and why; of a drive.toml, what `survey` would run before its tiles."),
     "tile": ("cut", "Cut a long corridor into tiles that overlap: a survey."),
     "survey": ("survey", "Make the worlds of all tiles of a survey, which meet, and one of them all."),
     "verify": ("verify", "Read all that was made, and say what is damaged; the next run makes that anew."),

@@ -15,7 +15,7 @@ from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.io.remote import is_remote, likeness
 from scan2sim.pipeline.store import Digests, Store
 
-PREPARED = "prepared"
+PREPARED, DRIVE = "prepared", "drive.toml"
 SHOWN = {"import_sweeps": "corridor", "cut": "survey"}
 """Of steps, the output that is shown beside the store, by a link."""
 
@@ -74,7 +74,7 @@ def found(place: Path) -> Path:
     Raises:
         InputError: there is none.
     """
-    names = ("survey.toml", "drive.toml", "tile.toml")
+    names = ("survey.toml", DRIVE, "tile.toml")
     if place.is_dir():
         place = next((place / name for name in names if (place / name).is_file()), place)
     if not place.is_file():
@@ -90,7 +90,7 @@ def plan_drive(
     Raises:
         ScanError: the file can't be read, or says something impossible.
     """
-    whole = source.name != "drive.toml"
+    whole = source.name != DRIVE
     drive = Drive(corridor=Path(source.name)) if whole else Drive.read(source)
     given = {name: value for name, value in (("length", length), ("buffer", buffer)) if value is not None}
     drive = drive.model_copy(update={"tiles": drive.tiles.model_copy(update=given)})

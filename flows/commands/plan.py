@@ -1,4 +1,4 @@
-"""`scan2sim plan`: what `run` would run, and why."""
+"""`scan2sim plan`: what `run`, or what comes before `survey`'s tiles, would run, and why."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from rich.table import Table
 
 from scan2sim.flows.commands.app import App, Config, Force, From, HoldOut, OutDir, Sets, TilePath, settings_of
 from scan2sim.flows.commands.display import console
+from scan2sim.flows.commands.drive import DRIVE, PREPARED, plan_drive
 from scan2sim.flows.engine.planning import STORE, Planned, check
 from scan2sim.flows.engine.planning import plan as plan_nodes
 from scan2sim.flows.recipes.settings import Settings
@@ -30,17 +31,21 @@ def plan(
     force: Force = False,
     from_: From = None,
 ) -> None:
-    """Show what `run` would run, and why."""
+    """Show what `run` would run, and why; of a drive.toml, what `survey` would run before its tiles."""
     show_plan(tile, out, settings_of(set_, config, hold_out), force=force, start=from_)
 
 
 def show_plan(path: Path, out: Path, settings: Settings, *, force: bool = False, start: str | None = None) -> None:
-    """Print each step of the tile, whether it would run, and why.
+    """Print each step of the tile or drive, whether it would run, and why.
 
     Raises:
         ScanError: see `pipeline.errors`; also if a step couldn't run here.
     """
-    planned, _ = plan_tile(read_tile(path), out, settings, force, start)
+    drive = path / DRIVE if path.is_dir() else path
+    if drive.name == DRIVE and drive.is_file():
+        planned = plan_drive(drive, out / PREPARED)[0]
+    else:
+        planned = plan_tile(read_tile(path), out, settings, force, start)[0]
     check(planned)
     table = Table("step", "would run", "why", box=None, header_style="bold")
     for item in planned:

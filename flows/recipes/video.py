@@ -10,6 +10,8 @@ from pydantic import Field
 
 from scan2sim.flows.recipes.graph import Node, NodeId, Output
 from scan2sim.flows.recipes.settings import Settings
+from scan2sim.pipeline.extras import need
+from scan2sim.pipeline.io import gps as gps_io
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.step import Step
 from scan2sim.slam.steps.adjust import ADJUST
@@ -44,9 +46,14 @@ def recipe(video: Video, settings: Settings) -> list[Node]:
 
     Raises:
         SettingError: a setting that doesn't exist or is out of range.
+        UnavailableError: a package is missing that reads the video, or GPS in one.
         InputError: the tile whose camera is asked for can't be read.
     """
     settings.check(STEPS)
+    if video.video.is_file():
+        need("a video", "av")
+    if video.gps is not None:
+        gps_io.reader(video.gps)
     nodes: list[Node] = []
 
     def add(step: Step, inputs: dict[str, Path | Output], group: str = "", **given: Any) -> Output:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
+from scan2sim.flows.cli import app
 from scan2sim.flows.commands.drive import plan_drive
 from scan2sim.flows.commands.drive import survey_of as made_of
 from scan2sim.flows.engine.execution import execute
@@ -85,6 +88,17 @@ def test_steps_of_a_drive_are_done_again_by_newer_code_and_of_other_files(
     assert changed() == {"import_sweeps", "cut"}
     (tmp_path / "video.mp4").write_text("another")
     assert changed() == {"track", "place", "import_sweeps", "cut"}
+
+
+def test_a_drive_is_planned_like_a_tile(corridor: Path, tmp_path: Path) -> None:
+    place = drive(tmp_path, 'corridor = "corridor"\n[tiles]\nlength = 6.0\nbuffer = 1.0\n')
+
+    def told() -> str:
+        return CliRunner().invoke(app, ["plan", str(place), "--out", str(tmp_path / "out")]).output
+
+    assert re.search(r"cut +yes +it was never run", told())
+    survey_of(place, tmp_path / "out")
+    assert re.search(r"cut +no +kept", told())
 
 
 def test_a_survey_is_itself(corridor: Path, tmp_path: Path) -> None:

@@ -12,10 +12,12 @@ from scan2sim.flows.cli import COMMANDS, app, loaded
 from scan2sim.flows.commands.numbers import Numbers
 from scan2sim.flows.recipes.settings import Settings
 from scan2sim.flows.recipes.steps import STEPS
+from scan2sim.pipeline.corridor import CutParams
 from scan2sim.pipeline.errors import SettingError
 from scan2sim.pipeline.ranges import told
 from scan2sim.pipeline.step import Params
 from scan2sim.pipeline.steps.decimate import DECIMATE
+from scan2sim.pipeline.steps.import_sweeps import SweepsParams
 from scan2sim.pipeline.steps.split import SPLIT
 from scan2sim.pipeline.steps.trim import TRIM
 from scan2sim.slam.steps.track import Filmed
@@ -133,7 +135,9 @@ def test_every_number_that_a_command_takes_has_a_range() -> None:
     single = [one for some in found for one in getattr(some, "commands", {"": some}).values()]
     hints = [get_type_hints(one.callback) for one in single]
     numbers = {name for of in hints for name, kind in of.items() if {int, float} & {kind, *get_args(kind)}}
-    assert len(numbers) > 15 and numbers <= Numbers.model_fields.keys() | Filmed.model_fields.keys()
+    assert len(numbers) > 15 and numbers <= {
+        name for model in (Numbers, Filmed, CutParams, SweepsParams) for name in model.model_fields
+    }
 
 
 @pytest.mark.parametrize(

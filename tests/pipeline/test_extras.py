@@ -56,10 +56,17 @@ def test_a_setting_that_cannot_be_is_refused_before_anything_runs(
 
 def test_a_survey_is_refused_before_it_is_cut(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     without(monkeypatch, "transformers")
-    how: dict[str, Any] = dict.fromkeys(("length", "buffer", "memory", "address", "cores"))
+    how: dict[str, Any] = dict.fromkeys(("length", "buffer", "memory", "address", "cores", "prefect"))
     for setting, error in (("label.network=segformer", UnavailableError), ("lable.network=segformer", SettingError)):
         with pytest.raises(error):
-            run_source(str(TILE), str(tmp_path), Settings.read(None, [setting]), jobs=1, runner="processes", **how)
+            run_source(
+                str(TILE),
+                str(tmp_path),
+                Settings.read(None, [setting]),
+                jobs=1,
+                runner="processes",
+                **how,
+            )
     assert not list(tmp_path.iterdir())
 
 

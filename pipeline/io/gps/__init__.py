@@ -34,7 +34,21 @@ def read(path: Path) -> GpsTrack:
     Times are UNIX seconds for GPX and NMEA, as the file says for CSV, and for a GoPro video seconds of the video.
 
     Raises:
-        InputError: unknown suffix, unreadable, or no fix in it.
+        InputError: unreadable, or no fix in it.
+        ScanError: as `reader`.
+    """
+    found = reader(path)
+    try:
+        return found.read(path)
+    except OSError as error:
+        raise from_os_error(error, path) from error
+
+
+def reader(path: Path) -> Format:
+    """What reads a track; the track itself isn't read.
+
+    Raises:
+        InputError: there is no such file, or its suffix is unknown.
         UnavailableError: a video, and PyAV isn't installed.
     """
     formats = backends.by_suffix(__name__)
@@ -42,9 +56,6 @@ def read(path: Path) -> GpsTrack:
     if name is None:
         raise InputError(path, "is no known GPS format", f"Give one of {', '.join(formats)}")
     files.check(path)
-    reader: Format = backends.module(__name__, name)
-    need(str(path), *backends.needs(reader))
-    try:
-        return reader.read(path)
-    except OSError as error:
-        raise from_os_error(error, path) from error
+    found: Format = backends.module(__name__, name)
+    need(str(path), *backends.needs(found))
+    return found
