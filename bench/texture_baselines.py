@@ -20,7 +20,7 @@ from scan2sim.pipeline.looking import eye, is_seen, pixel_of, sighted, to_camera
 from scan2sim.pipeline.sampling import bilinear
 from scan2sim.pipeline.types import U8, Mesh
 from scan2sim.pipeline.visibility import BIAS, load_depth_map
-from scan2sim.texturing import blend, fill
+from scan2sim.texturing import fill, texels
 
 OPEN3D_SIZE = 4096
 PADDING = 16
@@ -61,7 +61,7 @@ def open3d(scene: Scene, out: Path) -> None:
         extrinsics.append(o3d.core.Tensor(np.linalg.inv(view.T_world_cam)))
     albedo = body.project_images_to_albedo(photos, intrinsics, extrinsics, OPEN3D_SIZE, True)
     rgb = np.ascontiguousarray(albedo.as_tensor().numpy()[..., :3])
-    owner = blend.owners(blend.texels(mesh.uv, OPEN3D_SIZE, OPEN3D_SIZE), OPEN3D_SIZE, OPEN3D_SIZE)
+    owner = texels.owners(texels.corners(mesh.uv, OPEN3D_SIZE, OPEN3D_SIZE), OPEN3D_SIZE, OPEN3D_SIZE)
     seen = np.where((owner >= 0) & rgb.any(axis=2), 255, 0).astype(np.uint8)
     mesh.save(out / "mesh.npz")
     _write(out, 0, rgb, seen)
@@ -94,8 +94,8 @@ def _paint(scene: Scene, out: Path, *, only_nearest: bool) -> None:
     for k, size in enumerate(json.loads((scene.atlas / "pages.json").read_text())):
         width, height = size["width"], size["height"]
         faces = np.flatnonzero(mesh.page == k)
-        flat = blend.texels(mesh.uv[faces], width, height)
-        owner = blend.owners(flat, width, height)
+        flat = texels.corners(mesh.uv[faces], width, height)
+        owner = texels.owners(flat, width, height)
         at = np.nonzero(owner >= 0)
         face = owner[at]
         places = _places(flat, corners[faces], face, *at)
@@ -126,7 +126,7 @@ def _places(flat, corners, face, rows, columns):  # type: ignore[no-untyped-def]
     """(N, 3) float32: where the texels lie in space."""
     out = np.empty((len(face), 3), np.float32)
     for i in prange(len(face)):
-        origin, per_x, per_y, _ = blend.frame(flat, corners, face[i])
+        origin, per_x, per_y, _ = texels.frame(flat, corners, face[i])
         for k in range(3):
             out[i, k] = origin[k] + columns[i] * per_x[k] + rows[i] * per_y[k]
     return out

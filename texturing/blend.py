@@ -1,7 +1,4 @@
-"""Kernels that paint a page: whose texel is it, and what do the photos say of it. Import late: it loads numba.
-
-Texel (x, y) of a page of W x H has its centre at u = (x + 0.5) / W, v = 1 - (y + 0.5) / H.
-"""
+"""Kernels that paint a page: what photos say of its texels, weighed and summed. Import late: it loads numba."""
 
 from __future__ import annotations
 
@@ -17,8 +14,8 @@ from scan2sim.pipeline.looking import SLOPE_SHARE, Eye, is_behind, met, pixel_of
 from scan2sim.pipeline.sampling import allows, bicubic, halving, mixed, read, rescaled, taps
 from scan2sim.pipeline.types import F32, F64, I32, U8
 from scan2sim.texturing.photos import OFFSET
+from scan2sim.texturing.texels import box, frame
 
-BAND = 32
 WHITE = 251.0
 EDGE = 0.01
 """Share of its weight that a photo keeps beside something that hides what is behind."""
@@ -146,79 +143,6 @@ class NumbaRows:
         resolve(self._sums, rgb, seen)
 
 
-def texels(uv: F32, width: int, height: int) -> F32:
-    """(F, 3, 2) float32 places of the corners on a page, in texels (x right, y down, centres at integers)."""
-    return np.stack([uv[..., 0] * width - 0.5, (1 - uv[..., 1]) * height - 0.5], axis=-1).astype(np.float32)
-
-
-def owners(flat: F32, width: int, height: int) -> I32:
-    """(H, W) int32: the face, index into `flat` (F, 3, 2), whose triangle covers the texel's centre; -1 where none."""
-    out = np.full((height, width), -1, np.int32)
-    _own(flat, out)
-    return out
-
-
-@njit(cache=True)
-def _box(flat, f, width, height):  # type: ignore[no-untyped-def]
-    """Texels whose centres may be in face f: x0, y0, x1, y1, inclusive."""
-    x0 = min(flat[f, 0, 0], flat[f, 1, 0], flat[f, 2, 0])
-    x1 = max(flat[f, 0, 0], flat[f, 1, 0], flat[f, 2, 0])
-    y0 = min(flat[f, 0, 1], flat[f, 1, 1], flat[f, 2, 1])
-    y1 = max(flat[f, 0, 1], flat[f, 1, 1], flat[f, 2, 1])
-    return (
-        max(0, int(math.ceil(x0 - 1e-3))),
-        max(0, int(math.ceil(y0 - 1e-3))),
-        min(width - 1, int(math.floor(x1 + 1e-3))),
-        min(height - 1, int(math.floor(y1 + 1e-3))),
-    )
-
-
-@njit(cache=True, parallel=True)
-def _own(flat, owner):  # type: ignore[no-untyped-def]
-    height, width = owner.shape
-    bands = (height + BAND - 1) // BAND
-    rows = np.empty((len(flat), 2), np.int32)
-    for f in prange(len(flat)):
-        _, rows[f, 0], _, rows[f, 1] = _box(flat, f, width, height)
-    for band in prange(bands):  # a thread a band: no two write one texel
-        first, last = band * BAND, min(height, (band + 1) * BAND) - 1
-        for f in range(len(flat)):
-            if rows[f, 1] < first or rows[f, 0] > last:
-                continue
-            ax, ay = np.float64(flat[f, 0, 0]), np.float64(flat[f, 0, 1])
-            bx, by = flat[f, 1, 0] - ax, flat[f, 1, 1] - ay
-            cx, cy = flat[f, 2, 0] - ax, flat[f, 2, 1] - ay
-            det = bx * cy - by * cx
-            if abs(det) < 1e-9:
-                continue
-            x0, y0, x1, y1 = _box(flat, f, width, height)
-            for y in range(max(first, y0), min(last, y1) + 1):
-                for x in range(x0, x1 + 1):
-                    s = ((x - ax) * cy - (y - ay) * cx) / det
-                    t = (bx * (y - ay) - by * (x - ax)) / det
-                    if s >= -1e-6 and t >= -1e-6 and s + t <= 1 + 1e-6 and owner[y, x] < 0:
-                        owner[y, x] = f
-
-
-@njit(cache=True)
-def frame(flat, corners, f):  # type: ignore[no-untyped-def]
-    """The affine map of a face from texels to space: (origin, per x, per y), each (3,); and whether it has one."""
-    ax, ay = np.float64(flat[f, 0, 0]), np.float64(flat[f, 0, 1])
-    bx, by = flat[f, 1, 0] - ax, flat[f, 1, 1] - ay
-    cx, cy = flat[f, 2, 0] - ax, flat[f, 2, 1] - ay
-    det = bx * cy - by * cx
-    origin, per_x, per_y = np.zeros(3), np.zeros(3), np.zeros(3)
-    if abs(det) < 1e-9:
-        return origin, per_x, per_y, False
-    for k in range(3):
-        e1 = np.float64(corners[f, 1, k]) - corners[f, 0, k]
-        e2 = np.float64(corners[f, 2, k]) - corners[f, 0, k]
-        per_x[k] = (e1 * cy - e2 * by) / det
-        per_y[k] = (e2 * bx - e1 * cx) / det
-        origin[k] = corners[f, 0, k] - ax * per_x[k] - ay * per_y[k]
-    return origin, per_x, per_y, True
-
-
 @njit(cache=True, inline="always")
 def vignette(exposure, p, u, v):  # type: ignore[no-untyped-def]
     """Factor that undoes the darkening towards a photo's corners; `exposure` as of `photos.Exposures.of`."""
@@ -264,7 +188,7 @@ def _add_face(sums, laid, f, share, shown, eye, hides, weighing):  # type: ignor
     factors = (math.exp(exposure[0]), math.exp(exposure[1]), math.exp(exposure[2]))
     chosen = share[0] + share[1] + share[2] > 0
     used = 0
-    x0, y0, x1, y1 = _box(laid.flat, f, owner.shape[1], owner.shape[0])
+    x0, y0, x1, y1 = box(laid.flat, f, owner.shape[1], owner.shape[0])
     for ty in range(y0, y1 + 1):
         for tx in range(x0, x1 + 1):
             if owner[ty, tx] != f:
@@ -356,21 +280,3 @@ def resolve(sums, rgb, seen):  # type: ignore[no-untyped-def]
                 for k in range(3):
                     value = sums.low[y, x, k] / w + (sums.detail[y, x, k] / d if d > 0 else 0.0)
                     rgb[y, x, k] = min(255.0, max(0.0, value + 0.5))
-
-
-@njit(cache=True, parallel=True)
-def count(owner, seen, flat):  # type: ignore[no-untyped-def]
-    """(F, 4) texels of every face: all, seen by a photo (255), coloured from points (128), filled (64)."""
-    height, width = owner.shape
-    out = np.zeros((len(flat), 4), np.int64)
-    for f in prange(len(flat)):
-        x0, y0, x1, y1 = _box(flat, f, width, height)
-        for y in range(y0, y1 + 1):
-            for x in range(x0, x1 + 1):
-                if owner[y, x] == f:
-                    out[f, 0] += 1
-                    s = seen[y, x]
-                    out[f, 1] += s == 255
-                    out[f, 2] += s == 128
-                    out[f, 3] += s == 64
-    return out

@@ -228,7 +228,7 @@ def _catmull_rom(f: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 
 def _frames(flat: Tensor, corners: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """As `blend.frame`, of all faces: (F, 3) origin, per x, per y, and (F,) whether there is one."""
+    """As `texels.frame`, of all faces: (F, 3) origin, per x, per y, and (F,) whether there is one."""
     a = flat[:, 0]
     (bx, by), (cx, cy) = ((flat[:, k] - a)[:, :, None].unbind(dim=1) for k in (1, 2))
     det = bx * cy - by * cx

@@ -14,7 +14,7 @@ from numba import njit, prange
 
 from scan2sim.pipeline.heightfield import spacing
 from scan2sim.pipeline.types import F32, I32, U8
-from scan2sim.texturing.blend import _box, frame
+from scan2sim.texturing.texels import box, frame
 
 LATTICE = 0.08
 """Metres between the places where points are asked for their colour."""
@@ -147,7 +147,7 @@ def _lattice(owner, seen, flat, step):  # type: ignore[no-untyped-def]
     height, width = owner.shape
     shape = np.zeros((len(flat), 2), np.int32)
     for f in prange(len(flat)):
-        x0, y0, x1, y1 = _box(flat, f, width, height)
+        x0, y0, x1, y1 = box(flat, f, width, height)
         wanting = False
         for y in range(y0, y1 + 1):
             for x in range(x0, x1 + 1):
@@ -168,7 +168,7 @@ def _places(flat, corners, shape, start, step, size):  # type: ignore[no-untyped
         if shape[f, 0] == 0:
             continue
         origin, per_x, per_y, _ = frame(flat, corners, f)
-        x0, y0, _, _ = _box(flat, f, size[1], size[0])
+        x0, y0, _, _ = box(flat, f, size[1], size[0])
         for j in range(shape[f, 1]):
             for i in range(shape[f, 0]):
                 x, y = x0 + i * step, y0 + j * step
@@ -183,7 +183,7 @@ def _interpolate(rgb, seen, owner, flat, shape, start, step, colour, mark):  # t
     for f in prange(len(flat)):
         if shape[f, 0] == 0:
             continue
-        x0, y0, x1, y1 = _box(flat, f, width, height)
+        x0, y0, x1, y1 = box(flat, f, width, height)
         for y in range(y0, y1 + 1):
             for x in range(x0, x1 + 1):
                 if owner[y, x] != f or seen[y, x] != 0:

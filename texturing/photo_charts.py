@@ -135,7 +135,7 @@ def pack(size: npt.NDArray[np.int64], side: int, gutter: int) -> tuple[Index, In
 
 def overlapping(flat: F32, page: Index, pages: list[tuple[int, int]]) -> npt.NDArray[np.bool_]:
     """(N,) faces of which others cover too much; `flat` (N, 3, 2) texels of their page."""
-    from scan2sim.texturing.blend import owners
+    from scan2sim.texturing.texels import owners
 
     area = np.abs(_signed_area(flat))
     covered = np.zeros(len(flat), bool)

@@ -14,9 +14,9 @@ from numba import njit
 
 from scan2sim.pipeline.heightfield import MOST, drawn, grown
 from scan2sim.pipeline.types import F32, F64, U8, Mesh
-from scan2sim.texturing.blend import frame
 from scan2sim.texturing.continuation import FACTOR, continued
 from scan2sim.texturing.fill import FILLED, FROM_POINTS, SEEN, Page, texel_places
+from scan2sim.texturing.texels import frame
 
 CELL = 0.03
 """Metres of the picture's cells: grain, joints and markings, for a fraction of the texels."""
@@ -116,7 +116,7 @@ class Continued:
 
 @njit(cache=True, inline="always")
 def _cell_of(origin, per_x, per_y, x, y, low, cell, shape):  # type: ignore[no-untyped-def]
-    """Row and column of a texel in the picture; `origin`, `per_x`, `per_y` are its face's (`blend.frame`)."""
+    """Row and column of a texel in the picture; `origin`, `per_x`, `per_y` are its face's (`texels.frame`)."""
     row = math.floor((origin[1] + x * per_x[1] + y * per_y[1] - low[1]) / cell)
     column = math.floor((origin[0] + x * per_x[0] + y * per_y[0] - low[0]) / cell)
     return min(max(row, 0), shape[0] - 1), min(max(column, 0), shape[1] - 1)

@@ -10,7 +10,7 @@ import numpy as np
 from scan2sim.pipeline.cameras import pixel_angle, unproject
 from scan2sim.pipeline.looking import eye
 from scan2sim.pipeline.types import Camera
-from scan2sim.texturing import blend
+from scan2sim.texturing import blend, texels
 from scan2sim.texturing.photos import low_frequencies, shrunk
 
 CAMERAS = {
@@ -46,7 +46,7 @@ def scattered(rng: np.random.Generator, camera: Camera) -> blend.Laid:
     triangles = np.array([[0, 1, 2], [0, 2, 3]])
     flat = flat[:, triangles].reshape(-1, 3, 2).astype(np.float32)
     corners = corners.transpose(1, 0, 2)[:, triangles].reshape(-1, 3, 3).astype(np.float32)
-    owner = blend.owners(flat, CELL * CELLS, CELL * CELLS)
+    owner = texels.owners(flat, CELL * CELLS, CELL * CELLS)
     return blend.Laid(owner, flat, corners, np.repeat(facing, 2, axis=0).astype(np.float32))
 
 

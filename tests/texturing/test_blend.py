@@ -11,7 +11,7 @@ from scan2sim.pipeline.cameras import pixel_angle, project
 from scan2sim.pipeline.looking import eye
 from scan2sim.pipeline.render import look_at
 from scan2sim.pipeline.types import Camera
-from scan2sim.texturing import blend
+from scan2sim.texturing import blend, texels
 from scan2sim.texturing.photos import OFFSET
 from tests.texturing import plain_blend
 from tests.texturing.scattered import CAMERAS, scattered, taken
@@ -37,8 +37,8 @@ def test_texels_show_what_the_photo_shows_there(size: int, warp: tuple[float, fl
     corner = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * SIDE / 2
     corners = corner[[[0, 1, 2], [0, 2, 3]]].astype(np.float32)
     uv = (corners[..., :2] / SIDE + 0.5).astype(np.float32)
-    flat = blend.texels(uv, size, size)
-    owner = blend.owners(flat, size, size)
+    flat = texels.corners(uv, size, size)
+    owner = texels.owners(flat, size, size)
     assert (owner >= 0).all()
     gain, fall = np.array([0.1, -0.05, 0.0]), np.array([0.3, 0.2])
     everywhere = np.full((6, 8), np.inf, np.float32)

@@ -12,11 +12,13 @@ from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.io import image, textured
 from scan2sim.pipeline.step import silent
 from scan2sim.pipeline.types import Frame, Mesh
-from scan2sim.texturing import blend, fill
+from scan2sim.texturing import fill
 from scan2sim.texturing.borders.fading import changes, fade
 from scan2sim.texturing.borders.level import LevelParams, level
 from scan2sim.texturing.borders.measure import colour_step
 from scan2sim.texturing.borders.meeting import meet, rim
+from scan2sim.texturing.texels import corners as laid_flat
+from scan2sim.texturing.texels import owners
 
 YS = np.append(np.arange(-3, 3, 0.3), 3)
 
@@ -97,8 +99,8 @@ def tile(folder, sheets, colour, *, origin=(0.0, 0.0, 0.0), texel=0.03, turned=F
 
 def texels(mesh, width, height):
     """Owner (H, W) of a page's texels; rows, columns and world places of those in faces."""
-    corners = blend.texels(mesh.uv, width, height)
-    owner = blend.owners(corners, width, height)
+    corners = laid_flat(mesh.uv, width, height)
+    owner = owners(corners, width, height)
     rows, columns = np.nonzero(owner >= 0)
     places = fill.texel_places(owner, corners, mesh.corners, rows, columns)
     return owner, rows, columns, places + np.asarray(mesh.frame.origin)
@@ -220,7 +222,7 @@ def test_carried_inwards_as_the_slow_way_does():
     value = (20 * np.sin(2 * y)[:, None] + rng.normal(0, 10, (len(y), 3))).astype(np.float32)
     corners = np.array([[[0, 0, 0], [2, 0, 0], [0, 4, 0]]], np.float32)
     on_page = np.array([[[0, 0], [100, 0], [0, 200]]], np.float32)
-    owner, page = blend.owners(on_page, 101, 201), np.full((201, 101, 3), 128, np.uint8)
+    owner, page = owners(on_page, 101, 201), np.full((201, 101, 3), 128, np.uint8)
     tree = changes(places, np.full(len(y), 0.015), value)
     fade(page, owner, on_page, corners, np.ones(1, bool), tree, 3.0)
     rows, columns = np.nonzero(owner >= 0)

@@ -12,9 +12,9 @@ import numpy as np
 from numba import njit, prange
 
 from scan2sim.pipeline.types import F32, F64, I32, U8
-from scan2sim.texturing.blend import _box, frame
 from scan2sim.texturing.borders.meeting import SOFT, Index
 from scan2sim.texturing.borders.showing import taps
+from scan2sim.texturing.texels import box, frame
 
 LEAF = 8
 """Places of a tree's leaf, at most."""
@@ -178,7 +178,7 @@ def fade(rgb, owner, flat, corners, near, tree, reach):  # type: ignore[no-untyp
         if not ok:
             continue
         stack = np.empty(DEPTH, np.int64)
-        x0, y0, x1, y1 = _box(flat, f, width, height)
+        x0, y0, x1, y1 = box(flat, f, width, height)
         for ty in range(y0, y1 + 1):
             for tx in range(x0, x1 + 1):
                 if owner[ty, tx] != f:
@@ -242,7 +242,7 @@ def follow(before, after, owner, source):  # type: ignore[no-untyped-def]
     Args:
         before: (H, W, 3) uint8 as it was.
         after: (H, W, 3) uint8 with charts changed; changed in place.
-        owner, source: (H, W) of `blend.owners` and `sources`.
+        owner, source: (H, W) of `texels.owners` and `sources`.
     """
     height, width = owner.shape
     for y in prange(height):

@@ -83,7 +83,7 @@ def _level_pages(
     import numpy as np
 
     from scan2sim.pipeline.io import image
-    from scan2sim.texturing import blend
+    from scan2sim.texturing import texels
     from scan2sim.texturing.borders import fading, showing
 
     mesh, looks = own.mesh, border.looks[0]
@@ -100,8 +100,8 @@ def _level_pages(
         here = looks.page == k
         before = showing.read_page(own.pages[k])
         page, (height, width) = before.copy(), before.shape[:2]
-        flat = blend.texels(mesh.uv[faces], width, height)
-        owner = blend.owners(flat, width, height)
+        flat = texels.corners(mesh.uv[faces], width, height)
+        owner = texels.owners(flat, width, height)
         source = fading.sources(owner)
         fading.fade(page, owner, flat, corners[faces], near[faces], tree, reach)
         fading.settle(page, source, looks.uv[here], target[looks.place[here]])
