@@ -23,6 +23,7 @@ from scan2sim.pipeline.cameras import (
     unproject_pixel,
 )
 from scan2sim.pipeline.looking import eye, to_camera
+from scan2sim.pipeline.sampling import mixed, taps
 from scan2sim.pipeline.types import F64, U8, Camera, View
 from scan2sim.pipeline.visibility import DepthMap, visible
 
@@ -128,7 +129,7 @@ def matches(
             theirs = pictures[j]
             sees = np.flatnonzero(visible(depth(j), world, facing, bias=BEHIND))
             found, ok = _find(
-                mine.levels, theirs.levels, theirs.usable, at[sees], p[sees], n[sees],
+                _with_channel(mine.levels), _with_channel(theirs.levels), theirs.usable, at[sees], p[sees], n[sees],
                 eye(mine.camera, T), eye(theirs.camera, views[j].T_world_cam, T),
             )  # fmt: skip
             of.append(total + sees[ok])
@@ -150,6 +151,11 @@ def matches(
         joined(place, 3), joined(normal, 3), numbers(first), joined(corner, 2), numbers(of), numbers(seen_by),
         joined(uv, 2),
     )  # fmt: skip
+
+
+def _with_channel(levels: tuple[U8, ...]) -> tuple[U8, ...]:
+    """(h, w) pictures as `pipeline.sampling` takes them: (h, w, 1)."""
+    return tuple(level[..., None] for level in levels)
 
 
 def _corners(picture: Picture, depth: DepthMap, count: int, max_distance: float) -> tuple[F64, F64, F64]:
@@ -270,7 +276,7 @@ def _align(a, b, size, u, v, x0, y0, A, shift):  # type: ignore[no-untyped-def]
     """Correlation of two patches after `shift` (2,), in place, was bettered on one level; -1: not to be had.
 
     Args:
-        a, b: (h, w) uint8 grey of this level, whose pixels are `size` of the finest's.
+        a, b: (h, w, 1) uint8 grey of this level, whose pixels are `size` of the finest's.
         u, v: the corner in the first photo; x0, y0: where it should be in the second; A: (2, 2) the way between them.
     """
     n = 2 * HALF + 1
@@ -346,9 +352,5 @@ def _align(a, b, size, u, v, x0, y0, A, shift):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, inline="always")
 def _at(image, x, y):  # type: ignore[no-untyped-def]
-    """Grey at a pixel within the image, bilinear."""
-    c, r = int(x), int(y)
-    s, t = x - c, y - r
-    return (1 - t) * ((1 - s) * image[r, c] + s * image[r, c + 1]) + t * (
-        (1 - s) * image[r + 1, c] + s * image[r + 1, c + 1]
-    )
+    """Grey of a picture (H, W, 1) at a pixel."""
+    return mixed(image, 0, taps(image, x, y, False))

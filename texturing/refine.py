@@ -298,4 +298,4 @@ def _told(
     return {"largest_shift_cm": shift, "largest_turn_mrad": turn, "cameras": lens, "photos": rows}
 
 
-REFINE = Step("refine", 1, refine, RefineParams)
+REFINE = Step("refine", 2, refine, RefineParams)
