@@ -143,17 +143,17 @@ def _carve(xyz, origins, asked, starts, again, ends, spans, box, voxel, reach, v
     size = shape[0] * shape[1] * shape[2]
     passes, hits = np.zeros(size, np.uint16), np.zeros(size, np.uint16)
     through, inside = np.zeros(size, np.uint16), np.zeros(size, np.uint16)  # passes and hits of the voxel alone
-    hit_in, passed_in, inside_in = np.full(size, -1, np.int32), np.full(size, -1, np.int32), np.full(size, -1, np.int32)
-    rays = np.zeros(size, np.uint8)  # through the voxel, in that window
+    hit_in, inside_in = np.full(size, -1, np.int32), np.full(size, -1, np.int32)
+    rays = np.zeros(size, np.int32)  # through the voxel, counted on from `RAYS` + 1 times the window
     for w in range(len(spans)):
         if again[w]:
             _say(xyz, asked, box, corner, shape, voxel, votes, passes, hits, through, inside, out)
             for counts in (passes, hits, through, inside):
                 counts[:] = 0
         for i in range(starts[w], starts[w + 1] if _meet(ends[w], corner, far) else starts[w]):
-            _hit(xyz[i], corner, far, shape, voxel, w, hit_in, hits, inside_in, inside)
+            _hit(xyz, i, corner, far, shape, voxel, w, hit_in, hits, inside_in, inside)
         for i in range(starts[w], starts[w + 1] if _meet(spans[w], corner, far) else starts[w]):
-            _pass(xyz[i], origins[i], corner, far, shape, voxel, reach, w, hit_in, passed_in, rays, passes, through)
+            _pass(xyz, origins, i, corner, far, shape, voxel, reach, w, hit_in, rays, passes, through)
     _say(xyz, asked, box, corner, shape, voxel, votes, passes, hits, through, inside, out)
 
 
@@ -161,12 +161,11 @@ def _carve(xyz, origins, asked, starts, again, ends, spans, box, voxel, reach, v
 def _say(xyz, asked, box, corner, shape, voxel, votes, passes, hits, through, inside, out):  # type: ignore[no-untyped-def]
     """What the counts say of each point in the box, kept in `out` if it is more than was said before."""
     for i in range(len(xyz)):
-        p = xyz[i]
-        if not asked[i] or out[i] == FREE or p[0] < box[0] or p[1] < box[1] or p[2] < box[2]:
+        if not asked[i] or out[i] == FREE or xyz[i, 0] < box[0] or xyz[i, 1] < box[1] or xyz[i, 2] < box[2]:
             continue
-        if p[0] >= box[3] or p[1] >= box[4] or p[2] >= box[5]:
+        if xyz[i, 0] >= box[3] or xyz[i, 1] >= box[4] or xyz[i, 2] >= box[5]:
             continue
-        x, y, z = int((p[0] - corner[0]) / voxel), int((p[1] - corner[1]) / voxel), int((p[2] - corner[2]) / voxel)
+        x, y, z = _voxel(xyz, i, corner, voxel)
         at = (x * shape[1] + y) * shape[2] + z
         if hits[at] <= passes[at] and _least(passes, x, y, z, shape) >= votes:
             out[i] = FREE
@@ -174,6 +173,16 @@ def _say(xyz, asked, box, corner, shape, voxel, votes, passes, hits, through, in
             out[i] = OPEN
         elif out[i] == 0 and hits[at] + passes[at] >= votes:
             out[i] = STANDS
+
+
+@njit(cache=True)
+def _voxel(xyz, i, corner, voxel):  # type: ignore[no-untyped-def]
+    """The voxel of point i: x, y and z."""
+    return (
+        int((xyz[i, 0] - corner[0]) / voxel),
+        int((xyz[i, 1] - corner[1]) / voxel),
+        int((xyz[i, 2] - corner[2]) / voxel),
+    )
 
 
 @njit(cache=True)
@@ -197,12 +206,12 @@ def _least(values, x, y, z, shape):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _hit(p, corner, far, shape, voxel, window, hit_in, hits, inside_in, inside):  # type: ignore[no-untyped-def]
+def _hit(xyz, i, corner, far, shape, voxel, window, hit_in, hits, inside_in, inside):  # type: ignore[no-untyped-def]
     """Mark the voxel of a return and its neighbours."""
     for k in range(3):
-        if p[k] < corner[k] or p[k] >= far[k]:
+        if xyz[i, k] < corner[k] or xyz[i, k] >= far[k]:
             return
-    x, y, z = int((p[0] - corner[0]) / voxel), int((p[1] - corner[1]) / voxel), int((p[2] - corner[2]) / voxel)
+    x, y, z = _voxel(xyz, i, corner, voxel)
     own = (x * shape[1] + y) * shape[2] + z
     if inside_in[own] == window:  # and so are its neighbours
         return
@@ -218,9 +227,13 @@ def _hit(p, corner, far, shape, voxel, window, hit_in, hits, inside_in, inside):
 
 
 @njit(cache=True)
-def _pass(p, o, corner, far, shape, voxel, reach, window, hit_in, passed_in, rays, passes, through):  # type: ignore[no-untyped-def]
+def _pass(xyz, origins, i, corner, far, shape, voxel, reach, window, hit_in, rays, passes, through):  # type: ignore[no-untyped-def]
     """Walk along a ray from voxel to voxel (Amanatides and Woo, 1987), up to the last before its return."""
-    dx, dy, dz = float(p[0] - o[0]), float(p[1] - o[1]), float(p[2] - o[2])
+    for k in range(3):  # most rays are nowhere near a block
+        if max(origins[i, k], xyz[i, k]) < corner[k] or min(origins[i, k], xyz[i, k]) >= far[k]:
+            return
+    o = origins[i, 0], origins[i, 1], origins[i, 2]
+    dx, dy, dz = float(xyz[i, 0] - o[0]), float(xyz[i, 1] - o[1]), float(xyz[i, 2] - o[2])
     r = math.sqrt(dx * dx + dy * dy + dz * dz)
     begin, end = 0.0, min(r - voxel, reach)
     if not end > voxel:  # nor where the origin isn't known
@@ -250,14 +263,12 @@ def _pass(p, o, corner, far, shape, voxel, reach, window, hit_in, passed_in, ray
     next_x = begin + ((ix + 1 - x) if dx > 0 else (x - ix)) * each_x
     next_y = begin + ((iy + 1 - y) if dy > 0 else (y - iy)) * each_y
     next_z = begin + ((iz + 1 - z) if dz > 0 else (z - iz)) * each_z
-    along = begin
+    along, none = begin, window * (RAYS + 1)
     while along < end and 0 <= ix < shape[0] and 0 <= iy < shape[1] and 0 <= iz < shape[2]:
         at = (ix * shape[1] + iy) * shape[2] + iz
-        if passed_in[at] != window:
-            passed_in[at], rays[at] = window, 0
-        if rays[at] < RAYS:
-            rays[at] += 1
-            if rays[at] == RAYS:
+        if rays[at] < none + RAYS:
+            rays[at] = max(rays[at], none) + 1
+            if rays[at] == none + RAYS:
                 through[at] += 1
                 if hit_in[at] != window:
                     passes[at] += 1
