@@ -1,0 +1,63 @@
+"""A step of one's own: one file, and one line in a recipe."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+
+import pytest
+
+from scan2sim.flows.engine.execution import execute
+from scan2sim.flows.engine.planning import Reason, plan
+from scan2sim.flows.recipes.graph import Node, NodeId, Output, needed
+from scan2sim.flows.recipes.settings import Settings
+from scan2sim.flows.recipes.tile import STEPS, recipe
+from scan2sim.pipeline.io.tile import read_tile
+from scan2sim.pipeline.store import Store
+
+FILE = '''
+"""Lift: the cloud, so many metres higher."""
+
+from dataclasses import replace
+
+from pydantic import Field
+
+from scan2sim.pipeline.step import Done, Params, Step
+from scan2sim.pipeline.types import PointCloud
+
+
+class LiftParams(Params):
+    metres: float = Field(1.0, ge=0, le=100)
+
+
+def lift(inputs, params, out, report):
+    cloud = PointCloud.load(inputs["cloud"])
+    replace(cloud, xyz=cloud.xyz + (0, 0, params.metres)).save(out / "cloud.npz")
+    return Done({"cloud": out / "cloud.npz"}, {"highest": float(cloud.xyz[:, 2].max()) + params.metres})
+
+
+LIFT = Step("lift", 1, lift, LiftParams)
+'''
+
+
+def test_a_step_of_ones_own_is_one_file_and_one_line(
+    small_street: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "lifting.py").write_text(FILE)
+    monkeypatch.syspath_prepend(tmp_path)
+    step = importlib.import_module("lifting").LIFT
+    tile, store = read_tile(small_street), Store(tmp_path / "steps")
+
+    def run(*assignments: str) -> tuple[float, dict[str, Reason | None]]:
+        settings = Settings.read(None, assignments)
+        settings.check((*STEPS, step))
+        line = Node(step, settings.params(step), {"cloud": Output(NodeId("ingest"), "cloud")})
+        planned = plan(needed([*recipe(tile, Settings()), line], [line.id]), store)
+        outcome = execute(planned, store, jobs=1, watch=lambda *_: None)
+        outcome.check()
+        return outcome.of_tile()["lift"].facts["highest"], {item.node.label: item.reason for item in planned}
+
+    low, why = run()
+    assert why == {"ingest": Reason.NEW, "lift": Reason.NEW}
+    high, why = run("lift.metres=3")
+    assert high == pytest.approx(low + 2, abs=1e-3) and why == {"ingest": None, "lift": Reason.CHANGED}
