@@ -145,3 +145,12 @@ def test_architecture_names_every_file_of_the_core() -> None:
         for file in (ROOT / room).glob("*.py" if room == "pipeline" else "**/*.py"):
             if file.name != "__init__.py":
                 assert file.name in text, f"docs/architecture.md doesn't name {room}/{file.name}"
+
+
+def test_walks_stop_at_files_that_there_are_and_at_none_twice() -> None:
+    text = (ROOT / "docs" / "architecture.md").read_text().split("## Three walks")[1].split("\n## ")[0]
+    walks = [re.findall(r"`([\w/]+\.py)`", walk) for walk in text.split("\n\n")[2:] if walk.strip()]
+    assert len(walks) == 3
+    for stops in walks:
+        assert len(stops) > 8 and len(set(stops)) == len(stops), stops
+        assert all((ROOT / stop).is_file() for stop in stops)
