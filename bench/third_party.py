@@ -77,9 +77,9 @@ writes. Who passes on an environment (an image, an appliance, an installer) pass
 | --- | --- | --- | --- |
 {attention}
 
-Nothing that is GPL without an exception comes with the core. To ship without any GPL, leave out the extra `slam`: what
-it does needs PyAV to read and write videos (built against an FFmpeg without x264 and x265 it still reads them), and
-pycolmap for `slam --adjust` alone.
+Nothing that is GPL without an exception comes with the core. To ship without any GPL, leave out the extra `meshlab`,
+one of four libraries that decimate, and the extra `slam`: what it does needs PyAV to read and write videos (built
+against an FFmpeg without x264 and x265 it still reads them), and pycolmap for `slam --adjust` alone.
 """
 
 ATTENTION = (
@@ -88,6 +88,8 @@ ATTENTION = (
      "may also need patent licences"),
     ("SuiteSparse in pycolmap's binary", "GPL-2.0-or-later", "`slam`: pycolmap",
      "as above, although COLMAP's own code is BSD"),
+    ("MeshLab, all of it", "GPL-3.0", "`meshlab`: pymeshlab",
+     "likewise; it also brings Qt 5 (LGPL) and what that is built with"),
     ("FFmpeg", "LGPL-2.1-or-later", "core: opencv-python-headless, open3d",
      "the licence's text and the source, and that users may put another build in its place; OpenCV's is a shared "
      "library, Open3D's is linked in (scan2sim reads no video by either)"),
@@ -109,10 +111,14 @@ ATTENTION = (
 )  # fmt: skip
 
 
+NOT_HERE = ("dev", "meshlab")
+"""Extras that the page has no table of: its environment has none of MeshLab, which wants libraries of a desktop."""
+
+
 def project() -> dict[str, list[str]]:
-    """What pyproject.toml asks for: "core", then each extra but that for developers."""
+    """What pyproject.toml asks for: "core", then each extra but those that `make test` makes no environment with."""
     about = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    extras = {name: asked for name, asked in about["optional-dependencies"].items() if name != "dev"}
+    extras = {name: asked for name, asked in about["optional-dependencies"].items() if name not in NOT_HERE}
     return {"core": about["dependencies"], **extras}
 
 

@@ -14,6 +14,8 @@ EXTRA_OF = {
     "av": "slam",
     "matplotlib": "slam",
     "pycolmap": "slam",
+    "fast_simplification": "decimation",
+    "pymeshlab": "meshlab",
     "pye57": "e57",
     "zstandard": "ept",
     "prefect": "flows",

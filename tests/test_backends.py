@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scan2sim.pipeline import backends
+from scan2sim.pipeline import backends, decimation
 from scan2sim.pipeline.errors import SettingError, UnavailableError
 from scan2sim.pipeline.extras import EXTRA_OF
 from scan2sim.pipeline.io import clouds, gps, meshes, models
@@ -35,6 +35,7 @@ PROTOCOLS: dict[ModuleType, tuple[type, ...]] = {
     models: (models.Program,),
     gps: (gps.Format,),
     meshes: (meshes.ModelFormat, meshes.WorldFormat),
+    decimation: (decimation.Backend,),
 }
 """Packages of backends, and what their modules are: one of these."""
 ALL = [(package, name) for package in PROTOCOLS for name in backends.names(package.__name__)]

@@ -48,7 +48,8 @@ def collision(inputs: Inputs, params: CollisionParams, out: Path, report: Report
         DataError: no mesh has a face.
         StepError: the budget can't be met; with `keep_border`, the borders alone need over 200,000 triangles.
     """
-    from scan2sim.pipeline.steps.decimate import simplify, with_things
+    from scan2sim.pipeline.decimation import simplify
+    from scan2sim.pipeline.steps.decimate import with_things
 
     left_out = {"vegetation"} if not params.vegetation else set()
     groups = tuple(g for g in SURFACES if g not in left_out and (g in inputs or g != "vehicle"))
@@ -62,7 +63,7 @@ def collision(inputs: Inputs, params: CollisionParams, out: Path, report: Report
         warnings.append(f"collision: the borders alone need {len(small):,} triangles, kept since other tiles join them")
     elif not border_kept:
         warnings.append(f"collision: the borders alone need {len(small):,} triangles, so they were thinned too")
-        small = simplify(small, budget, preserve_border=False)
+        small = simplify(small, budget, keep_border=False)
     small = replace(with_things(small, things), label=None) if len(things) else small
     allowed = MOST if params.keep_border else params.triangles
     if len(small) > allowed:
@@ -72,13 +73,13 @@ def collision(inputs: Inputs, params: CollisionParams, out: Path, report: Report
             "Raise collision.triangles, or remove small islands",
         )
     report(0.7, "deviation")
-    deviation = _deviation(whole, small, params.seed)
+    apart = deviation(whole, small, params.seed)
     small.save(out / "collision.npz")
     facts = {
         "triangles_in": len(whole),
         "triangles": len(small),
         "border_kept": border_kept,
-        "deviation_m": deviation,
+        "deviation_m": apart,
     }
     return Done({"mesh": out / "collision.npz"}, facts, warnings)
 
@@ -117,7 +118,7 @@ def _parted(mesh: Mesh, budget: int) -> tuple[Mesh, Mesh]:
     return mesh.keep(~own), mesh.keep(own)
 
 
-def _deviation(source: Mesh, small: Mesh, seed: int) -> dict[str, float]:
+def deviation(source: Mesh, small: Mesh, seed: int) -> dict[str, float]:
     """Distances in metres from points of `source`, drawn evenly over its area, to `small`."""
     import numpy as np
     import open3d as o3d

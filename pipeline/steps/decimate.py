@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from pydantic import Field
 
+from scan2sim.pipeline.ranges import Name
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
@@ -18,34 +19,42 @@ class DecimateParams(Params):
 
     Attributes:
         target: triangles; the mission's 100 K for terrain and buildings, 300 K for vegetation; 50 K for vehicles.
+        backend: "pyfqmr", "fast_simplification", "pymeshlab" or "open3d", which can't keep borders: the library that
+            does it (`pipeline/decimation/`).
         keep_border: never thin the border, be there too many triangles; set by the recipe where tiles meet.
     """
 
     target: int = Field(100_000, ge=10_000, le=1_000_000)
+    backend: Name = "pyfqmr"
     keep_border: bool = False
 
 
 def decimate(inputs: Inputs, params: DecimateParams, out: Path, report: Report) -> Done:
-    """Collapse edges of `mesh` down to the target, borders kept (tiles and classes meet there).
+    """Collapse edges of `mesh` down to the target, borders kept where the library can (tiles and classes meet there).
 
     What `furniture` (optional) holds is added as it is, within the target; its faces keep their classes, all others
     have the class 0 then.
 
     Where the border alone is more than the target allows, the border is thinned as well (but for `keep_border`),
     and a warning says so.
+
+    Raises:
+        SettingError, UnavailableError: as `can_decimate`.
     """
+    from scan2sim.pipeline.decimation import find, simplify
     from scan2sim.pipeline.types import Mesh
+
+    border_kept = find(params.backend, keep_border=params.keep_border).KEEPS_BORDER
 
     mesh = Mesh.load(inputs["mesh"])
     things = Mesh.load(inputs["furniture"]) if "furniture" in inputs else None
     target = params.target - len(things or ())
-    small, warnings = simplify(mesh, target), []
-    border_kept = True
+    small, warnings = simplify(mesh, target, keep_border=border_kept, backend=params.backend), []
     if len(small) > target * 1.05 and params.keep_border:
         warnings.append(f"the border alone needs {len(small):,} triangles, {params.target:,} were asked for: kept")
-    elif len(small) > target * 1.05:
+    elif len(small) > target * 1.05 and border_kept:
         warnings.append(f"the border alone needs {len(small):,} triangles: thinned too, to {params.target:,}")
-        small, border_kept = simplify(small, target, preserve_border=False), False
+        small, border_kept = simplify(small, target, keep_border=False, backend=params.backend), False
     if things is not None and len(things):
         small = with_things(small, things)
     small.save(out / "mesh.npz")
@@ -68,20 +77,16 @@ def with_things(mesh: Mesh, things: Mesh) -> Mesh:
     )
 
 
-def simplify(mesh: Mesh, target: int, *, preserve_border: bool = True) -> Mesh:
-    """Quadric edge collapse (Garland and Heckbert 1997) by pyfqmr, which refuses collapses that flip a face."""
-    import numpy as np
-    import pyfqmr
+def can_decimate(params: DecimateParams) -> None:
+    """Refuse a library that can't run here.
 
-    from scan2sim.pipeline.types import Mesh
+    Raises:
+        SettingError: there is none of that name, or it can't keep borders where that is asked.
+        UnavailableError: it isn't installed.
+    """
+    from scan2sim.pipeline.decimation import find
 
-    if len(mesh) <= target:
-        return Mesh(mesh.frame, mesh.vertices, mesh.faces)
-    simplifier = pyfqmr.Simplify()
-    simplifier.setMesh(mesh.vertices.astype(np.float64), mesh.faces)
-    simplifier.simplify_mesh(target_count=target, aggressiveness=5, preserve_border=preserve_border, verbose=0)
-    vertices, faces, _ = simplifier.getMesh()
-    return Mesh(mesh.frame, vertices.astype(np.float32), faces.astype(np.int32)).keep(np.ones(len(faces), bool))
+    find(params.backend, keep_border=params.keep_border)
 
 
 DECIMATE = Step(
@@ -90,6 +95,7 @@ DECIMATE = Step(
     decimate,
     DecimateParams,
     class_defaults={"vegetation": {"target": 300_000}, "vehicle": {"target": 50_000}},
+    check=can_decimate,
     per_class=True,
     memory=(0.4, 30),
 )

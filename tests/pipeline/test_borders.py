@@ -16,11 +16,12 @@ from scan2sim.pipeline.borders.grid import GRID, world
 from scan2sim.pipeline.borders.join import join
 from scan2sim.pipeline.cells import Cell
 from scan2sim.pipeline.classes import CODE, GROUPS, group_of
+from scan2sim.pipeline.decimation import simplify
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.step import Done, Step, silent
 from scan2sim.pipeline.steps.clip import CLIP
 from scan2sim.pipeline.steps.collision import COLLISION
-from scan2sim.pipeline.steps.decimate import DECIMATE, simplify
+from scan2sim.pipeline.steps.decimate import DECIMATE
 from scan2sim.pipeline.steps.geometry import GEOMETRY
 from scan2sim.pipeline.steps.islands import ISLANDS
 from scan2sim.pipeline.steps.join import JOIN

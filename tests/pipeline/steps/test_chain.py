@@ -11,10 +11,11 @@ import pytest
 
 from scan2sim.pipeline import isolate
 from scan2sim.pipeline.classes import CODE
+from scan2sim.pipeline.decimation import simplify
 from scan2sim.pipeline.errors import DataError, StepError
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.step import Done, Step, silent
-from scan2sim.pipeline.steps.decimate import DECIMATE, simplify
+from scan2sim.pipeline.steps.decimate import DECIMATE
 from scan2sim.pipeline.steps.geometry import distances
 from scan2sim.pipeline.steps.ingest import INGEST
 from scan2sim.pipeline.steps.islands import ISLANDS

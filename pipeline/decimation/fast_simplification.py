@@ -1,0 +1,19 @@
+"""fast-simplification: the same passes as pyfqmr's, by the authors of PyVista."""
+
+from __future__ import annotations
+
+from scan2sim.pipeline.types import F64, I32
+
+NEEDS = ("fast_simplification",)
+KEEPS_BORDER = True
+AGGRESSIVENESS = 5.0
+"""As pyfqmr's."""
+
+
+def simplify(vertices: F64, faces: I32, target: int, keep_border: bool) -> tuple[F64, I32]:
+    """See `pipeline.decimation.Backend`."""
+    import fast_simplification
+
+    return fast_simplification.simplify(
+        vertices, faces, target_count=target, agg=AGGRESSIVENESS, preserve_border=keep_border
+    )

@@ -1,0 +1,95 @@
+"""Decimation: one contract for all libraries; what they are to keep, they keep."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from scan2sim.pipeline import backends, decimation
+from scan2sim.pipeline.errors import SettingError
+from scan2sim.pipeline.step import silent
+from scan2sim.pipeline.steps.decimate import DECIMATE, DecimateParams
+from scan2sim.pipeline.types import Frame, Mesh
+
+NAMES = backends.names(decimation.__name__)
+SIDE = 120
+
+
+def hills() -> Mesh:
+    """Wavy ground of 12 x 12 m with a hole, 28 K triangles, all of which look up."""
+    random = np.random.default_rng(0)
+    i, j = np.meshgrid(np.arange(SIDE), np.arange(SIDE), indexing="ij")
+    x, y = (0.1 * axis + random.uniform(-0.02, 0.02, axis.shape) for axis in (i, j))
+    z = 0.5 * np.sin(x) * np.cos(y)
+    a = (i[:-1, :-1] * SIDE + j[:-1, :-1]).ravel()
+    faces = np.concatenate([np.stack([a, a + SIDE, a + SIDE + 1], 1), np.stack([a, a + SIDE + 1, a + 1], 1)])
+    mesh = Mesh(Frame(), np.stack([x, y, z], -1).reshape(-1, 3).astype(np.float32), faces.astype(np.int32))
+    middle = mesh.corners.mean(axis=1)[:, :2] - 6
+    return mesh.keep(np.hypot(*middle.T) > 1)
+
+
+def border(mesh: Mesh) -> set[frozenset[tuple[float, ...]]]:
+    """The edges of one face alone, by their places."""
+    edges = np.sort(np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]]), axis=1)
+    once, count = np.unique(edges, axis=0, return_counts=True)
+    return {frozenset(map(tuple, ends)) for ends in mesh.vertices[once[count == 1]].tolist()}
+
+
+def off(small: Mesh) -> float:
+    """Metres that vertices are from the ground, 95 of 100 at most."""
+    x, y, z = small.vertices.T
+    return float(np.percentile(np.abs(z - 0.5 * np.sin(x) * np.cos(y)), 95))
+
+
+def simplified(mesh: Mesh, name: str, target: int, *, keep_border: bool) -> Mesh:
+    if lacking := backends.missing(decimation.__name__, name):
+        pytest.skip(f"needs {lacking}")
+    return decimation.simplify(mesh, target, keep_border=keep_border, backend=name)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("keep_border", [True, False])
+def test_the_surface_stays_with_fewer_triangles(name: str, keep_border: bool) -> None:
+    whole = hills()
+    if keep_border and not backends.module(decimation.__name__, name).KEEPS_BORDER:
+        with pytest.raises(SettingError, match=r"can't keep borders.*Choose .*pyfqmr"):
+            simplified(whole, name, 4000, keep_border=True)
+        return
+    small = simplified(whole, name, 4000, keep_border=keep_border)
+    assert 3800 <= len(small) <= 4010
+    assert np.isfinite(small.vertices).all() and small.frame == whole.frame
+    assert small.faces.max() + 1 == len(small.vertices) == len(np.unique(small.faces))
+    assert (small.face_normal[small.face_area > 1e-6, 2] > 0).all(), "no face is turned over"
+    assert off(small) < 0.005
+    assert abs(float(small.face_area.sum() / whole.face_area.sum()) - 1) < 0.01
+    if keep_border:
+        assert border(small) == border(whole)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_is_small_enough_stays(name: str) -> None:
+    whole = hills()
+    same = simplified(whole, name, len(whole), keep_border=False)
+    assert np.array_equal(same.vertices, whole.vertices) and np.array_equal(same.faces, whole.faces)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_step_uses_the_library_that_is_set(tmp_path: Path, name: str) -> None:
+    if lacking := backends.missing(decimation.__name__, name):
+        pytest.skip(f"needs {lacking}")
+    hills().save(tmp_path / "mesh.npz")
+    (tmp_path / "out").mkdir()
+    params = DecimateParams(target=10_000, backend=name)
+    done = DECIMATE.run({"mesh": tmp_path / "mesh.npz"}, params, tmp_path / "out", silent)
+    small = Mesh.load(done.files["mesh"])
+    same = simplified(hills(), name, 10_000, keep_border=done.facts["border_kept"])
+    assert np.array_equal(small.vertices, same.vertices) and np.array_equal(small.faces, same.faces)
+    assert done.facts["border_kept"] == (name != "open3d") and not done.warnings
+
+
+def test_a_library_that_loses_borders_is_refused_where_tiles_meet() -> None:
+    assert DECIMATE.check is not None
+    with pytest.raises(SettingError, match=r"decimate\.backend: 'open3d' can't keep borders"):
+        DECIMATE.check(DecimateParams(backend="open3d", keep_border=True))
