@@ -47,8 +47,9 @@ ALIKE = 0.8
 """Share of what is seen of a plate's face that all photos agree on."""
 NEARLY = 0.8
 """Share of both from which a plate is looked at more closely."""
-HOPEFUL, EARLY = 0.4, 10
-"""Share of both below which a search ends after so many generations."""
+HOPEFUL, MIDWAY, GENERATIONS = 0.4, 25, 50
+"""Share of both below which a search ends midway, and generations: a plate that is there may be met late, but by then
+has nearly all."""
 ROUGHLY = 0.6
 """Share of both from which what a search ends with is refined."""
 TURN = math.radians(60)
@@ -247,12 +248,12 @@ def _best(
 
     def hopeless(intermediate_result: OptimizeResult) -> bool:
         best = _of(shape, plates(intermediate_result.x[None])[0])
-        return bool(intermediate_result.nit >= EARLY and not shown.shows(best, HOPEFUL))
+        return bool(intermediate_result.nit >= MIDWAY and not shown.shows(best, HOPEFUL))
 
     bounds = list(zip(low, high, strict=True))
     found = differential_evolution(
-        price, bounds, popsize=16, maxiter=50, tol=1e-2, rng=0, polish=False, updating="deferred", vectorized=True,
-        callback=hopeless,
+        price, bounds, popsize=16, maxiter=GENERATIONS, tol=1e-2, rng=0, polish=False, updating="deferred",
+        vectorized=True, callback=hopeless,
     )  # fmt: skip
     if not shown.shows(_of(shape, plates(found.x[None])[0]), ROUGHLY):
         return None
