@@ -18,6 +18,8 @@ import numpy.typing as npt
 
 from scan2sim.pipeline.errors import DataError
 from scan2sim.pipeline.extras import need
+from scan2sim.pipeline.io import gps as gps_io
+from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.io.trajectory import replacing
 from scan2sim.pipeline.similarity import umeyama
 from scan2sim.pipeline.types import F64, GpsTrack, Trajectory
@@ -111,6 +113,19 @@ class Evaluation:
             "truth_noise_m": self.truth_noise,
             "poses": float(len(self.times)),
         }
+
+
+def read_truth(path: Path) -> Trajectory | GpsTrack:
+    """What a trajectory is compared with: another in any of their formats, or a GPS track.
+
+    Raises:
+        InputError: it is neither, or can't be read.
+    """
+    if path.suffix.lower() in (".gpx", ".nmea", ".mp4"):
+        return gps_io.read(path)
+    if path.suffix.lower() == ".csv" and "lat" in path.read_text(encoding="utf-8", errors="replace")[:200]:
+        return gps_io.read(path)
+    return trajectory_io.read(path)
 
 
 def evaluate(

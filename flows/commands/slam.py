@@ -11,24 +11,20 @@ from typing import Annotated, Any, TypeVar, get_args
 import typer
 
 from scan2sim.flows.commands.app import App, Config, Sets, settings_of
-from scan2sim.flows.commands.display import console, progress, warn
+from scan2sim.flows.commands.display import console, warn
 from scan2sim.flows.commands.log import Log
 from scan2sim.flows.commands.options import options
 from scan2sim.flows.commands.shown import execute_shown
+from scan2sim.flows.commands.study import study_compression
 from scan2sim.flows.engine.lock import locked
 from scan2sim.flows.engine.planning import STORE, Planned, drop_damaged, plan
 from scan2sim.flows.recipes.settings import Settings
 from scan2sim.flows.recipes.video import ALONE, STEPS, Video, recipe
 from scan2sim.pipeline.errors import SettingError
-from scan2sim.pipeline.io import gps as gps_io
 from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.io.worlds import link
 from scan2sim.pipeline.store import Digests, Manifest, Store
-from scan2sim.pipeline.types import GpsTrack, Trajectory
-from scan2sim.slam.evaluate import AlignmentKind, Evaluation, evaluate, plot
-from scan2sim.slam.odometry import OdometryParams
-from scan2sim.slam.steps.track import TRACK, read_gps, read_mask
-from scan2sim.slam.video import open_video
+from scan2sim.slam.evaluate import AlignmentKind, Evaluation, evaluate, plot, read_truth
 
 T = TypeVar("T", int, float)
 MADE = (
@@ -85,14 +81,14 @@ def slam_study(
     bitrates: Annotated[str, typer.Option(help="Mbit/s.")] = "1,2,5,10,20,40",
     rates: Annotated[str, typer.Option(help="Frames a second.")] = "30,15",
     jobs: Annotated[int, typer.Option(min=1, help="Cells at a time.")] = 1,
-    backend: Annotated[str, typer.Option(help="lm, or adam: the mission's.")] = "lm",
+    backend: Annotated[str | None, typer.Option(help="lm, or adam: the mission's.")] = None,
     set_: Sets = None,
     config: Config = None,
 ) -> None:
     """What resolution, bit rate and frame rate of the video cost: D3.2's tables 4 and 5."""
     study_compression(
         source, out, truth=truth, gps=gps, mask=mask, heights=heights, bitrates=bitrates, rates=rates, jobs=jobs,
-        backend=backend, settings=settings_of(set_, config),
+        settings=settings_of([*(set_ or []), *([f"track.backend={backend}"] if backend else [])], config),
     )  # fmt: skip
 
 
@@ -148,17 +144,6 @@ def _figures(done: Mapping[str, Manifest]) -> dict[str, Any]:
     return facts | {"warnings": list(dict.fromkeys(text for one in steps for text in one.warnings))}
 
 
-def odometry_params(settings: Settings) -> OdometryParams:
-    """Of `--set track.param=value`.
-
-    Raises:
-        SettingError: unknown, or out of range.
-    """
-    settings.check(STEPS)
-    given = settings.params(TRACK)
-    return OdometryParams(**{name: getattr(given, name) for name in OdometryParams.model_fields})
-
-
 def evaluate_trajectory(estimate: Path, truth: Path, *, segment: float, alignment: str, out: Path | None) -> Evaluation:
     """Print how far a trajectory is from the truth: a trajectory, or a GPS track."""
     kinds: tuple[AlignmentKind, ...] = get_args(AlignmentKind)
@@ -166,7 +151,7 @@ def evaluate_trajectory(estimate: Path, truth: Path, *, segment: float, alignmen
     if kind is None:
         raise SettingError("--alignment", f"there is no `{alignment}`", f"Choose one of {', '.join(kinds)}")
     path = trajectory_io.read(estimate)
-    known = _truth(truth)
+    known = read_truth(truth)
     result = evaluate(path, known, segment=segment, alignment=kind)
     for name, value in result.figures().items():
         console.print(f"{name:<24}{'-' if value is None else f'{value:.4f}':>14}", highlight=False, markup=False)
@@ -174,50 +159,3 @@ def evaluate_trajectory(estimate: Path, truth: Path, *, segment: float, alignmen
         plot(result, out)
         console.print(f"Plot: {out}", highlight=False, soft_wrap=True, markup=False)
     return result
-
-
-def _truth(path: Path) -> Trajectory | GpsTrack:
-    if path.suffix.lower() in (".gpx", ".nmea", ".mp4"):
-        return gps_io.read(path)
-    if path.suffix.lower() == ".csv" and "lat" in path.read_text(encoding="utf-8", errors="replace")[:200]:
-        return gps_io.read(path)
-    return trajectory_io.read(path)
-
-
-def study_compression(
-    source: Path, out: Path, *, truth: Path | None, gps: Path | None, mask: Path | None, heights: str, bitrates: str,
-    rates: str, jobs: int, backend: str, settings: Settings,
-) -> Path:  # fmt: skip
-    """Print the table of what compression costs; in a drive's folder, what isn't named is found by its name.
-
-    Raises:
-        ScanError: see `pipeline.errors`.
-    """
-    from scan2sim.slam.study import study
-
-    def found(given: Path | None, name: str) -> Path | None:
-        beside = source / name
-        return given or (beside if source.is_dir() and beside.is_file() else None)
-
-    known = found(truth, "truth.csv")
-    if known is None:
-        raise SettingError("--truth", "is missing", "Give a trajectory, or a GPS track, to compare with")
-    video = open_video(source / "video.mp4" if (source / "video.mp4").is_file() else source)
-    track = read_gps(video, found(gps, "gps.csv"), 0.0, warn)
-    free = read_mask(video, found(mask, "mask.png"))
-    with progress("study") as report:
-        table = study(
-            source, _truth(known), out, params=odometry_params(settings), gps=track, mask=free, jobs=jobs,
-            backend=backend, heights=_numbers("--heights", heights, int),
-            bitrates=_numbers("--bitrates", bitrates, float), rates=_numbers("--rates", rates, float), report=report,
-        )  # fmt: skip
-    console.print(table.read_text(encoding="utf-8"), highlight=False, markup=False, soft_wrap=True)
-    console.print(f"Table: {table}", highlight=False, soft_wrap=True, markup=False)
-    return table
-
-
-def _numbers(option: str, text: str, kind: type[T]) -> list[T]:
-    try:
-        return [kind(part) for part in text.split(",")]  # type: ignore[call-arg]
-    except ValueError:
-        raise SettingError(option, f"`{text}` isn't a list of numbers", "Write 512,1024") from None

@@ -1,0 +1,116 @@
+"""`scan2sim slam study`: what resolution, bit rate and frame rate of the video cost (D3.2, tables 4 and 5)."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import TypeVar
+
+from scan2sim.flows.commands.display import console
+from scan2sim.flows.commands.log import Log
+from scan2sim.flows.commands.shown import execute_shown
+from scan2sim.flows.engine.execution import limit_cores
+from scan2sim.flows.engine.lock import locked
+from scan2sim.flows.engine.planning import STORE, Planned, plan
+from scan2sim.flows.recipes.graph import NodeId
+from scan2sim.flows.recipes.settings import Settings
+from scan2sim.flows.recipes.study import Cell, Study, cells, recipe, refused, segment_of
+from scan2sim.flows.reports.study import Result, Tables, write
+from scan2sim.pipeline.errors import ScanError, SettingError, SpaceError
+from scan2sim.pipeline.extras import need
+from scan2sim.pipeline.store import Digests, Store
+from scan2sim.slam.evaluate import read_truth
+from scan2sim.slam.steps.track import TRACK, can_track
+from scan2sim.slam.video import Video
+
+T = TypeVar("T", int, float)
+
+
+def study_compression(
+    source: Path, out: Path, *, truth: Path | None, gps: Path | None, mask: Path | None, heights: str, bitrates: str,
+    rates: str, jobs: int, settings: Settings,
+) -> Path:  # fmt: skip
+    """Print the table of what compression costs; in a drive's folder, what isn't named is found by its name.
+
+    Raises:
+        ScanError: see `pipeline.errors`.
+    """
+
+    def found(given: Path | None, name: str) -> Path | None:
+        beside = source / name
+        return given or (beside if source.is_dir() and beside.is_file() else None)
+
+    known = found(truth, "truth.csv")
+    if known is None:
+        raise SettingError("--truth", "is missing", "Give a trajectory, or a GPS track, to compare with")
+    asked = Study.of("", {
+        "source": source, "truth": known, "gps": found(gps, "gps.csv"), "mask": found(mask, "mask.png"),
+        "heights": _numbers("--heights", heights, int), "bitrates": _numbers("--bitrates", bitrates, float),
+        "rates": _numbers("--rates", rates, float),
+    }, remedy="Give others")  # fmt: skip
+    table = study(asked, out, settings, jobs)
+    console.print(table.read_text(encoding="utf-8"), highlight=False, markup=False, soft_wrap=True)
+    console.print(f"Table: {table}", highlight=False, soft_wrap=True, markup=False)
+    return table
+
+
+def study(asked: Study, out: Path, settings: Settings, jobs: int = 1) -> Path:
+    """Run the cells that no earlier run has finished; returns `out/table.md`, which holds them all.
+
+    A cell that fails is N/A with its reason; an interrupted study leaves the tables of what is there.
+
+    Raises:
+        ScanError: see `pipeline.errors`.
+    """
+    need("slam study", "av", "matplotlib")
+    can_track(settings.params(TRACK))
+    video = asked.video()
+    segment = segment_of(video, read_truth(asked.truth))
+    nodes = recipe(asked, video, segment, settings)
+    failed: Mapping[NodeId, ScanError] = {}
+    with locked(out):
+        store = Store(out / STORE)
+        digests = Digests(store.root / "digests.json")
+        planned = plan(nodes, store, digest=digests)
+        log = Log(out / "run.log")
+        limit_cores(max(1, (os.cpu_count() or 1) // jobs))
+        try:
+            with log.errors(out):
+                failed = execute_shown(planned, store, log, jobs, to_the_end=True).failed
+        finally:
+            backend, results = settings.params(TRACK).backend, _results(asked, video, planned, store, failed)
+            table = write(out, Tables(video, asked.gps is not None, backend, segment, cells(asked), results))
+            digests.save()
+        for error in failed.values():
+            if isinstance(error, SpaceError):  # no cell's fault
+                raise error
+        store.sweep({item.node.label: item.key for item in planned})
+    return table
+
+
+def _results(
+    asked: Study, video: Video, planned: Iterable[Planned], store: Store, failed: Mapping[NodeId, ScanError]
+) -> dict[Cell, Result]:
+    """Of the cells that are done, or can't be."""
+    results = {cell: Result(reason=refused(cell, video)) for cell in cells(asked) if refused(cell, video)}
+    for cell in cells(asked):
+        own = [item.node for item in planned if item.node.group == cell.name]
+        keys = [item.key for item in planned if item.node.group == cell.name]
+        made = [store.find(node.label, key) for node, key in zip(own, keys, strict=True)]
+        done = [manifest for manifest in made if manifest is not None]
+        error = next((failed[node.id] for node in own if node.id in failed), None)
+        facts = {key: value for manifest in done for key, value in manifest.facts.items()}
+        if error is not None:
+            results[cell] = Result(facts, f"{error.where}: {error.cause}")
+        elif own and len(done) == len(own):
+            reason = facts.pop("reason", None)
+            results[cell] = Result(facts | {"seconds": round(sum(one.seconds for one in done), 1)}, reason)
+    return results
+
+
+def _numbers(option: str, text: str, kind: type[T]) -> list[T]:
+    try:
+        return [kind(part) for part in text.split(",")]  # type: ignore[call-arg]
+    except ValueError:
+        raise SettingError(option, f"`{text}` isn't a list of numbers", "Write 512,1024") from None

@@ -1,0 +1,49 @@
+"""Encode: a video, as a link of so many Mbit/s would bring it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import Field
+
+from scan2sim.pipeline.extras import need
+from scan2sim.pipeline.ranges import Rate
+from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.slam.encoding import encode
+from scan2sim.slam.video import open_video
+
+Pixels = Annotated[int, Field(ge=2, le=100_000, multiple_of=2)]
+
+
+class EncodeParams(Params):
+    """How the video comes; set by the recipe.
+
+    Attributes:
+        size: pixels, width and height, even.
+        bitrate: Mbit/s that are aimed at.
+        rate: frames a second.
+        fps: of a source that is a folder of pictures.
+    """
+
+    size: tuple[Pixels, Pixels] = (2048, 1024)
+    bitrate: Annotated[float, Field(ge=0.01, le=10_000)] = 10.0
+    rate: Rate = 30.0
+    fps: Rate = 10.0
+
+
+def encode_video(inputs: Inputs, params: EncodeParams, out: Path, report: Report) -> Done:
+    """`video`, smaller, slower and worse."""
+    file = out / "video.mp4"
+    video = open_video(inputs["video"], fps=params.fps)
+    seconds = encode(video, file, size=params.size, bitrate=params.bitrate, rate=params.rate)
+    facts = {"width": params.size[0], "mbit_s": round(8e-6 * file.stat().st_size / seconds, 4)}
+    return Done({"video": file}, facts)
+
+
+def can_encode(params: Any) -> None:
+    """Raise an UnavailableError where PyAV isn't installed."""
+    need("slam study", "av", "matplotlib")
+
+
+ENCODE = Step("encode", 1, encode_video, EncodeParams, check=can_encode)
