@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import tomli_w
 
-from scan2sim.flows.commands.drive import read_drive
+from scan2sim.flows.recipes.drive import Drive
 from scan2sim.flows.recipes.settings import Settings
 from scan2sim.flows.recipes.steps import STEPS
 from scan2sim.pipeline.io import gps as gps_io
@@ -165,7 +165,7 @@ def telemetry(data: bytes, rng: Random) -> bytes:
 
 def read_drive_file(folder: Path) -> object:
     """The drive."""
-    return read_drive(folder / "drive.toml")
+    return Drive.read(folder / "drive.toml")
 
 
 def read_survey_folder(folder: Path) -> object:
