@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +60,9 @@ STEPS: tuple[Step, ...] = (
 )  # fmt: skip
 
 
+Sources = dict[str, Path | Output]
+
+
 def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None) -> list[Node]:
     """The graph of a tile, each node after those that it reads of the same tile.
 
@@ -73,177 +76,289 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
         SettingError: a setting that doesn't exist or is out of range.
     """
     settings.check(STEPS)
-    nodes: list[Node] = []
+    graph = _Graph(tile, settings, beside)
+    told = graph.classes()
+    graph.parts(graph.whole())
+    made = graph.made_up(told)
+    for group in graph.groups:
+        graph.surface(group, made.get(group, {}))
+    lists = graph.places()
+    surfaces, seen = graph.photos(told, lists)
+    textured = graph.textures(surfaces, seen, made)
+    graph.results(surfaces, textured, seen, lists, made)
+    return graph.nodes
 
-    def at(step: Step, name: str, group: str = "", other: str = tile.name) -> Output:
-        """An output of a node of this tile, or of a neighbour."""
-        return Output(NodeId(step.name, group, "" if beside is None else other), name)
 
-    def add(step: Step, inputs: Mapping[str, Path | Output], group: str = "", **given: Any) -> None:
-        of = "" if beside is None else tile.name
-        nodes.append(Node(step, settings.params(step, group, **given), inputs, group, of))
+class _Graph:
+    """A tile's graph as it grows.
 
-    frame: dict[str, Any] = {"crs": tile.frame.crs, "origin": tile.frame.origin, "unit": tile.frame.unit}
-    files = {f"cloud.{i:04d}": path for i, path in enumerate(tile.clouds)}
-    add(INGEST, files, **frame, classes=dict(tile.classes))
-    path = scanner_path(tile)
-    if path:
-        add(PATH, {}, **path)
-    scanner = {"path": at(PATH, "path")} if path else {}
-    cameras = _rows([view.centre for view in tile.views if view.camera.model != "orthographic"])
-    rays = scanner if tile.trajectory is not None else {}  # cameras aren't where the scanner was
-    add(CARVE, {"cloud": at(INGEST, "cloud")} | rays, cameras=cameras)
-    whole = {"cloud": at(CARVE, "cloud")}
-    moving = {"moving": at(CARVE, "moving")}
-    photos: dict[str, Path | Output] = {f"photo.{i}": view.photo for i, view in enumerate(tile.views)}
-    masks: dict[str, Path | Output] = {f"mask.{i}": view.mask for i, view in enumerate(tile.views) if view.mask}
-    add(VIEWS, photos | masks | whole, poses=tuple(views_io.to_json(view, with_paths=False) for view in tile.views))
-    seen: dict[str, Path | Output] = {"views": at(VIEWS, "views")}
-    photographed = any(view.camera.model != "orthographic" for view in tile.views)
-    if photographed:
-        add(LABEL, whole | seen | _weights(settings), **_kept(settings))
-    told = {**seen, **moving, "labels": at(LABEL, "labels")} if photographed else {}
-    add(SEGMENT, whole | scanner | told)
-    last = SEGMENT  # step whose cloud is split, in every tile of a survey the same
-    cell: dict[str, Any] = {"seed": tile.cell.seed, "neighbours": dict(tile.cell.neighbours)} if tile.cell else {}
-    met = [name for name in cell.get("neighbours", {}) if name in (beside or ())]
-    first = [name for name in met if name < tile.name]  # they own the borders with this one
-    listed: dict[str, Path | Output] = {}
-    if settings.params(THINGS).find and (path or met):
-        classified = {name: at(SEGMENT, name) for name in ("cloud", "confidence")}
-        add(THINGS, classified | moving | scanner)
-        last, listed = THINGS, {"things": at(THINGS, "things")} if path else {}
-    limit = settings.params(REACH).limit
-    if limit != "off" and (met or (path and (photographed or limit != "auto"))):
-        shown = seen if photographed else {}
-        add(REACH, {"cloud": at(last, "cloud")} | scanner | shown, voxel=settings.params(VOXEL, "terrain").size)
-        last = REACH
-    cloud = at(last, "cloud")
-    if met and tile.cell:
-        others = {f"cloud.{name}": at(last, "cloud", other=name) for name in met}
-        add(OVERLAP, {"cloud": cloud} | others, name=tile.name, buffer=tile.cell.buffer, **cell)
-        cloud = at(OVERLAP, "cloud")
-    standing: dict[str, Path | Output] = {}
-    if path and settings.params(FURNITURE).when == "auto":
-        add(FURNITURE, {"cloud": cloud} | scanner, **cell)
-        standing = {name: at(FURNITURE, name) for name in (*GROUPS[1:], "taken", "plates", "geojson", "csv")}
-    kept = listed if settings.params(SPLIT).vehicles == "keep" else {}
-    add(SPLIT, {"cloud": cloud} | kept | {name: standing[name] for name in standing if name == "taken"})
+    Attributes:
+        nodes: so far.
+        cell: parameters of what happens at borders; empty where the tile was cut from nothing.
+        met: neighbours that are made, too, and
+        first: those of them that own the border with this one.
+        photographed: whether there are photos from the ground.
+        scanner: the path, where there is one, and
+        rays: it again where it is the scanner's own, not the cameras'.
+        listed: the things that were found.
+        standing: furniture, by class, and what is known of it.
+        kept: whether vehicles are.
+        groups: classes that get a surface; `parted`: all that the cloud is split into.
+    """
 
-    vegetation = settings.params(SPLIT).vegetation
-    groups = [g for g in GROUPS if g != "vegetation" or vegetation != "locations"]
-    groups += ["vehicle"] if kept else []
-    parted = (*GROUPS, "rest", "vehicle") if kept else (*GROUPS, "rest")
-    for part in parted:
-        add(VOXEL, {"cloud": at(SPLIT, part)} | scanner, part)
-    made: dict[str, dict[str, Path | Output]] = {}  # by group, what no airborne scanner sees
-    around = {"name": tile.name, "buffer": tile.cell.buffer, **cell} if tile.cell else {}
-    for step, group, parts in (
-        (GROUND, "terrain", (*GROUPS, "rest")),
-        (WALLS, "building", ("building", "terrain")),
-    ):
-        when = settings.params(step).when
-        hidden = listed if step is GROUND and when == "auto" else {}
-        if when == "always" or (when == "auto" and not path) or hidden:
-            seen_from_above = {part: at(VOXEL, "cloud", part) for part in parts}
-            theirs = {f"{part}.{name}": at(VOXEL, "cloud", part, name) for part in parts for name in met}
-            below: dict[str, Path | Output] = {}
-            if step is WALLS:
-                below = {"ground": made["terrain"]["made"]} if "terrain" in made else {}
-                below |= {"footprints": tile.footprints} if tile.footprints else {}
-            others = {f"{k}.{name}": at(THINGS, k, other=name) for k in hidden for name in met}
-            add(step, seen_from_above | theirs | below | hidden | others, **around)
-            made[group] = {"made": at(step, "made")}
-    if rays and photographed and settings.params(FACADES).when == "auto" and "building" not in made:
-        shown = {name: told[name] for name in ("views", "labels")}
-        size = settings.params(VOXEL, "building").size
-        beside_it = {f"other.{part}": at(VOXEL, "cloud", part) for part in parted if part != "building"}
-        add(FACADES, {"cloud": at(VOXEL, "cloud", "building")} | beside_it | rays | shown, voxel=size, **cell)
-        made["building"] = {"made": at(FACADES, "made")}
-    for group in groups:
-        cloud, size = at(VOXEL, "cloud", group), settings.params(VOXEL, group).size
-        borne = {"cloud": cloud, **made.get(group, {})}
+    def __init__(self, tile: Tile, settings: Settings, beside: Collection[str] | None) -> None:
+        self.nodes: list[Node] = []
+        self.tile, self.settings = tile, settings
+        self._name = "" if beside is None else tile.name
+        self.cell: dict[str, Any] = {}
+        if tile.cell:
+            self.cell = {"seed": tile.cell.seed, "neighbours": dict(tile.cell.neighbours)}
+        self.met = [name for name in self.cell.get("neighbours", {}) if name in (beside or ())]
+        self.first = [name for name in self.met if name < tile.name]
+        self.photographed = any(view.camera.model != "orthographic" for view in tile.views)
+        self.scanner: Sources = {}
+        self.rays: Sources = {}
+        self.listed: Sources = {}
+        self.standing: Sources = {}
+        self.kept = False
+        self.groups: list[str] = []
+        self.parted: tuple[str, ...] = ()
+
+    def at(self, step: Step, name: str, group: str = "", other: str | None = None) -> Output:
+        """An output of a node of this tile, or of the neighbour `other`."""
+        return Output(NodeId(step.name, group, self._name if other is None else other), name)
+
+    def add(self, step: Step, inputs: Mapping[str, Path | Output], group: str = "", **given: Any) -> None:
+        """One more node."""
+        self.nodes.append(Node(step, self.settings.params(step, group, **given), inputs, group, self._name))
+
+    def of_neighbours(self, step: Step, name: str, group: str = "", prefix: str | None = None) -> Sources:
+        """An output of all neighbours' nodes, by `prefix` (default: its name) and the tile's name."""
+        return {f"{prefix or name}.{tile}": self.at(step, name, group, tile) for tile in self.met}
+
+    def classes(self) -> Sources:
+        """What each point is, by photos and shape; returns what photos tell of points."""
+        tile, at, add = self.tile, self.at, self.add
+        frame: dict[str, Any] = {"crs": tile.frame.crs, "origin": tile.frame.origin, "unit": tile.frame.unit}
+        files = {f"cloud.{i:04d}": path for i, path in enumerate(tile.clouds)}
+        add(INGEST, files, **frame, classes=dict(tile.classes))
+        path = scanner_path(tile)
+        if path:
+            add(PATH, {}, **path)
+            self.scanner = {"path": at(PATH, "path")}
+        self.rays = self.scanner if tile.trajectory is not None else {}  # cameras aren't where the scanner was
+        cameras = _rows([view.centre for view in tile.views if view.camera.model != "orthographic"])
+        add(CARVE, {"cloud": at(INGEST, "cloud")} | self.rays, cameras=cameras)
+        whole: Sources = {"cloud": at(CARVE, "cloud")}
+        photos: Sources = {f"photo.{i}": view.photo for i, view in enumerate(tile.views)}
+        masks: Sources = {f"mask.{i}": view.mask for i, view in enumerate(tile.views) if view.mask}
+        add(VIEWS, photos | masks | whole, poses=tuple(views_io.to_json(view, with_paths=False) for view in tile.views))
+        told: Sources = {}
+        if self.photographed:
+            add(LABEL, whole | self._views() | _weights(self.settings), **_kept(self.settings))
+            told = {**self._views(), **self._moving(), "labels": at(LABEL, "labels")}
+        add(SEGMENT, whole | self.scanner | told)
+        return told
+
+    def _views(self) -> Sources:
+        return {"views": self.at(VIEWS, "views")}
+
+    def _moving(self) -> Sources:
+        return {"moving": self.at(CARVE, "moving")}
+
+    def whole(self) -> Output:
+        """The cloud without what moves or is too far, with what neighbours know of the border; returns it."""
+        at, add = self.at, self.add
+        last = SEGMENT  # step whose cloud is split, in every tile of a survey the same
+        if self.settings.params(THINGS).find and (self.scanner or self.met):
+            classified: Sources = {name: at(SEGMENT, name) for name in ("cloud", "confidence")}
+            add(THINGS, classified | self._moving() | self.scanner)
+            last, self.listed = THINGS, {"things": at(THINGS, "things")} if self.scanner else {}
+        limit = self.settings.params(REACH).limit
+        if limit != "off" and (self.met or (self.scanner and (self.photographed or limit != "auto"))):
+            shown = self._views() if self.photographed else {}
+            size = self.settings.params(VOXEL, "terrain").size
+            add(REACH, {"cloud": at(last, "cloud")} | self.scanner | shown, voxel=size)
+            last = REACH
+        if not (self.met and self.tile.cell):
+            return at(last, "cloud")
+        others = self.of_neighbours(last, "cloud")
+        cell = self.tile.cell
+        add(OVERLAP, {"cloud": at(last, "cloud")} | others, name=self.tile.name, buffer=cell.buffer, **self.cell)
+        return at(OVERLAP, "cloud")
+
+    def parts(self, cloud: Output) -> None:
+        """Furniture taken out, the rest split by class and thinned."""
+        if self.scanner and self.settings.params(FURNITURE).when == "auto":
+            self.add(FURNITURE, {"cloud": cloud} | self.scanner, **self.cell)
+            names = (*GROUPS[1:], "taken", "plates", "geojson", "csv")
+            self.standing = {name: self.at(FURNITURE, name) for name in names}
+        given = self.settings.params(SPLIT)
+        self.kept = given.vehicles == "keep" and bool(self.listed)
+        taken = {name: self.standing[name] for name in self.standing if name == "taken"}
+        self.add(SPLIT, {"cloud": cloud} | (self.listed if self.kept else {}) | taken)
+        vehicle = ("vehicle",) if self.kept else ()
+        self.groups = [g for g in (*GROUPS, *vehicle) if g != "vegetation" or given.vegetation != "locations"]
+        self.parted = (*GROUPS, "rest", *vehicle)
+        for part in self.parted:
+            self.add(VOXEL, {"cloud": self.at(SPLIT, part)} | self.scanner, part)
+
+    def made_up(self, told: Sources) -> dict[str, Sources]:
+        """Points that no scanner saw: ground below what hid it, walls below roofs and above its reach; by class."""
+        made: dict[str, Sources] = {}
+        when = self.settings.params(GROUND).when
+        hidden = self.listed if when == "auto" else {}
+        if hidden or self._from_above(when):
+            others: Sources = {}
+            for name in hidden:
+                others |= self.of_neighbours(THINGS, name)
+            made["terrain"] = self._make_up(GROUND, (*GROUPS, "rest"), {**hidden, **others})
+        if self._from_above(self.settings.params(WALLS).when):
+            below: Sources = {"ground": made["terrain"]["made"]} if "terrain" in made else {}
+            below |= {"footprints": self.tile.footprints} if self.tile.footprints else {}
+            made["building"] = self._make_up(WALLS, ("building", "terrain"), below)
+        if self.rays and self.photographed and "building" not in made and self.settings.params(FACADES).when == "auto":
+            shown = {name: told[name] for name in ("views", "labels")}
+            size = self.settings.params(VOXEL, "building").size
+            clouds = {"cloud": self.at(VOXEL, "cloud", "building")} | self._beside("building")
+            self.add(FACADES, clouds | self.rays | shown, voxel=size, **self.cell)
+            made["building"] = {"made": self.at(FACADES, "made")}
+        return made
+
+    def _from_above(self, when: str) -> bool:
+        """Whether a step for airborne clouds is to run."""
+        return when == "always" or (when == "auto" and not self.scanner)
+
+    def _make_up(self, step: Step, parts: Sequence[str], more: Sources) -> Sources:
+        """What a step makes up of the voxels of some classes, the neighbours' among them."""
+        inputs: Sources = {part: self.at(VOXEL, "cloud", part) for part in parts}
+        for part in parts:
+            inputs |= self.of_neighbours(VOXEL, "cloud", part, prefix=part)
+        cell = self.tile.cell
+        around = {"name": self.tile.name, "buffer": cell.buffer, **self.cell} if cell else {}
+        self.add(step, inputs | more, **around)
+        return {"made": self.at(step, "made")}
+
+    def _beside(self, group: str) -> Sources:
+        """The voxels of all other classes."""
+        return {f"other.{part}": self.at(VOXEL, "cloud", part) for part in self.parted if part != group}
+
+    def surface(self, group: str, made: Sources) -> None:
+        """A class's mesh: reconstructed, trimmed, straightened, met with the neighbours', decimated."""
+        at, add, cell = self.at, self.add, self.cell
+        cloud, size = at(VOXEL, "cloud", group), self.settings.params(VOXEL, group).size
+        borne: Sources = {"cloud": cloud, **made}
         add(POISSON, borne, group, voxel=size, aligned=bool(cell))
         add(TRIM, {"mesh": at(POISSON, "mesh", group), **borne}, group, voxel=size)
         surface = at(TRIM, "mesh", group)
-        when = settings.params(PLANES).when
-        if group == "building" and (when == "always" or (when == "auto" and path)):
-            others = {f"other.{part}": at(VOXEL, "cloud", part) for part in parted if part != group}
-            points = {"cloud": cloud, "points": at(SPLIT, group)}
-            add(PLANES, {"mesh": surface, **points, **others, **made.get(group, {})}, voxel=size, **cell)
+        when = self.settings.params(PLANES).when
+        if group == "building" and (when == "always" or (when == "auto" and self.scanner)):
+            points = {**borne, "points": at(SPLIT, group)}
+            add(PLANES, {"mesh": surface, **points, **self._beside(group)}, voxel=size, **cell)
             surface = at(PLANES, "mesh")
         add(ISLANDS, {"mesh": surface}, group)
         surface = at(ISLANDS, "mesh", group)
         if cell:
             add(CLIP, {"mesh": surface}, group, **cell)
-            clipped = {"mesh": at(CLIP, "mesh", group), "on": at(CLIP, "on", group)}
-            surface = clipped["mesh"]
-        if met:
-            others = {f"{k}.{name}": at(CLIP, k, group, name) for name in first for k in clipped}
-            add(JOIN, clipped | others, group, name=tile.name, **cell)
+            surface = at(CLIP, "mesh", group)
+        if self.met:
+            clipped = {name: at(CLIP, name, group) for name in ("mesh", "on")}
+            others = {f"{name}.{tile}": at(CLIP, name, group, tile) for tile in self.first for name in clipped}
+            add(JOIN, clipped | others, group, name=self.tile.name, **cell)
             surface = at(JOIN, "mesh", group)
-        things = {"furniture": standing[group]} if group in standing else {}
+        things = {"furniture": self.standing[group]} if group in self.standing else {}
         add(DECIMATE, {"mesh": surface, **things}, group, keep_border=bool(cell))
-    surfaces: dict[str, Path | Output] = {g: at(DECIMATE, "mesh", g) for g in groups}
-    meshes = {f"mesh.{g}": surfaces[g] for g in groups}
-    clouds = {f"cloud.{part}": at(VOXEL, "cloud", part) for part in parted}
-    own = {"cloud.furniture": at(SPLIT, "furniture")} if standing else {}
-    invented = {f"made.{group}": points["made"] for group, points in made.items()}
-    lists: dict[str, Path | Output] = {}
-    if standing:
-        lists = {"furniture": standing["geojson"], "furniture_csv": standing["csv"]}
-    if vegetation != "mesh":
-        add(PLANTS, {name: at(VOXEL, "cloud", name) for name in ("vegetation", "terrain")}, **cell)
-        lists |= {"plants": at(PLANTS, "geojson"), "plants_csv": at(PLANTS, "csv")}
 
-    if photographed and settings.params(REFINE).when == "auto":
-        add(REFINE, meshes | {"cloud.rest": clouds["cloud.rest"]} | moving | seen)
-        seen = {"views": at(REFINE, "views")}
-    if photographed and standing and settings.params(SIGNS).when == "auto":
-        plates = {name: standing[name] for name in ("plates", "geojson")}
-        add(SIGNS, meshes | plates | seen | {"labels": at(LABEL, "labels")}, **cell)
-        surfaces |= {g: at(SIGNS, g) for g in groups if g in ("building", "vegetation")}
-        meshes = {f"mesh.{g}": surfaces[g] for g in groups}
-        lists |= {"furniture": at(SIGNS, "geojson"), "furniture_csv": at(SIGNS, "csv")}
-    add(VISIBILITY, meshes | clouds | moving | seen)
-    seen = seen | {"depth": at(VISIBILITY, "depth")}
-    prior = settings.params(EXPOSURE).prior
-    add(EXPOSURE, seen | ({"prior": Path(prior)} if prior else {}))
-    seen = seen | {"exposures": at(EXPOSURE, "exposures")}
-    add(AGREEMENT, seen)
-    seen = seen | {"agreement": at(AGREEMENT, "agreement")}
-    for group in groups:
-        mesh = {"mesh": surfaces[group]}
-        add(CHOOSE, mesh | seen, group)
-        choice = {"choice": at(CHOOSE, "choice", group)}
-        by_photo = {**choice, **seen} if settings.params(UNWRAP, group).backend == "photo" else {}
-        add(UNWRAP, mesh | by_photo, group)
-        unwrapped = {name: at(UNWRAP, name, group) for name in ("mesh", "pages")}
-        stood = listed if group == "terrain" and not kept else {}
-        add(TEXTURE, {**unwrapped, **choice, **clouds, **own, **invented, **seen, **stood}, group)
-    textured: dict[str, Path | Output] = {g: at(TEXTURE, "textured", g) for g in groups}
-    for group in groups if met else ():
-        others = {f"neighbour.{name}": at(TEXTURE, "textured", group, name) for name in met}
-        add(LEVEL, {"textured": textured[group]} | others, group)
-        textured[group] = at(LEVEL, "textured", group)
-    add(COLLISION, surfaces, keep_border=bool(cell))
-    add(EXPORT, textured | lists | listed | {"collision": at(COLLISION, "mesh")}, name=tile.name)
-    if settings.params(EXPORT).rasters:
-        add(RASTERS, textured, name=tile.name, **_fineness(settings))
+    def places(self) -> Sources:
+        """Lists of what stands where, for the export."""
+        lists: Sources = {}
+        if self.standing:
+            lists = {"furniture": self.standing["geojson"], "furniture_csv": self.standing["csv"]}
+        if self.settings.params(SPLIT).vegetation != "mesh":
+            clouds = {name: self.at(VOXEL, "cloud", name) for name in ("vegetation", "terrain")}
+            self.add(PLANTS, clouds, **self.cell)
+            lists |= {"plants": self.at(PLANTS, "geojson"), "plants_csv": self.at(PLANTS, "csv")}
+        return lists
 
-    truth: dict[str, Path | Output] = {}
-    if tile.truth_mesh and tile.truth_points:
-        truth = {"truth.mesh": tile.truth_mesh, "truth.points": tile.truth_points}
-    add(GEOMETRY, meshes | clouds | invented | truth, **cell)
-    add(SCORE, textured | {name: seen[name] for name in ("views", "depth")} | listed | truth)
-    stages = {f"decimate.{g}": at(DECIMATE, "mesh", g) for g in groups}
-    if met:
-        mine = {f"textured.{g}": at(LEVEL, "textured", g) for g in groups}
-        theirs = {f"textured.{g}.{n}": at(LEVEL, "textured", g, n) for g in groups for n in first}
-        add(BORDERS, mine | theirs, **cell)
-    add(PREVIEW, textured | scanner)
-    add(PICTURES, textured | stages | clouds | {"views": seen["views"]} | scanner)
-    return nodes
+    def photos(self, told: Sources, lists: Sources) -> tuple[Sources, Sources]:
+        """What photos see of the meshes, and how well they agree; signs are fitted to them, and listed in `lists`.
+
+        Returns:
+            The final mesh of each class, and what is known of the photos.
+        """
+        at, add = self.at, self.add
+        surfaces: Sources = {group: at(DECIMATE, "mesh", group) for group in self.groups}
+        seen, clouds = self._views(), self._clouds()
+        if self.photographed and self.settings.params(REFINE).when == "auto":
+            add(REFINE, _meshes(surfaces) | {"cloud.rest": clouds["cloud.rest"]} | self._moving() | seen)
+            seen = {"views": at(REFINE, "views")}
+        if self.photographed and self.standing and self.settings.params(SIGNS).when == "auto":
+            plates = {name: self.standing[name] for name in ("plates", "geojson")}
+            add(SIGNS, _meshes(surfaces) | plates | seen | {"labels": told["labels"]}, **self.cell)
+            surfaces |= {group: at(SIGNS, group) for group in self.groups if group in ("building", "vegetation")}
+            lists |= {"furniture": at(SIGNS, "geojson"), "furniture_csv": at(SIGNS, "csv")}
+        add(VISIBILITY, _meshes(surfaces) | clouds | self._moving() | seen)
+        seen = {**seen, "depth": at(VISIBILITY, "depth")}
+        prior = self.settings.params(EXPOSURE).prior
+        add(EXPOSURE, seen | ({"prior": Path(prior)} if prior else {}))
+        seen = {**seen, "exposures": at(EXPOSURE, "exposures")}
+        add(AGREEMENT, seen)
+        return surfaces, {**seen, "agreement": at(AGREEMENT, "agreement")}
+
+    def _clouds(self) -> Sources:
+        return {f"cloud.{part}": self.at(VOXEL, "cloud", part) for part in self.parted}
+
+    def textures(self, surfaces: Sources, seen: Sources, made: Mapping[str, Sources]) -> Sources:
+        """Each class's mesh with its pages, in the neighbours' colours at borders."""
+        at, add = self.at, self.add
+        own: Sources = {"cloud.furniture": at(SPLIT, "furniture")} if self.standing else {}
+        points = self._clouds() | own | _invented(made)
+        for group in self.groups:
+            mesh = {"mesh": surfaces[group]}
+            add(CHOOSE, mesh | seen, group)
+            choice = {"choice": at(CHOOSE, "choice", group)}
+            by_photo = {**choice, **seen} if self.settings.params(UNWRAP, group).backend == "photo" else {}
+            add(UNWRAP, mesh | by_photo, group)
+            unwrapped = {name: at(UNWRAP, name, group) for name in ("mesh", "pages")}
+            stood = self.listed if group == "terrain" and not self.kept else {}
+            add(TEXTURE, {**unwrapped, **choice, **points, **seen, **stood}, group)
+        last = TEXTURE
+        if self.met:
+            last = LEVEL
+            for group in self.groups:
+                others = self.of_neighbours(TEXTURE, "textured", group, prefix="neighbour")
+                add(LEVEL, {"textured": at(TEXTURE, "textured", group)} | others, group)
+        return {group: at(last, "textured", group) for group in self.groups}
+
+    def results(
+        self, surfaces: Sources, textured: Sources, seen: Sources, lists: Sources, made: Mapping[str, Sources]
+    ) -> None:
+        """What users get: the world, maps, figures and pictures."""
+        at, add, tile = self.at, self.add, self.tile
+        add(COLLISION, surfaces, keep_border=bool(self.cell))
+        add(EXPORT, textured | lists | self.listed | {"collision": at(COLLISION, "mesh")}, name=tile.name)
+        if self.settings.params(EXPORT).rasters:
+            add(RASTERS, textured, name=tile.name, **_fineness(self.settings))
+        truth: Sources = {}
+        if tile.truth_mesh and tile.truth_points:
+            truth = {"truth.mesh": tile.truth_mesh, "truth.points": tile.truth_points}
+        add(GEOMETRY, _meshes(surfaces) | self._clouds() | _invented(made) | truth, **self.cell)
+        add(SCORE, textured | {name: seen[name] for name in ("views", "depth")} | self.listed | truth)
+        if self.met:
+            mine = {f"textured.{g}": at(LEVEL, "textured", g) for g in self.groups}
+            theirs = {f"textured.{g}.{n}": at(LEVEL, "textured", g, n) for g in self.groups for n in self.first}
+            add(BORDERS, mine | theirs, **self.cell)
+        add(PREVIEW, textured | self.scanner)
+        stages = {f"decimate.{g}": at(DECIMATE, "mesh", g) for g in self.groups}
+        add(PICTURES, textured | stages | self._clouds() | {"views": seen["views"]} | self.scanner)
+
+
+def _meshes(surfaces: Sources) -> Sources:
+    return {f"mesh.{group}": mesh for group, mesh in surfaces.items()}
+
+
+def _invented(made: Mapping[str, Sources]) -> Sources:
+    return {f"made.{group}": points["made"] for group, points in made.items()}
 
 
 def check_here(settings: Settings) -> None:
