@@ -58,7 +58,7 @@ def carved(cloud: PointCloud, path: Trajectory) -> tuple[Bools, float, dict[str,
 
 def dufomap(cloud: PointCloud, path: Trajectory) -> tuple[Bools, float]:
     """The same of DUFOMap, with its authors' settings, from the scanner's place in the middle of each window."""
-    from dufomap import dufomap as peer  # type: ignore[import-not-found]
+    from dufomap import dufomap as peer
 
     assert cloud.time is not None
     begin = time.perf_counter()

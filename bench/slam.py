@@ -189,13 +189,13 @@ def pano() -> None:
         for f in sorted(folder.glob("2019*.jpg"))
     )
     charts, rng = Charts(Camera("equirectangular", 1024, 512)), np.random.default_rng(0)
-    a, b = (describe(charts, charts.pictures(grey)) for grey in (first, second))  # type: ignore[arg-type]
+    a, b = (describe(charts, charts.pictures(grey)) for grey in (first, second))
     pairs = matches(a.descriptor, b.descriptor)
     tracker = named("corners", charts, None, 600)
-    tracker.look(first)  # type: ignore[arg-type]
+    tracker.look(first)
     tracker.refill()
     before = tracker.tracks
-    tracker.look(second)  # type: ignore[arg-type]
+    tracker.look(second)
     followed = np.searchsorted(before.ids, tracker.tracks.ids)
     for kind, there, now in (
         ("ORB", a.bearing[pairs[:, 0]], b.bearing[pairs[:, 1]]),

@@ -272,7 +272,7 @@ def lay_out(length: float, seed: int, style: Style | None = None) -> Layout:
     zebra = length * rng.uniform(0.52, 0.7) if length >= 18 else -100.0
     kerb = {side: lane + (Layout.BAY if side == parking else 0.0) for side in (1, -1)}
     garden = {side: k + style.pavement for side, k in kerb.items()}
-    houses = [h for side in (1, -1) for h in _houses(rng, style, length, side, garden[side])]  # type: ignore[arg-type]
+    houses = [h for side in (1, -1) for h in _houses(rng, style, length, side, garden[side])]
     trees = _trees(rng, style, length, kerb, garden, houses, zebra)
     return Layout(
         axis=axis,

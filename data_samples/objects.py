@@ -42,7 +42,7 @@ def eaves(plan: House) -> float:
 
 
 def _window_paint(plan: House, rng: np.random.Generator) -> Paint:
-    return Paint(Material.WINDOW, tuple(np.array(plan.trim) * 1.05), paints.BUILDING, int(rng.integers(1 << 20)))  # type: ignore[arg-type]
+    return Paint(Material.WINDOW, tuple(np.array(plan.trim) * 1.05), paints.BUILDING, int(rng.integers(1 << 20)))
 
 
 def _windows(plan: House, width: float, rng: np.random.Generator, columns: int, first: int = 0) -> list[Opening]:
@@ -240,7 +240,7 @@ def _foliage(
     per_m2: float,
 ) -> list[Part]:
     """Dark blobs, and leaves on their skin where no other blob covers it."""
-    inner = Paint(Material.FOLIAGE, tuple(0.75 * np.array(plan.colour)), label, plan.seed)  # type: ignore[arg-type]
+    inner = Paint(Material.FOLIAGE, tuple(0.75 * np.array(plan.colour)), label, plan.seed)
     parts, points, outward = [], [], []
     for i, (centre, radius) in enumerate(zip(centres, radii, strict=True)):
         parts.append(
@@ -310,7 +310,7 @@ def boundary(plan: Boundary, length: float) -> Part:
         for x in np.append(np.arange(0, length, 2.0), length - 0.1):
             parts.append(box((x, 0.02, -0.6), (x + 0.1, 0.12, 1.12), wood))
         return join(parts)
-    iron = Paint(Material.PLAIN, tuple(0.6 * np.array(plan.colour)), paints.WALL, plan.seed)  # type: ignore[arg-type]
+    iron = Paint(Material.PLAIN, tuple(0.6 * np.array(plan.colour)), paints.WALL, plan.seed)
     stone = Paint(Material.STONE, linear("#9c958a"), paints.WALL, plan.seed)
     parts = [box((0, -0.14, -0.8), (length, 0.14, 0.35), stone)]
     parts += [box((0, -0.02, z), (length, 0.02, z + 0.04), iron, bottom=True) for z in (0.48, 1.15)]
@@ -346,7 +346,7 @@ def _hedge(plan: Boundary, length: float, rng: np.random.Generator) -> Part:
     xyz[..., 0], xyz[..., 1], xyz[..., 2] = x, profile[:, :1], profile[:, 1:]
     wobble = waves(rng, 0.4)(xyz)[..., None]
     xyz[..., 1:] += wobble * 0.035 * np.sign(np.array([profile[:, 0], profile[:, 1] - 0.3]).T)[:, None]
-    inner = Paint(Material.FOLIAGE, tuple(0.7 * np.array(plan.colour)), paints.BUSH, plan.seed)  # type: ignore[arg-type]
+    inner = Paint(Material.FOLIAGE, tuple(0.7 * np.array(plan.colour)), paints.BUSH, plan.seed)
     side = sheet(xyz, np.stack([xyz[..., 0], xyz[..., 1] + xyz[..., 2]], axis=-1), inner)
     parts = [side]
     for end, way in ((0, 1), (-1, -1)):

@@ -19,7 +19,8 @@ from pathlib import Path
 import numpy as np
 
 from scan2sim.data_samples import paints
-from scan2sim.data_samples.layout import RGB, Layout, Style, lay_out
+from scan2sim.data_samples.layout import Layout, Style, lay_out
+from scan2sim.data_samples.paints import RGB
 from scan2sim.data_samples.photos import Effects, Rendering, develop, directions, render
 from scan2sim.data_samples.scanner import Drive, plan_drive
 from scan2sim.data_samples.scene import Scene

@@ -304,7 +304,7 @@ def _mean(colours: U8, hit: npt.NDArray[np.bool_], centre: U8) -> U8:
 def _tensor(array: npt.NDArray[Any]) -> Any:
     import open3d as o3d
 
-    return o3d.core.Tensor(np.ascontiguousarray(array))  # type: ignore[call-overload]  # its stubs know no typed arrays
+    return o3d.core.Tensor(np.ascontiguousarray(array))  # its stubs know no typed arrays
 
 
 def _read(path: Path) -> tuple[U8, U8 | None]:

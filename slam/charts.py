@@ -65,7 +65,7 @@ class Charts:
 
         band = cv2.copyMakeBorder(grey[self._rows[0] : self._rows[1]], 0, 0, self._pad, self._pad, cv2.BORDER_WRAP)
         caps = [cv2.remap(grey, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP) for maps in self._maps]
-        return [band, *caps]  # type: ignore[list-item]
+        return [band, *caps]
 
     def place(self, bearing: F64) -> I32:
         """(N,) the chart in which each of (N, 3) unit bearings is to be followed."""

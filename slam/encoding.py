@@ -83,7 +83,7 @@ def _of_picture(path: Path, size: tuple[int, int]) -> U8:
     if rgb is None:
         raise InputError(path, "is no readable picture", "Copy it again, or take it out of the folder")
     small = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
-    return cv2.cvtColor(small, cv2.COLOR_RGB2YUV_I420)  # type: ignore[return-value]
+    return cv2.cvtColor(small, cv2.COLOR_RGB2YUV_I420)
 
 
 def _planar(y: U8, u: U8, v: U8, size: tuple[int, int]) -> U8:

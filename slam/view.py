@@ -72,7 +72,7 @@ class Recorder:
             self._encoder = Encoder(
                 self._part, size, self._rate, container=options, preset="ultrafast", crf="25", g=f"{4 * self._rate:.0f}"
             )
-        self._encoder.add(cv2.cvtColor(picture, cv2.COLOR_BGR2YUV_I420), self._written / self._rate)  # type: ignore[arg-type]
+        self._encoder.add(cv2.cvtColor(picture, cv2.COLOR_BGR2YUV_I420), self._written / self._rate)
         self._written += 1
 
     def close(self) -> None:

@@ -62,7 +62,8 @@ class TorchRows:
         which[~self._flat_enough] = -1
         mine = torch.nonzero(which[self._face] >= 0).ravel()
         shares, photo = self._to(share).double(), Sampled(look, self._to)
-        return sum(self._add(part, which, shares, photo, look, weighing) for part in mine.split(CHUNK))
+        seen = [self._add(part, which, shares, photo, look, weighing) for part in torch.split(mine, CHUNK)]
+        return sum(seen)
 
     def resolve(self, rgb: U8, seen: U8) -> None:
         """Weighted means of both sums, added, into `rgb` (H, W, 3); `seen` is 255 where there is one."""

@@ -268,7 +268,7 @@ def _through_plane(eye_a, u, v, place, normal, eye_b):  # type: ignore[no-untype
     if not t > 0:
         return 0.0, 0.0, False
     x, y, z = to_camera(eye_b.T, x * t, y * t, z * t)
-    return project_point(eye_b.model, eye_b.p, x, y, z)  # type: ignore[no-any-return]
+    return project_point(eye_b.model, eye_b.p, x, y, z)
 
 
 @njit(cache=True)

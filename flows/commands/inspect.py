@@ -84,7 +84,7 @@ def _cloud(path: Path) -> tuple[str, Facts]:
 
     header = clouds.read_header(path)
     low = tuple(np.floor(header.low).tolist())
-    cloud = clouds.read(path, Frame(origin=low))  # type: ignore[arg-type]
+    cloud = clouds.read(path, Frame(origin=low))
     area = float(np.prod(np.maximum((header.high - header.low)[:2], 1e-3)))
     facts = [
         ("points", f"{header.count:,}"),

@@ -111,6 +111,6 @@ def _results(
 
 def _numbers(option: str, text: str, kind: type[T]) -> list[T]:
     try:
-        return [kind(part) for part in text.split(",")]  # type: ignore[call-arg]
+        return [kind(part) for part in text.split(",")]
     except ValueError:
         raise SettingError(option, f"`{text}` isn't a list of numbers", "Write 512,1024") from None

@@ -6,7 +6,8 @@ from typing import Any
 
 import scan2sim.flows.deployed.prefect_settings  # noqa: F401  # isort: skip  # before prefect
 from prefect import flow, get_run_logger
-from prefect.states import Completed, State
+from prefect.client.schemas.objects import State
+from prefect.states import Completed
 
 from scan2sim.flows.commands.drive import survey_of
 from scan2sim.flows.commands.survey import changes

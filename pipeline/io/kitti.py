@@ -26,7 +26,6 @@ from scan2sim.pipeline.io import crs as crs_io
 from scan2sim.pipeline.io import files
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.importing import place, tile_folder
-from scan2sim.pipeline.io.merging import GREY as GREY
 from scan2sim.pipeline.io.merging import borrow_colours, colour, phase_of, read_bin
 from scan2sim.pipeline.io.tile import tile_name, write_tile
 from scan2sim.pipeline.poses import interpolate, nearest_rotation

@@ -9,8 +9,7 @@ import numpy.typing as npt
 
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.io.image import read_rgb
-from scan2sim.pipeline.types import F32, F64, U8, Camera
-from scan2sim.pipeline.types import UNCOLOURED as GREY
+from scan2sim.pipeline.types import F32, F64, U8, UNCOLOURED, Camera
 
 Bools = npt.NDArray[np.bool_]
 
@@ -111,7 +110,7 @@ def borrow_colours(xyz: F32, rgb: U8, seen: Bools, distance: F32) -> U8:
     from scipy.spatial import cKDTree
 
     out = rgb.copy()
-    out[~seen] = GREY
+    out[~seen] = UNCOLOURED
     index = np.flatnonzero(seen)
     if len(index) in (0, len(xyz)):
         return out

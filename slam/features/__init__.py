@@ -94,7 +94,7 @@ def enlarged(picture: U8, mask: U8 | None, times: int) -> tuple[U8, U8 | None]:
         return picture, mask
     size = (picture.shape[1] * times, picture.shape[0] * times)
     large = cv2.resize(picture, size, interpolation=cv2.INTER_LINEAR)
-    return large, None if mask is None else cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST)  # type: ignore[return-value]
+    return large, None if mask is None else cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST)
 
 
 def unmasked(found: Found, mask: U8 | None) -> Found:

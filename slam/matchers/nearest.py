@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -46,7 +47,7 @@ class Nearest:
         return f"nearest descriptors, ratio {self.ratio}"
 
 
-def _nearest(a: npt.NDArray, b: npt.NDArray, ratio: float) -> tuple[I64, npt.NDArray[np.bool_]]:
+def _nearest(a: npt.NDArray[Any], b: npt.NDArray[Any], ratio: float) -> tuple[I64, npt.NDArray[np.bool_]]:
     """(N,) the row of b nearest to each of a, and whether the second nearest is clearly farther."""
     if a.dtype == np.uint8:
         import cv2

@@ -10,11 +10,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import numpy.typing as npt
 from numba import njit
 
-from scan2sim.pipeline.types import F64
+from scan2sim.pipeline.types import F64, I32
 from scan2sim.slam.geometry import exp_so3
-from scan2sim.slam.graph import Graph, Solution
+from scan2sim.slam.graph import Factor, Graph, Solution
+
+I64 = npt.NDArray[np.int64]
 
 ITERATIONS = 8
 ENOUGH = 1e-4
@@ -54,7 +57,7 @@ def solve(graph: Graph, *, iterations: int | None = None, points: bool = True, c
     return Solution(poses, xyz, shared, known)
 
 
-def _covariance(graph: Graph, poses: F64, xyz: F64, shared: F64, free, starts, size: int) -> F64:  # type: ignore[no-untyped-def]
+def _covariance(graph: Graph, poses: F64, xyz: F64, shared: F64, free: I64, starts: I64, size: int) -> F64:
     H, g, V, gp, W = _normal(graph, poses, xyz, shared, free, starts, size, True)
     out = np.zeros((len(poses), 6, 6))
     if not size:
@@ -90,7 +93,9 @@ def _cost(graph: Graph, poses: F64, xyz: F64, shared: F64) -> float:
     return float(total)
 
 
-def _normal(graph, poses, xyz, shared, free, starts, size, points):  # type: ignore[no-untyped-def]
+def _normal(
+    graph: Graph, poses: F64, xyz: F64, shared: F64, free: I64, starts: I64, size: int, points: bool
+) -> tuple[F64, F64, F64, F64, F64]:
     """Normal equations: H, g of cameras and shared parameters; V, gp of points; W between."""
     H, g, V, gp, W = _accumulate(
         poses, xyz, starts, graph.camera_of, graph.bearing, graph.bend, shared, free, size, graph.sigma
@@ -116,7 +121,7 @@ def _normal(graph, poses, xyz, shared, free, starts, size, points):  # type: ign
     return H, g, V, gp, W
 
 
-def _numeric(factor, poses, free, size):  # type: ignore[no-untyped-def]
+def _numeric(factor: Factor, poses: F64, free: I64, size: int) -> tuple[F64, F64]:
     """Jacobian of a user's factor by central differences, and its residual."""
     mine = [poses[c] for c in factor.cameras]
     residual = np.atleast_1d(np.asarray(factor.residual(*mine, factor.measured), np.float64))
@@ -135,7 +140,19 @@ def _numeric(factor, poses, free, size):  # type: ignore[no-untyped-def]
     return J, residual
 
 
-def _step(H, g, V, gp, W, graph, free, starts, size, damping, points):  # type: ignore[no-untyped-def]
+def _step(
+    H: F64,
+    g: F64,
+    V: F64,
+    gp: F64,
+    W: F64,
+    graph: Graph,
+    free: I64,
+    starts: I64,
+    size: int,
+    damping: float,
+    points: bool,
+) -> tuple[F64, F64]:
     """Change of cameras and shared parameters (size,), and of points (P, 3)."""
     from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
@@ -157,7 +174,9 @@ def _step(H, g, V, gp, W, graph, free, starts, size, damping, points):  # type: 
     return step, _back(step, V, gp, W, starts, graph.camera_of, free, graph.bend.shape[1], damping)
 
 
-def _reduce(H, g, V, gp, W, starts, camera_of, free, n_shared, damping):  # type: ignore[no-untyped-def]
+def _reduce(
+    H: F64, g: F64, V: F64, gp: F64, W: F64, starts: I64, camera_of: I32, free: I64, n_shared: int, damping: float
+) -> tuple[F64, F64]:
     less, less_g = _schur(V, gp, W, starts, camera_of, free, n_shared, len(g), damping)
     return H - less, g - less_g
 

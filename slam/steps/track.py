@@ -147,7 +147,7 @@ def read_mask(video: Video, path: Path | None) -> U8 | None:
     rgb = image.read_rgb(path) if path.is_file() else None
     if rgb is None:
         raise InputError(path, "is no readable picture", "Give a mask: 0 where the car itself is seen")
-    return cv2.resize(rgb[..., 0], (video.width, video.height), interpolation=cv2.INTER_NEAREST)  # type: ignore[return-value]
+    return cv2.resize(rgb[..., 0], (video.width, video.height), interpolation=cv2.INTER_NEAREST)
 
 
 def tracker_of(camera: Camera, mask: U8 | None, params: TrackParams, inputs: Inputs) -> tuple[Tracker, str]:

@@ -8,6 +8,7 @@ is made. Charts overlap: a feature that moves from one into another is matched i
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -38,7 +39,7 @@ class SeenInChart:
     found: Found
     ids: I64
 
-    def add(self, uv: F32, descriptors: npt.NDArray, ids: I64) -> None:
+    def add(self, uv: F32, descriptors: npt.NDArray[Any], ids: I64) -> None:
         """Features (M, 2) that weren't found here."""
         f = self.found
         scores = np.full(len(ids), f.scores.min(initial=1.0), np.float32)
@@ -102,7 +103,7 @@ class DescriptorTracker(CornerTracker):
             return 0.0
         expected = tracks.bearing if expected is None else expected
         bearing = np.full_like(tracks.bearing, np.nan)
-        known: dict[int, npt.NDArray] = {}  # rows of tracks to their descriptors
+        known: dict[int, npt.NDArray[Any]] = {}  # rows of tracks to their descriptors
         row_of = {int(track): row for row, track in enumerate(tracks.ids)}
         for chart, was in enumerate(before):
             at = np.array([row_of.get(int(track), -1) for track in was.ids], np.int64)
@@ -186,7 +187,7 @@ class DescriptorTracker(CornerTracker):
             good[good] = self._masks[chart][at[:, 1], at[:, 0]] > 0
         return there, good
 
-    def _settle(self, descriptors: list[npt.NDArray]) -> None:
+    def _settle(self, descriptors: list[npt.NDArray[Any]]) -> None:
         """Every track is a feature of the chart where it goes on: the one it was matched with, or one that is there.
 
         Where there is none, the track's last descriptor is taken on.

@@ -14,8 +14,10 @@ from scipy.spatial.transform import Rotation
 from scan2sim.pipeline.cameras import project
 from scan2sim.pipeline.errors import InputError, SettingError
 from scan2sim.pipeline.io import clouds
-from scan2sim.pipeline.io.kitti import GREY, borrow_colours, import_kitti_raw
+from scan2sim.pipeline.io.kitti import import_kitti_raw
+from scan2sim.pipeline.io.merging import borrow_colours
 from scan2sim.pipeline.io.tile import read_tile
+from scan2sim.pipeline.types import UNCOLOURED as GREY
 
 FRAMES, PERIOD, SPEED, LATE = 4, 0.1, 11.0, 0.01
 YAW = 0.4  # against true east

@@ -16,9 +16,9 @@ from scan2sim.flows.cli import app
 from scan2sim.pipeline.cameras import project
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.io import clouds
-from scan2sim.pipeline.io.kitti import GREY
 from scan2sim.pipeline.io.kitti_odometry import import_kitti_odometry
 from scan2sim.pipeline.io.tile import read_tile
+from scan2sim.pipeline.types import UNCOLOURED as GREY
 
 FRAMES, WIDTH, HEIGHT = 4, 600, 300
 AXES = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])  # scanner to camera
