@@ -19,7 +19,6 @@ class Numbers(Params):
     cores: Annotated[int, Field(ge=1, le=1024)] | None = None
     length: Length | None = None
     buffer: Buffer | None = None
-    reach: Annotated[float, Field(ge=1, le=10_000)] | None = None
     points: Annotated[float, Field(ge=1000, le=1e9)] | None = None
     photos: Annotated[int, Field(ge=0, le=10_000)] | None = None
     seed: Seed | None = None

@@ -160,5 +160,5 @@ def parsed_crs(header: Any) -> Any:
 
     try:
         return header.parse_crs()
-    except (CRSError, NotImplementedError) as error:
+    except (CRSError, NotImplementedError) as error:  # the latter is laspy's, of keys that it can't read
         raise ValueError(str(error)) from error
