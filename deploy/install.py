@@ -11,6 +11,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import NoReturn
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
@@ -73,7 +74,7 @@ def install_project(extra: "str | None") -> None:
     subprocess.run([*pip, "-c", str(ROOT / "constraints.txt"), "-e", project], check=True)
 
 
-def stop(*lines: str) -> None:
+def stop(*lines: str) -> NoReturn:
     """End with lines on standard error."""
     sys.exit("\n".join(lines))
 

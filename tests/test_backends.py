@@ -183,5 +183,5 @@ def write(path, surface, look):
 
     world = made_up.world(tmp_path, formats=("obj", "off")).files["world"]
     folder = world / "models" / "street" / "meshes"
-    assert len(trimesh.load(folder / "terrain.off", process=False).faces) == len(made_up.ground())
+    assert len(trimesh.load_mesh(folder / "terrain.off", process=False).faces) == len(made_up.ground())
     assert (folder / "terrain.obj").is_file() and not (folder / "terrain.dae").exists()

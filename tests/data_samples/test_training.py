@@ -38,7 +38,7 @@ def test_streets_of_training_have_every_class_and_no_two_are_alike() -> None:
         labels.append(np.bincount(scene.surface.label, minlength=256))
         world = scene.truth_mesh().label
         assert world is not None and CODE["person"] not in world, "people are no part of a world"
-    found = {name for name in CLASSES if name != "sky" and sum(labels)[CODE[name]] > 0}
+    found = {name for name in CLASSES if name != "sky" and np.sum(labels, axis=0)[CODE[name]] > 0}
     assert found == set(CLASSES) - {"sky"}
     assert (labels[0] != labels[1]).any()
 

@@ -14,7 +14,7 @@ from scan2sim.flows.commands import display
 def test_a_long_message_takes_none_of_the_bars_room(width: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(display, "console", Console(file=io.StringIO(), width=width, force_terminal=True))
     bars = display._progress()
-    bars.add_task("poisson.vegetation", total=1.0, completed=1.0, message="photos/panorama_000123.jpg " * 9)
+    bars.add_task("poisson.vegetation", total=1, completed=1, message="photos/panorama_000123.jpg " * 9)
     shown = Console(file=io.StringIO(), width=width)
     shown.print(bars.get_renderable())
     text = shown.file.getvalue()  # type: ignore[attr-defined]

@@ -23,7 +23,7 @@ GOOD: dict[str, dict[str, Any]] = {
 }
 
 
-def run_of(warnings: dict[str, list[str]] | None = None, **changed: dict[str, Any]) -> dict[str, Manifest]:
+def run_of(warnings: dict[str, list[str]] | None = None, /, **changed: dict[str, Any]) -> dict[str, Manifest]:
     """Manifests of the good run, with facts of steps changed, and warnings."""
     facts = {step: GOOD.get(step, {}) | changed.get(step, {}) for step in GOOD | changed}
     return {

@@ -54,7 +54,12 @@ def test_what_does_not_fit_waits() -> None:
 def test_more_than_there_is_runs_alone() -> None:
     with share(1.0, 50.0):
         waited = threading.Event()
-        thread = threading.Thread(target=lambda: [share(1.0, 0.25).__enter__(), waited.set()])
+
+        def wait() -> None:
+            with share(1.0, 0.25):
+                waited.set()
+
+        thread = threading.Thread(target=wait)
         thread.start()
         assert not waited.wait(0.5)
     assert waited.wait(5)
@@ -108,7 +113,8 @@ def test_steps_that_do_not_fit_together_run_one_after_the_other(
 ) -> None:
     monkeypatch.setattr("scan2sim.flows.engine.execution.need", lambda *_: 3.0)
     (tmp_path / "source.txt").write_text("1")
-    running, most = set(), []
+    running: set[int] = set()
+    most: list[int] = []
 
     def watch(node: object, event: str, *_: object) -> None:
         (running.add if event == "start" else running.discard)(id(node))

@@ -6,6 +6,7 @@ import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
@@ -21,7 +22,7 @@ from scan2sim.pipeline.steps.cut import CUT
 from scan2sim.pipeline.steps.import_sweeps import IMPORT_SWEEPS
 
 
-def survey_of(place: Path | str, out: Path, **how: float) -> str:
+def survey_of(place: Path | str, out: Path, **how: Any) -> str:
     return made_of(place, out, lambda planned, store: execute(planned, store, jobs=1, watch=lambda *_: None), **how)
 
 
@@ -40,7 +41,7 @@ def drive(folder: Path, text: str) -> Path:
 def test_a_corridor_is_cut_once_and_again_when_it_changes(corridor: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
 
-    def cut(**how: float) -> tuple[Path, int]:
+    def cut(**how: Any) -> tuple[Path, int]:
         survey = Path(survey_of(corridor, out, **how))
         assert (out / "prepared" / "survey" / "survey.toml").samefile(survey)
         return survey, survey.stat().st_ino

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -13,7 +14,7 @@ from tests.gazebo.checker import check_world
 pytestmark = pytest.mark.slow
 
 
-def run(tile: Path, out: Path, *options: object) -> dict:
+def run(tile: Path, out: Path, *options: object) -> dict[str, Any]:
     """Run the command with its defaults, have Gazebo load the world; the report's figures."""
     good(scan2sim("run", tile, "--out", out, *options, timeout=1800))
     report = json.loads((out / "report.json").read_text())

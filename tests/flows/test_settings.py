@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import get_args, get_type_hints
+from typing import Any, get_args, get_type_hints
 
 import pytest
 from typer.testing import CliRunner
@@ -85,7 +85,7 @@ MODELS: dict[str, type[Params]] = {
     **{step.name: step.params for step in STEPS}, "": Numbers,
 }  # fmt: skip
 SETTINGS = [(where, name) for where, model in MODELS.items() for name in model.model_fields]
-WILD = (
+WILD: tuple[Any, ...] = (
     float("nan"), float("inf"), float("-inf"), -1, -1e300, 0, 1e300, 1e-300, 10**30, "9" * 6000, "wild", "a\0b",
     "x" * 100_000, [], {}, [float("nan")] * 3, [1e300] * 2, True, None,
 )  # fmt: skip

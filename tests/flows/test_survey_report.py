@@ -27,7 +27,7 @@ def tiles(count: int = 6, length: float = 50.0) -> list[TileState]:
     """Tiles in a row; the second failed, the last waits, the third is kept and was not scored."""
     seeds = {f"town_{i}": tuple((START + [length * i, 0]).tolist()) for i in range(count)}
     made = []
-    for i, (name, cell) in enumerate(cells(seeds, 3 * length).items()):  # type: ignore[arg-type]
+    for i, (name, cell) in enumerate(cells(seeds, 3 * length).items()):
         state = {1: "failed", 2: "kept", count - 1: "waiting"}.get(i, "done")
         borders = [{"neighbour": n, "gap_m": 0.001 * i, "colour_step": 2.0} for n in cell.neighbours]
         known = state in ("done", "kept")

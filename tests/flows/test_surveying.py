@@ -71,8 +71,8 @@ def test_where_classes_meet_there_is_no_hole(made: Path, survey: Path) -> None:
         for file in made.glob(f"steps/{path.parent.name}/decimate.*/*/mesh.npz"):
             mesh = Mesh.load(file)
             scene.add_triangles(mesh.vertices, mesh.faces.astype(np.uint32))
-        down = np.tile(np.float32([0, 0, -1]), (len(middle), 1))
-        rays = np.concatenate([middle + np.float32([0, 0, 0.4]), down], axis=1)
+        down = np.tile(np.array([0, 0, -1], np.float32), (len(middle), 1))
+        rays = np.concatenate([middle + np.array([0, 0, 0.4], np.float32), down], axis=1)
         deep = scene.cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy()
         assert (deep < 0.8).mean() > 0.995
 

@@ -19,7 +19,7 @@ from scan2sim.flows.recipes.tile import recipe
 from scan2sim.pipeline.classes import CODE
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.step import silent
-from scan2sim.pipeline.steps.split import SPLIT
+from scan2sim.pipeline.steps.split import SPLIT, SplitParams
 from scan2sim.pipeline.types import Frame, Mesh, PointCloud
 from tests.conftest import ROOT
 
@@ -63,7 +63,7 @@ def test_what_is_parked_is_kept_and_what_moved_is_not(tmp_path: Path) -> None:
     (tmp_path / "things.geojson").write_text(json.dumps({"features": features}))
     inputs = {"cloud": tmp_path / "cloud.npz", "things": tmp_path / "things.geojson"}
     (tmp_path / "out").mkdir()
-    done = SPLIT.run(inputs, SPLIT.params(vehicles="keep"), tmp_path / "out", silent)
+    done = SPLIT.run(inputs, SplitParams(vehicles="keep"), tmp_path / "out", silent)
     kept = PointCloud.load(done.files["vehicle"]).xyz
     assert len(kept) == 500 and np.abs(kept[:, 0]).max() < 2.3
     assert done.facts["points"]["rest"] == 1000

@@ -8,7 +8,7 @@ import signal
 import sys
 import time
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from scan2sim.flows.recipes.graph import Node, NodeId, Output
 from scan2sim.pipeline.errors import DataError
@@ -51,11 +51,11 @@ def toy(inputs: Inputs, params: ToyParams, out: Path, report: Report) -> Done:
 TOY = Step("toy", 1, toy, ToyParams)
 
 
-def chain(source: Path, log: Path, **changes: dict[str, object]) -> list[Node]:
+def chain(source: Path, log: Path, **changes: dict[str, Any]) -> list[Node]:
     """source -> a -> b -> d, a -> c -> d; `changes` by node name."""
 
     def node(name: str, inputs: dict[str, Path | Output]) -> Node:
-        return Node(Step(name, 1, toy, ToyParams), ToyParams(log=log, name=name, **changes.get(name, {})), inputs)  # type: ignore[arg-type]
+        return Node(Step(name, 1, toy, ToyParams), ToyParams(log=log, name=name, **changes.get(name, {})), inputs)
 
     return [
         node("a", {"source": source}),

@@ -9,7 +9,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import tomli_w
+
 from scan2sim.flows.commands.inspect import inspect_path
+from scan2sim.pipeline.io import gps as gps_io
 from scan2sim.pipeline.io.tile import read_tile
 from tests.fuzz import clouds, models, tables
 from tests.fuzz.damage import Damage
@@ -42,7 +45,7 @@ KINDS: dict[str, Kind] = {
     "tile.toml": Kind(tables.tile, read_tile),
     "survey.toml": Kind(tables.survey, tables.read_survey_folder),
     "drive.toml": Kind(tables.written("drive.toml", tables.DRIVE), tables.read_drive_file),
-    "settings.toml": Kind(tables.written("settings.toml", tables.tomli_w.dumps(tables.SETTINGS)), tables.settings),
+    "settings.toml": Kind(tables.written("settings.toml", tomli_w.dumps(tables.SETTINGS)), tables.settings),
     "--set": Kind(tables.written("set.txt", SET), tables.assignments, tables.every_setting),
     "photos.csv": Kind(tables.photos, tables.read_photos),
     "cameras.toml": Kind(tables.camera_file, tables.read_camera_file),
@@ -52,7 +55,7 @@ KINDS: dict[str, Kind] = {
     "gps gpx": Kind(*tables.track("g.gpx", gps.gpx("1.1"))),
     "gps nmea": Kind(*tables.track("g.nmea", gps.nmea())),
     "gps csv": Kind(*tables.track("g.csv", gps.table("time,latitude,longitude,altitude"))),
-    "gps gopro": Kind(tables.film, lambda folder: gps.gps.read(folder / "g.mp4"), tables.telemetry),
+    "gps gopro": Kind(tables.film, lambda folder: gps_io.read(folder / "g.mp4"), tables.telemetry),
     "video": Kind(tables.film, models.read_video),
     "colmap txt": Kind(*models.colmap("txt")),
     "colmap bin": Kind(*models.colmap("bin")),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -26,7 +27,8 @@ from tests.pipeline.io.test_kitti_import import make_drive
 from tests.pipeline.io.test_kitti_odometry import make_sequence
 from tests.pipeline.io.test_model_imports import WRITERS, images
 
-Make, Read = Callable[[Path], list[Path]], Callable[[Path], object]
+Make: TypeAlias = Callable[[Path], list[Path]]
+Read: TypeAlias = Callable[[Path], object]
 
 
 def photo(suffix: str) -> tuple[Make, Read]:

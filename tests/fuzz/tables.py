@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 from random import Random
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -25,7 +26,8 @@ from tests.pipeline.io.test_las_import import cloud
 from tests.pipeline.io.test_tile import body, save
 from tests.pipeline.test_trajectory_io import UTM, made_up
 
-Make, Read = Callable[[Path], list[Path]], Callable[[Path], object]
+Make: TypeAlias = Callable[[Path], list[Path]]
+Read: TypeAlias = Callable[[Path], object]
 
 
 def written(name: str, text: str) -> Make:
@@ -115,8 +117,8 @@ def photos(folder: Path) -> list[Path]:
 def read_photos(folder: Path) -> object:
     """The tile of them."""
     out = folder / "tile"
-    given = {"photos": folder / "photos.csv", "cameras": folder / "cameras.csv"}
-    return import_las([folder / "c.laz"], out, overwrite=out.exists(), **given)
+    photos, cameras = folder / "photos.csv", folder / "cameras.csv"
+    return import_las([folder / "c.laz"], out, photos=photos, cameras=cameras, overwrite=out.exists())
 
 
 def trajectory(suffix: str) -> tuple[Make, Read]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -74,7 +75,7 @@ def textured(folder: Path, mesh: Mesh) -> Path:
     return folder
 
 
-def world(folder: Path, frame: Frame = UTM, name: str = "street", **params: object) -> Done:
+def world(folder: Path, frame: Frame = UTM, name: str = "street", **params: Any) -> Done:
     """The made-up tile, collision made and exported below `folder`."""
     meshes = {"terrain": ground(frame=frame), "building": house(frame)}
     inputs = {group: textured(folder / group, mesh) for group, mesh in meshes.items()}

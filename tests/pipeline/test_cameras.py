@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from scan2sim.pipeline.cameras import inside, pixel_rays, project, unproject
-from scan2sim.pipeline.types import Camera
+from scan2sim.pipeline.types import F64, Camera
 
 K = (700.0, 690.0, 639.5, 359.5)
 CAMERAS = {
@@ -17,19 +17,19 @@ CAMERAS = {
 }
 
 
-def matrix(camera):
+def matrix(camera: Camera) -> F64:
     return np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
 
 
 @pytest.fixture
-def points():
+def points() -> F64:
     rng = np.random.default_rng(0)
     z = rng.uniform(1, 20, 500)
     return np.column_stack([rng.uniform(-0.9, 0.9, 500) * z, rng.uniform(-0.5, 0.5, 500) * z, z])
 
 
 @pytest.mark.parametrize("name", ["pinhole", "opencv4", "opencv8"])
-def test_projects_as_opencv_does(name, points):
+def test_projects_as_opencv_does(name: str, points: F64) -> None:
     camera = CAMERAS[name]
     expected, _ = cv2.projectPoints(
         points, np.zeros(3), np.zeros(3), matrix(camera), np.array(camera.distortion or np.zeros(4))
@@ -39,7 +39,7 @@ def test_projects_as_opencv_does(name, points):
     np.testing.assert_allclose(uv, expected[:, 0], atol=2e-3)
 
 
-def test_projects_as_opencvs_fisheye_does(points):
+def test_projects_as_opencvs_fisheye_does(points: F64) -> None:
     camera = CAMERAS["fisheye"]
     expected, _ = cv2.fisheye.projectPoints(
         points[:, None], np.zeros(3), np.zeros(3), matrix(camera), np.array(camera.distortion)
@@ -47,9 +47,9 @@ def test_projects_as_opencvs_fisheye_does(points):
     np.testing.assert_allclose(project(camera, points)[0], expected.reshape(-1, 2), atol=2e-3)
 
 
-def test_equirectangular_looks_along_z_at_its_centre_and_along_x_on_its_right():
+def test_equirectangular_looks_along_z_at_its_centre_and_along_x_on_its_right() -> None:
     camera = CAMERAS["equirectangular"]
-    uv, valid = project(camera, [[0, 0, 5], [5, 0, 0], [0, 3, 0], [-1e-9, 0, -2]])
+    uv, valid = project(camera, np.array([[0, 0, 5], [5, 0, 0], [0, 3, 0], [-1e-9, 0, -2]]))
     assert valid.all()
     np.testing.assert_allclose(uv[:2], [[1023.5, 511.5], [1535.5, 511.5]], atol=1e-3)
     assert uv[2, 1] == pytest.approx(1023.5)  # straight down
@@ -57,7 +57,7 @@ def test_equirectangular_looks_along_z_at_its_centre_and_along_x_on_its_right():
 
 
 @pytest.mark.parametrize("name", CAMERAS)
-def test_pixels_survive_the_way_to_rays_and_back(name):
+def test_pixels_survive_the_way_to_rays_and_back(name: str) -> None:
     camera = CAMERAS[name]
     rng = np.random.default_rng(1)
     uv = rng.uniform([0, 0], [camera.width - 1, camera.height - 1], (2000, 2))
@@ -70,7 +70,7 @@ def test_pixels_survive_the_way_to_rays_and_back(name):
     np.testing.assert_allclose(back, uv[reached], atol=2e-3)
 
 
-def test_points_beyond_the_field_of_view_do_not_fold_back_into_the_image():
+def test_points_beyond_the_field_of_view_do_not_fold_back_into_the_image() -> None:
     camera = Camera("opencv", 1280, 720, *K, (-0.25, 0.02, 0.0, 0.0))
     angles = np.radians(np.linspace(0, 89.9, 500))
     points = np.column_stack([np.sin(angles), np.zeros(500), np.cos(angles)])
@@ -82,7 +82,7 @@ def test_points_beyond_the_field_of_view_do_not_fold_back_into_the_image():
     assert folded  # OpenCV alone would have put some of them back into view
 
 
-def test_points_behind_are_invalid_except_for_wide_cameras():
+def test_points_behind_are_invalid_except_for_wide_cameras() -> None:
     behind = [[0.5, 0.1, -1.0]]
     assert not project(CAMERAS["pinhole"], behind)[1][0]
     assert not project(CAMERAS["opencv4"], behind)[1][0]
@@ -90,7 +90,7 @@ def test_points_behind_are_invalid_except_for_wide_cameras():
     assert project(CAMERAS["equirectangular"], behind)[1][0]
 
 
-def test_pixel_rays_are_those_of_unproject():
+def test_pixel_rays_are_those_of_unproject() -> None:
     camera = CAMERAS["fisheye"].scaled(0.1)
     rays = pixel_rays(camera)
     assert rays.shape == (camera.height, camera.width, 3)

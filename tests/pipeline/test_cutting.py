@@ -9,6 +9,7 @@ from dataclasses import replace
 from datetime import date
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import cv2
 import laspy
@@ -16,7 +17,6 @@ import numpy as np
 import pytest
 import tomli_w
 
-from scan2sim.pipeline import corridor as cutting
 from scan2sim.pipeline.corridor import CutParams, cut_survey
 from scan2sim.pipeline.cutting import members, seeds
 from scan2sim.pipeline.errors import DataError, InputError, SettingError
@@ -62,7 +62,7 @@ def points(n: int = 200_000, seed: int = 0, frame: Frame = UTM) -> PointCloud:
     )
 
 
-def look(along: float, aside: float = 0.0) -> dict:
+def look(along: float, aside: float = 0.0) -> dict[str, Any]:
     """A photo's pose, looking along the street."""
     (x, y), a = street(np.array([along]), np.array([aside]))[0], along / RADIUS
     forward, right = np.array([np.cos(a), np.sin(a), 0]), np.array([np.sin(a), -np.cos(a), 0])
@@ -156,9 +156,9 @@ def path_of(*corners: tuple[float, float], step: float = 1.0) -> Trajectory:
     legs = []
     for a, b in pairwise(corners):
         n = max(1, round(np.hypot(b[0] - a[0], b[1] - a[1]) / step))
-        legs.append(np.array(a) + (np.array(b) - a) * np.arange(n)[:, None] / n)
+        legs.append(np.array(a) + np.subtract(b, a) * np.arange(n)[:, None] / n)
     xy = np.concatenate([*legs, [corners[-1]]])
-    return Trajectory(np.arange(len(xy)) * 0.1, np.column_stack([xy, np.zeros(len(xy))]))
+    return Trajectory(np.arange(len(xy), dtype=float) * 0.1, np.column_stack([xy, np.zeros(len(xy))]))
 
 
 def placed(path: Trajectory, length: float = 100.0) -> np.ndarray:
@@ -214,7 +214,7 @@ def test_standing_still_makes_no_way() -> None:
     path = path_of((0, 0), (300, 0))
     still = path.positions[150] + np.column_stack([rng.normal(0, 0.05, (5000, 2)), np.zeros(5000)])
     xyz = np.insert(path.positions, 150, still, axis=0)
-    assert np.allclose(placed(Trajectory(np.arange(len(xyz)) * 0.1, xyz)), placed(path), atol=0.5)
+    assert np.allclose(placed(Trajectory(np.arange(len(xyz), dtype=float) * 0.1, xyz)), placed(path), atol=0.5)
 
 
 def test_without_a_path_seeds_are_on_a_grid() -> None:
@@ -266,7 +266,7 @@ def test_every_tile_holds_exactly_its_points_and_they_are_the_same_in_all(bend: 
         wanted = source[holds[:, j]]
         kept = np.isin(wanted["place"] @ [1, 10**9, 7], got["place"] @ [1, 10**9, 7])
         assert np.array_equal(got, wanted[kept])  # same points, attributes and order
-        total += np.count_nonzero(kept & (own[holds[:, j]] == j))
+        total += int(np.count_nonzero(kept & (own[holds[:, j]] == j)))
         some = np.flatnonzero(holds[::40, j])
         near = np.isin(source["place"][::40][some] @ [1, 10**9, 7], got["place"] @ [1, 10**9, 7])
         assert near[distance[some] < 19.5].all() and not near[distance[some] > 20.1].any()
@@ -499,7 +499,7 @@ def test_memory_does_not_grow_with_the_points(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr("scan2sim.pipeline.io.spool.CHUNK", 20_000)
 
     def peak(parts: int) -> int:
-        monkeypatch.setattr(cutting.clouds, "chunks", lambda *_: iter([part] * parts))
+        monkeypatch.setattr(clouds, "chunks", lambda *_: iter([part] * parts))
         tracemalloc.start()
         cut_survey(folder, tmp_path / "out", CUT, overwrite=True)
         most = tracemalloc.get_traced_memory()[1]

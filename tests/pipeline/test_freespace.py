@@ -105,7 +105,7 @@ def lost(cloud: PointCloud, done: Done) -> dict[int, float]:
     kept = PointCloud.load(done.files["cloud"]).label
     assert cloud.label is not None and kept is not None
     before, after = np.bincount(cloud.label, minlength=10), np.bincount(kept, minlength=10)
-    return {kind: float(1 - after[kind] / before[kind]) for kind in np.flatnonzero(before)}
+    return {kind: float(1 - after[kind] / before[kind]) for kind in np.flatnonzero(before).tolist()}
 
 
 @pytest.fixture(scope="module")

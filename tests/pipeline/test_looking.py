@@ -20,7 +20,7 @@ POSE = look_at((3.0, -2.0, 4.0), (8.0, 5.0, 3.0))
 
 
 @pytest.mark.parametrize("name", CAMERAS)
-def test_places_are_shown_where_the_camera_at_its_pose_has_them(name):
+def test_places_are_shown_where_the_camera_at_its_pose_has_them(name: str) -> None:
     camera, places = CAMERAS[name], np.random.default_rng(0).uniform(-20, 20, (5000, 3))
     uv, shown = pixels(camera, POSE, places)
     expected, ahead = project(camera, (places - POSE[:3, 3]) @ POSE[:3, :3])
@@ -29,7 +29,7 @@ def test_places_are_shown_where_the_camera_at_its_pose_has_them(name):
     assert shown.any() and (name == "equirectangular" or not shown.all())
 
 
-def test_a_panorama_shows_what_is_right_behind_it():
+def test_a_panorama_shows_what_is_right_behind_it() -> None:
     camera = Camera("equirectangular", 400, 200)
     behind = np.array([[0.0, 0.3, -5.0], [-0.0, -1.0, -2.0], [1e-9, 0.0, -1.0]])
     uv, shown = pixels(camera, np.eye(4), behind)
@@ -37,7 +37,7 @@ def test_a_panorama_shows_what_is_right_behind_it():
 
 
 @pytest.mark.parametrize("size", [(71, 97), (35, 48), (18, 24), (9, 200)])
-def test_pictures_of_any_size_cover_the_photo(size):
+def test_pictures_of_any_size_cover_the_photo(size: tuple[int, int]) -> None:
     """A ramp over the whole photo is the same ramp in whatever size the picture is kept, up to half its pixel."""
     camera = CAMERAS["pinhole"]
     p, (height, width) = parameters(camera), size
@@ -52,7 +52,7 @@ def test_pictures_of_any_size_cover_the_photo(size):
             np.testing.assert_allclose(told, place, atol=1e-9)
 
 
-def test_masks_hold_up_to_the_photos_border():
+def test_masks_hold_up_to_the_photos_border() -> None:
     p = parameters(CAMERAS["pinhole"])
     mask = np.zeros((7, 9), np.uint8)
     mask[0, 0] = mask[6, 8] = 255

@@ -22,7 +22,8 @@ def test_between_poses_it_moves_straight_and_turns_evenly() -> None:
     at = np.array([0.0, 0.25, 1.0, 2.0, 2.9, 3.0])
     found = interpolate(some(), TIMES, at)
     assert np.allclose(found[:, :3, :3], Slerp([0, 1, 3], TURNS[[0, 1, 3]])(at).as_matrix())
-    assert np.allclose(found[:, :3, 3], [[0, 0, 0], [0.25, 0.5, 0], [1, 2, 0], [3, 2, 2], [4.8, 2, 3.8], [5, 2, 4]])
+    places = np.array([[0, 0, 0], [0.25, 0.5, 0], [1, 2, 0], [3, 2, 2], [4.8, 2, 3.8], [5, 2, 4]])
+    assert np.allclose(found[:, :3, 3], places)
 
 
 def test_beyond_its_ends_a_motion_goes_on_and_a_trajectory_is_held() -> None:

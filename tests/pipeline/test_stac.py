@@ -61,7 +61,8 @@ def check(thing: pystac.Item | pystac.Collection) -> None:
 def read(path: Path) -> tuple[pystac.Collection, list[pystac.Item]]:
     collection = pystac.Collection.from_file(str(path))
     items = sorted(collection.get_items(), key=lambda item: item.id)
-    for thing in (collection, *items):
+    things: list[pystac.Item | pystac.Collection] = [collection, *items]
+    for thing in things:
         check(thing)
     return collection, items
 

@@ -122,7 +122,7 @@ class Drive:
 def make(
     folder: Path, *, turning: bool = False, write: Callable[[Path, F64], None] = to_bin, shift: Any = (0, 0, 0)
 ) -> Drive:
-    times = 0.1 + PERIOD * np.arange(SWEEPS)
+    times = 0.1 + PERIOD * np.arange(SWEEPS, dtype=float)
     for name in ("sweeps", "photos"):
         (folder / name).mkdir(parents=True)
     scanner = way(times)
@@ -169,7 +169,8 @@ def test_sweeps_of_all_formats(tmp_path: Path, write: Callable[[Path, F64], None
 
 
 def test_poses_may_be_the_scanners_own(drive: Drive, tmp_path: Path) -> None:
-    for extra in ({}, {"extrinsics": T_CAMERA_SCANNER, "of": "scanner"}):
+    given: dict[str, Any] = {"extrinsics": T_CAMERA_SCANNER, "of": "scanner"}
+    for extra in ({}, given):
         path = import_sweeps(
             drive.folder / "sweeps", drive.folder / "scanner.kitti", tmp_path / "tile", overwrite=True, **extra
         )

@@ -7,7 +7,7 @@ import open3d as o3d
 import pytest
 
 from scan2sim.pipeline.cameras import pixel_rays, project
-from scan2sim.pipeline.types import Camera, Frame, Mesh, PointCloud
+from scan2sim.pipeline.types import F32, F64, U8, Camera, Frame, Mesh, PointCloud
 from scan2sim.pipeline.visibility import depth_map, scene, visible
 
 CAMERAS = {
@@ -18,7 +18,7 @@ CAMERAS = {
 }
 
 
-def forward_pose(x=0.0, y=0.0, z=2.0):
+def forward_pose(x: float = 0.0, y: float = 0.0, z: float = 2.0) -> F64:
     """A camera that looks along world x, upright."""
     pose = np.eye(4)
     pose[:3, :3] = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
@@ -26,7 +26,7 @@ def forward_pose(x=0.0, y=0.0, z=2.0):
     return pose
 
 
-def grid(nx, ny, size, at):
+def grid(nx: int, ny: int, size: float, at: tuple[float, float, float]) -> Mesh:
     """A horizontal grid of nx x ny cells of `size` metres around `at`."""
     x, y = np.meshgrid(np.arange(nx + 1) * size, np.arange(ny + 1) * size, indexing="ij")
     vertices = np.column_stack([x.ravel() - nx * size / 2, y.ravel() - ny * size / 2, np.zeros(x.size)]) + at
@@ -36,18 +36,18 @@ def grid(nx, ny, size, at):
     return Mesh(Frame(), vertices.astype(np.float32), faces.astype(np.int32))
 
 
-def box(low, high):
+def box(low: tuple[float, float, float], high: tuple[float, float, float]) -> Mesh:
     mesh = o3d.t.geometry.TriangleMesh.create_box(*(np.subtract(high, low)))
     vertices = mesh.vertex.positions.numpy() + np.asarray(low)
     return Mesh(Frame(), vertices.astype(np.float32), mesh.triangle.indices.numpy().astype(np.int32))
 
 
 @pytest.fixture(scope="module")
-def street():
+def street() -> list[Mesh]:
     return [grid(60, 60, 1.0, (0, 0, 0)), box((8, -2, 0), (9, 2, 3)), box((-6, 3, 0), (-4, 5, 4))]
 
 
-def cast(meshes, camera, pose):
+def cast(meshes: list[Mesh], camera: Camera, pose: F64) -> F32:
     casting = o3d.t.geometry.RaycastingScene()
     for mesh in meshes:
         casting.add_triangles(o3d.core.Tensor(mesh.vertices), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
@@ -58,7 +58,7 @@ def cast(meshes, camera, pose):
 
 
 @pytest.mark.parametrize("name", CAMERAS)
-def test_range_image_is_what_rays_meet(street, name):
+def test_range_image_is_what_rays_meet(street: list[Mesh], name: str) -> None:
     camera, pose = CAMERAS[name], forward_pose()
     depth = depth_map(camera, pose, scene(street))
     expected = cast(street, depth.camera, pose)
@@ -67,14 +67,14 @@ def test_range_image_is_what_rays_meet(street, name):
     assert same.mean() > 0.999
 
 
-def test_large_cameras_are_scaled_down(street):
+def test_large_cameras_are_scaled_down(street: list[Mesh]) -> None:
     depth = depth_map(CAMERAS["pinhole"], forward_pose(), scene(street), pixels=20_000)
     assert depth.range.size <= 20_500
     assert depth.range.shape == (depth.camera.height, depth.camera.width)
 
 
 @pytest.mark.parametrize("name", CAMERAS)
-def test_leak_and_false_hiding_on_the_ground_are_small_at_grazing_angles(street, name):
+def test_leak_and_false_hiding_on_the_ground_are_small_at_grazing_angles(street: list[Mesh], name: str) -> None:
     camera, pose = CAMERAS[name], forward_pose()
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(-25, 25, (40_000, 2)), np.zeros(40_000)])
@@ -94,24 +94,30 @@ def test_leak_and_false_hiding_on_the_ground_are_small_at_grazing_angles(street,
     assert (~seen[truly]).mean() < 0.06
 
 
-def side_of(x, y0, y1, z0, z1, step=0.1):
+def side_of(x: float, y0: float, y1: float, z0: float, z1: float, step: float = 0.1) -> F32:
     """(N, 3) points every `step` metres on an upright rectangle across the view of `forward_pose`."""
     y, z = (part.ravel() for part in np.meshgrid(np.arange(y0, y1, step), np.arange(z0, z1, step)))
     return np.column_stack([np.full(y.size, x), y, z]).astype(np.float32)
 
 
-def cloud_of(*parts, label=None, time=None):
+def cloud_of(*parts: F32, label: U8 | None = None, time: F64 | None = None) -> PointCloud:
     """Points that look towards the camera."""
     xyz = np.concatenate(parts)
-    return PointCloud(Frame(), xyz, normal=np.tile(np.float32([-1, 0, 0]), (len(xyz), 1)), label=label, time=time)
+    return PointCloud(
+        Frame(), xyz, normal=np.tile(np.array([-1, 0, 0], np.float32), (len(xyz), 1)), label=label, time=time
+    )
 
 
-WALL = Mesh(Frame(), np.float32([[8, -2, 0], [8, 2, 0], [8, 2, 3], [8, -2, 3]]), np.int32([[0, 2, 1], [0, 3, 2]]))
+WALL = Mesh(
+    Frame(),
+    np.array([[8, -2, 0], [8, 2, 0], [8, 2, 3], [8, -2, 3]], np.float32),
+    np.array([[0, 2, 1], [0, 3, 2]], np.int32),
+)
 ON_WALL = np.array([[8.0, 0.0, 1.5], [8.0, 1.9, 1.5]])
 FACING = np.tile([-1.0, 0, 0], (2, 1))
 
 
-def test_points_without_a_mesh_hide_what_is_behind_them():
+def test_points_without_a_mesh_hide_what_is_behind_them() -> None:
     pose, camera = forward_pose(), CAMERAS["pinhole"]
     car = side_of(4.0, -1, 0.5, 0.5, 2.5)
     before_wall = side_of(7.95, -2, 2.05, 0, 3.05)  # the mesh has it already
@@ -122,14 +128,14 @@ def test_points_without_a_mesh_hide_what_is_behind_them():
     assert visible(depth_map(camera, pose, hides), car, np.tile([-1.0, 0, 0], (len(car), 1))).all()
 
 
-def test_the_trail_of_what_drove_past_hides_only_while_it_was_there():
+def test_the_trail_of_what_drove_past_hides_only_while_it_was_there() -> None:
     wall, trail = side_of(8.0, -2, 2.05, 0, 3.05), side_of(4.0, -1, 0.5, 0.5, 2.5)
-    label = np.repeat(np.uint8([6, 66]), [len(wall), len(trail)])
+    label = np.repeat(np.array([6, 66], np.uint8), [len(wall), len(trail)])
     passed = np.concatenate([np.full(len(wall), 100.0), np.linspace(100.0, 100.2, len(trail))])
     stood = np.concatenate([np.full(len(wall), 100.0), np.linspace(100.0, 104.0, len(trail))])
     camera, pose = CAMERAS["pinhole"], forward_pose()
 
-    def sees_wall(cloud, time):
+    def sees_wall(cloud: PointCloud, time: float | None) -> bool:
         depth = depth_map(camera, pose, scene([WALL], cloud), time=time)
         return bool(visible(depth, ON_WALL[:1], FACING[:1])[0])
 
@@ -141,30 +147,32 @@ def test_the_trail_of_what_drove_past_hides_only_while_it_was_there():
     assert not sees_wall(parked, 110.0)
 
 
-def test_what_was_carved_as_moving_hides_only_at_its_own_moment():
+def test_what_was_carved_as_moving_hides_only_at_its_own_moment() -> None:
     wall, car = side_of(8.0, -2, 2.05, 0, 3.05), side_of(4.0, -1, 0.5, 0.5, 2.5)
     moving = cloud_of(car, time=np.full(len(car), 100.0))
     hides = scene([WALL], cloud_of(wall), moving=moving)
 
-    def sees_wall(time):
+    def sees_wall(time: float | None) -> bool:
         depth = depth_map(CAMERAS["pinhole"], forward_pose(), hides, time=time)
         return bool(visible(depth, ON_WALL[:1], FACING[:1])[0])
 
     assert [sees_wall(time) for time in (99.8, 100.0, 100.2)] == [True, False, True]
 
 
-def test_a_bulge_that_no_point_bears_out_hides_nothing():
+def test_a_bulge_that_no_point_bears_out_hides_nothing() -> None:
     wall, sign = side_of(8.0, -2, 2.05, 0, 3.05), side_of(4.0, -0.3, 0.35, 1.5, 2.1)
     flat = grid(20, 11, 0.1, (0, 1.8, 0))
-    bulge = Mesh(Frame(), np.roll(flat.vertices, 1, axis=1) + np.float32([4, 0, 0]), flat.faces)
+    bulge = Mesh(Frame(), np.roll(flat.vertices, 1, axis=1) + np.array([4, 0, 0], np.float32), flat.faces)
     depth = depth_map(CAMERAS["pinhole"], forward_pose(), scene([WALL, bulge], cloud_of(wall, sign)))
     behind = np.array([[8.0, 0.0, 1.6], [8.0, 1.6, 1.6]])  # the sign, and what is left of it
     assert visible(depth, behind, FACING).tolist() == [False, True]
 
 
-def test_things_of_their_own_hide_though_their_points_are_in_no_surfaces_cloud():
+def test_things_of_their_own_hide_though_their_points_are_in_no_surfaces_cloud() -> None:
     pole, ground = box((3, -0.2, 0), (3.1, 0.2, 4)), grid(40, 20, 0.5, (10, 0, 0))
-    cloud = PointCloud(Frame(), ground.vertices, normal=np.tile(np.float32([0, 0, 1]), (len(ground.vertices), 1)))
+    cloud = PointCloud(
+        Frame(), ground.vertices, normal=np.tile(np.array([0, 0, 1], np.float32), (len(ground.vertices), 1))
+    )
     behind = [[6.0, 0.0, 1.0]]
     for label, hidden in ((0, False), (64, True)):
         mesh = replace(pole, label=np.full(len(pole), label, np.uint8))
@@ -173,12 +181,12 @@ def test_things_of_their_own_hide_though_their_points_are_in_no_surfaces_cloud()
         assert visible(depth, behind).tolist() == [not hidden]
 
 
-def test_what_is_out_of_the_image_is_not_seen(street):
+def test_what_is_out_of_the_image_is_not_seen(street: list[Mesh]) -> None:
     depth = depth_map(CAMERAS["pinhole"], forward_pose(), scene(street))
     assert not visible(depth, [[-5.0, 0, 1], [5.0, 60, 1]]).any()
 
 
-def test_depth_is_the_same_whatever_the_number_of_threads(street):
+def test_depth_is_the_same_whatever_the_number_of_threads(street: list[Mesh]) -> None:
     import numba
 
     camera, pose = CAMERAS["equirectangular"], forward_pose()

@@ -119,7 +119,7 @@ def test_nothing_is_done_where_nothing_has_changed(tmp_path: Path) -> None:
     assert _snapshot(folder) == before  # a user's edit stays
     assert len(told) == 1 and "tile0/model.sdf was changed since it was made" in told[0]
     assemble(tmp_path, "town", row, buffer=5)
-    assert _snapshot(folder) != before and _root(folder / "town.sdf").find(".//level/buffer").text == "5"
+    assert _snapshot(folder) != before and _root(folder / "town.sdf").findtext(".//level/buffer") == "5"
     (folder / "models/tile1/meshes/collision.obj").unlink()
     assemble(tmp_path, "town", row, buffer=5)
     assert (folder / "models/tile1/meshes/collision.obj").is_file()

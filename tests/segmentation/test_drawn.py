@@ -52,7 +52,7 @@ def test_heights_distances_and_slopes_are_where_they_should_be(scan: Drawn, came
     channels = scan.into(view(camera), (camera.width, camera.height))
     assert channels.shape == (camera.height // 4, camera.width // 4, 4)
     wall, road, behind = code(channels, camera, 10, 0.5, 1.5), code(channels, camera, 6, 0.5, 0), channels[0, 0]
-    assert wall[0] == pytest.approx(coded_height(np.float32([1.5])), abs=4) and wall[2] < 30
+    assert wall[0] == pytest.approx(coded_height(np.array([1.5], np.float32)), abs=4) and wall[2] < 30
     assert road[0] == pytest.approx(128, abs=6) and road[2] > 225
     assert wall[1] > road[1] and wall[3] == road[3] == 255
     assert (behind == 0).all(), "nothing is up there"

@@ -37,7 +37,7 @@ def painted(camera, classes=12):
     return np.repeat((index * 20).astype(np.uint8)[..., None], 3, axis=2), index
 
 
-def test_classes_come_back_where_they_are():
+def test_classes_come_back_where_they_are() -> None:
     rgb, truth = painted(PINHOLE)
     best, sure = labels_of(Labeller(ByColour(), "").probabilities(rgb, PINHOLE), rgb.shape[:2])
     assert (best == truth).mean() > 0.95
@@ -45,7 +45,7 @@ def test_classes_come_back_where_they_are():
 
 
 @pytest.mark.parametrize("camera", [Camera("pinhole", 3000, 2000, 500.0, 500.0, 1499.5, 999.5)])
-def test_large_photos_are_looked_at_in_tiles_without_seams(camera):
+def test_large_photos_are_looked_at_in_tiles_without_seams(camera) -> None:
     rgb, truth = painted(camera)
     network = ByColour()
     labeller = Labeller(network, "")
@@ -54,7 +54,7 @@ def test_large_photos_are_looked_at_in_tiles_without_seams(camera):
     assert len(network.seen) > 1 and max(max(size) for size in network.seen) <= labeller.tile
 
 
-def test_a_device_short_of_memory_gets_smaller_tiles():
+def test_a_device_short_of_memory_gets_smaller_tiles() -> None:
     rgb, truth = painted(PINHOLE)
     network = ByColour(memory=400 * 400)
     labeller = Labeller(network, "")
@@ -64,7 +64,7 @@ def test_a_device_short_of_memory_gets_smaller_tiles():
         Labeller(ByColour(memory=100), "").probabilities(rgb, PINHOLE)
 
 
-def test_photos_are_looked_at_at_one_angular_resolution():
+def test_photos_are_looked_at_at_one_angular_resolution() -> None:
     network = ByColour(resolution=250.0)
     rgb, _ = painted(PINHOLE)
     Labeller(network, "").probabilities(rgb, PINHOLE)
@@ -72,7 +72,7 @@ def test_photos_are_looked_at_at_one_angular_resolution():
 
 
 @pytest.mark.parametrize("camera", [PINHOLE, PANORAMA])
-def test_a_network_that_takes_channels_gets_them_beside_the_colours(camera):
+def test_a_network_that_takes_channels_gets_them_beside_the_colours(camera) -> None:
     class ByChannel(ByColour):
         def probabilities(self, seen):
             assert seen.shape[2] == 7
@@ -88,7 +88,7 @@ def test_a_network_that_takes_channels_gets_them_beside_the_colours(camera):
     assert (labels_of(labeller.probabilities(rgb, camera), truth.shape)[0] == 0).all(), "a photo alone has none"
 
 
-def test_a_panoramas_seam_is_no_special_place():
+def test_a_panoramas_seam_is_no_special_place() -> None:
     network = ByColour(resolution=PANORAMA.width / (2 * np.pi))
     rgb, truth = painted(PANORAMA)
     best, _ = labels_of(Labeller(network, "").probabilities(rgb, PANORAMA), rgb.shape[:2])
@@ -96,7 +96,7 @@ def test_a_panoramas_seam_is_no_special_place():
     assert {size[1] for size in network.seen} == {1024 + 2 * OVERLAP}, "each side is continued by the other"
 
 
-def test_label_sets_of_others_map_by_name():
+def test_label_sets_of_others_map_by_name() -> None:
     cityscapes = [
         "road",
         "sidewalk",
@@ -118,6 +118,6 @@ def test_label_sets_of_others_map_by_name():
         mapped(["cat", "dog"], "pets.onnx")
 
 
-def test_every_foreign_label_maps_onto_a_class_and_codes_go_round():
+def test_every_foreign_label_maps_onto_a_class_and_codes_go_round() -> None:
     assert all(ours in CLASSES for table in LABEL_SETS.values() for ours in table.values())
     assert index_of_code()[code_of_index()].tolist() == list(range(len(CLASSES)))

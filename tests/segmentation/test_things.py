@@ -148,7 +148,7 @@ def test_the_end_of_a_trail_goes_with_it(tmp_path: Path) -> None:
     time = np.random.default_rng(0).uniform(0, 5, len(cloud))
     time[-len(end) - len(bush) : -len(bush)] /= 20
     replace(cloud, time=time).save(inputs["cloud"])
-    before = [xyz[xyz[:, 0] < xyz[:, 0].min() + 0.1] - np.float32([0.15, 0, 0]) for xyz in (end, bush)]
+    before = [xyz[xyz[:, 0] < xyz[:, 0].min() + 0.1] - np.array([0.15, 0, 0], np.float32) for xyz in (end, bush)]
     PointCloud(FRAME, np.concatenate(before)).save(tmp_path / "moving.npz")
     after = told(go(inputs | {"moving": tmp_path / "moving.npz"}, tmp_path), end, bush)
     assert (after["0"] == VEHICLE).mean() > 0.97 and (after["1"] == HEDGE).all()

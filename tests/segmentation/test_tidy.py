@@ -23,7 +23,7 @@ def neighbours(xyz: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("away", [0.3, 2.0])
-def test_a_large_floating_piece_on_a_wall_is_the_walls_and_a_crown_in_the_air_is_not(away):
+def test_a_large_floating_piece_on_a_wall_is_the_walls_and_a_crown_in_the_air_is_not(away) -> None:
     wall, piece = sheet(6, 0, 6), sheet(3, 2, 5, away)
     xyz = np.concatenate([wall, piece])
     best = np.repeat([BUILDING, HIGH], [len(wall), len(piece)]).astype(np.uint8)
@@ -32,20 +32,20 @@ def test_a_large_floating_piece_on_a_wall_is_the_walls_and_a_crown_in_the_air_is
     assert (found[: len(wall)] == BUILDING).all()
 
 
-def test_vegetation_that_stands_on_the_ground_stays_even_on_a_wall():
+def test_vegetation_that_stands_on_the_ground_stays_even_on_a_wall() -> None:
     wall, climber = sheet(6, 0, 6), sheet(3, 0, 5, 0.3)
     xyz = np.concatenate([wall, climber])
     best = np.repeat([BUILDING, HIGH], [len(wall), len(climber)]).astype(np.uint8)
     assert (without_specks(best, xyz[:, 2], xyz, neighbours(xyz)) == best).all()
 
 
-def test_nothing_but_vegetation_stays():
+def test_nothing_but_vegetation_stays() -> None:
     xyz = sheet(2, 1, 2)
     best = np.full(len(xyz), HIGH, np.uint8)
     assert (without_specks(best, xyz[:, 2], xyz, neighbours(xyz)) == best).all()
 
 
-def test_road_in_the_air_is_what_stands_around_it_and_a_ramp_is_road():
+def test_road_in_the_air_is_what_stands_around_it_and_a_ramp_is_road() -> None:
     road, seat, car, ramp = (sheet(4, *z)[:, [0, 2, 1]] for z in ((0, 4), (1, 1.5), (1.5, 2.5), (5, 9)))
     seat[:, 2], car[:, 2], ramp[:, 2] = 1.0, 1.0, 0.3 * (ramp[:, 1] - 5)
     xyz = np.concatenate([road, seat, car, ramp])
@@ -55,7 +55,7 @@ def test_road_in_the_air_is_what_stands_around_it_and_a_ramp_is_road():
     assert (found[: len(road)] == ROAD).all() and (found[-len(ramp) :] == ROAD).all()
 
 
-def test_plants_in_the_air_are_not_what_road_in_the_air_is():
+def test_plants_in_the_air_are_not_what_road_in_the_air_is() -> None:
     road, seat, leaf, car = (sheet(4, *z)[:, [0, 2, 1]] for z in ((0, 4), (1, 1.5), (1.5, 1.7), (1.7, 3)))
     seat[:, 2] = leaf[:, 2] = car[:, 2] = 1.0
     xyz = np.concatenate([road, seat, leaf, car])
@@ -64,7 +64,7 @@ def test_plants_in_the_air_are_not_what_road_in_the_air_is():
     assert (found[len(road) :] == VEHICLE).all()
 
 
-def test_the_foot_of_a_wall_is_the_walls_and_a_kerb_is_not():
+def test_the_foot_of_a_wall_is_the_walls_and_a_kerb_is_not() -> None:
     wall, road = sheet(4, 0, 3), sheet(4, 0, 3, 5.0)[:, [0, 2, 1]]
     kerb = sheet(4, 0, 0.2, 9.0)
     xyz = np.concatenate([wall, road, kerb])
@@ -76,7 +76,7 @@ def test_the_foot_of_a_wall_is_the_walls_and_a_kerb_is_not():
     assert (found[: len(wall)] == BUILDING).all() and (found[len(wall) :] == ROAD).all()
 
 
-def test_vegetation_is_told_by_height_where_it_can_be_nothing_else():
+def test_vegetation_is_told_by_height_where_it_can_be_nothing_else() -> None:
     xyz = np.concatenate([sheet(1, 0, 0.6), sheet(1, 0, 4, 3.0)])
     found = by_height(np.full(len(xyz), LOW, np.uint8), xyz[:, 2], xyz)
     assert (found[xyz[:, 2] > 2.7] == HIGH).all() and (found[xyz[:, 1] < 1] == LOW).all()

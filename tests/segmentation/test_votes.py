@@ -1,6 +1,7 @@
 """From pixels to points on the synthetic street, with photos labelled by its own truth."""
 
 import json
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -19,7 +20,7 @@ from scan2sim.segmentation.segment import SEGMENT
 
 
 @pytest.fixture(scope="module")
-def labelled(tmp_path_factory):
+def labelled(tmp_path_factory: pytest.TempPathFactory):
     """A street, its cloud without classes, its photos' true labels as probabilities; and the true classes."""
     from scan2sim.data_samples.street import generate
     from scan2sim.pipeline.types import PointCloud
@@ -51,7 +52,7 @@ def segment(folder, out, names=("views", "labels", "path"), **params):
         return PointCloud.load(done.files["cloud"]).label, dict(beside), done
 
 
-def test_photos_that_are_right_make_points_right(labelled, tmp_path):
+def test_photos_that_are_right_make_points_right(labelled, tmp_path: Path) -> None:
     folder, truth = labelled
     (tmp_path / "photos").mkdir()
     (tmp_path / "shape").mkdir()
@@ -68,7 +69,7 @@ def test_photos_that_are_right_make_points_right(labelled, tmp_path):
     assert set(np.unique(source)) <= {1, 2} and (right[source == 1].mean()) > right[source == 2].mean()
 
 
-def test_a_wrong_pose_shows_in_the_skys_share(labelled, tmp_path):
+def test_a_wrong_pose_shows_in_the_skys_share(labelled, tmp_path: Path) -> None:
     folder, _ = labelled
     views = list(views_io.load(folder / "views.json"))
     for view in views:
@@ -81,7 +82,7 @@ def test_a_wrong_pose_shows_in_the_skys_share(labelled, tmp_path):
     assert done.facts["sky_share"] > 0.15 and any("poses" in w for w in done.warnings)
 
 
-def test_a_network_that_knows_only_vegetation_has_it_parted_by_height(labelled, tmp_path):
+def test_a_network_that_knows_only_vegetation_has_it_parted_by_height(labelled, tmp_path: Path) -> None:
     folder, truth = labelled
     labels = tmp_path / "labels"
     labels.mkdir()
@@ -99,7 +100,7 @@ def test_a_network_that_knows_only_vegetation_has_it_parted_by_height(labelled, 
     assert iou["low_vegetation"] > 0.5 and iou["high_vegetation"] > 0.85
 
 
-def test_photos_without_overlap_leave_it_to_shape(labelled, tmp_path):
+def test_photos_without_overlap_leave_it_to_shape(labelled, tmp_path: Path) -> None:
     folder, _ = labelled
     (tmp_path / "labels").mkdir()
     done = SEGMENT.run(
@@ -109,7 +110,7 @@ def test_photos_without_overlap_leave_it_to_shape(labelled, tmp_path):
     assert done.facts["source"] == "shape" and any("shape alone" in w for w in done.warnings)
 
 
-def test_classes_that_are_there_are_kept_and_photos_not_looked_at(labelled, tmp_path):
+def test_classes_that_are_there_are_kept_and_photos_not_looked_at(labelled, tmp_path: Path) -> None:
     from scan2sim.pipeline.types import PointCloud
 
     folder, truth = labelled
@@ -124,13 +125,13 @@ def test_classes_that_are_there_are_kept_and_photos_not_looked_at(labelled, tmp_
     np.testing.assert_array_equal(PointCloud.load(kept.files["cloud"]).label, truth)
 
 
-def test_ground_codes_and_vehicles_have_their_own_classes(labelled, tmp_path):
+def test_ground_codes_and_vehicles_have_their_own_classes(labelled, tmp_path: Path) -> None:
     folder, _ = labelled
     told, *_ = segment(folder, tmp_path)
     assert {CODE[n] for n in ("road", "sidewalk", "terrain", "building", "high_vegetation")} <= set(told.tolist())
 
 
-def test_weights_that_are_no_weights_are_named(tmp_path):
+def test_weights_that_are_no_weights_are_named(tmp_path: Path) -> None:
     from scan2sim.segmentation.backends import load
 
     with pytest.raises(InputError, match=r"no\.safetensors"):

@@ -35,7 +35,7 @@ def command(*arguments):
 
 
 @pytest.fixture(scope="session")
-def done(corridor, tmp_path_factory):
+def done(corridor, tmp_path_factory: pytest.TempPathFactory):
     out = tmp_path_factory.mktemp("slam") / "out"
     result = command(
         "slam", corridor.folder / "video.mp4", "--out", out, "--colmap", "--adjust", "--set", "track.count=300"
@@ -43,7 +43,7 @@ def done(corridor, tmp_path_factory):
     return out, result.output
 
 
-def test_it_writes_the_trajectory_in_all_formats_and_says_that_there_is_no_gps(done, corridor):
+def test_it_writes_the_trajectory_in_all_formats_and_says_that_there_is_no_gps(done, corridor) -> None:
     out, said = done
     found = trajectory_io.read(out / "trajectory.csv")
     assert len(found) == len(corridor.truth)
@@ -55,7 +55,7 @@ def test_it_writes_the_trajectory_in_all_formats_and_says_that_there_is_no_gps(d
     assert list((out / "steps").rglob("state*")) == []
 
 
-def test_what_was_tracked_is_kept_when_only_its_placing_changes(corridor, tmp_path):
+def test_what_was_tracked_is_kept_when_only_its_placing_changes(corridor, tmp_path: Path) -> None:
     asked = ("slam", corridor.folder / "video.mp4", "--out", tmp_path, "--set", "track.count=300", "--until", "0.5")
     command(*asked, "--view")
     first = {path: path.stat().st_mtime_ns for path in tmp_path.glob("steps/track/*/*")}
@@ -67,14 +67,14 @@ def test_what_was_tracked_is_kept_when_only_its_placing_changes(corridor, tmp_pa
     assert not (tmp_path / "view.mp4").exists(), "of an earlier run nothing stays"
 
 
-def test_the_colmap_model_is_one(done):
+def test_the_colmap_model_is_one(done) -> None:
     pycolmap = pytest.importorskip("pycolmap")
     model = pycolmap.Reconstruction(done[0] / "colmap")
     assert model.num_points3D() > 100
     assert model.compute_mean_reprojection_error() < 1.0
 
 
-def test_evaluate_prints_the_missions_errors(done, corridor, tmp_path):
+def test_evaluate_prints_the_missions_errors(done, corridor, tmp_path: Path) -> None:
     trajectory_io.write(tmp_path / "truth.csv", corridor.truth)
     said = command("slam", "evaluate", done[0] / "trajectory.csv", tmp_path / "truth.csv", "--segment", "5").output
     figures = dict(line.split() for line in said.splitlines() if len(line.split()) == 2)
@@ -83,7 +83,9 @@ def test_evaluate_prints_the_missions_errors(done, corridor, tmp_path):
 
 
 @pytest.mark.parametrize("features", ["corners", "orb"])
-def test_an_interrupted_run_goes_on_and_ends_the_same(corridor, tmp_path, monkeypatch, features):
+def test_an_interrupted_run_goes_on_and_ends_the_same(
+    corridor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, features
+) -> None:
     monkeypatch.setattr(tracking, "KEEP_EVERY", 0.0)
     video, state = open_video(corridor.folder / "video.mp4"), tmp_path / "state.npz"
     params = TrackParams.model_validate({"count": 300, "features": features})
@@ -128,7 +130,9 @@ def damages(path):
     }  # fmt: skip
 
 
-def test_a_state_that_is_damaged_or_foreign_is_not_run_and_the_run_begins_anew(corridor, tmp_path, monkeypatch):
+def test_a_state_that_is_damaged_or_foreign_is_not_run_and_the_run_begins_anew(
+    corridor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(tracking, "KEEP_EVERY", 0.0)
     video, state = open_video(corridor.folder / "video.mp4"), tmp_path / "state.npz"
     params = OdometryParams.model_validate({"count": 300})
@@ -144,7 +148,9 @@ def test_a_state_that_is_damaged_or_foreign_is_not_run_and_the_run_begins_anew(c
         assert again.names == whole.names and not (tmp_path / "trap").exists(), name
 
 
-def test_an_interrupted_run_goes_on_only_from_what_the_same_code_made_of_the_same_contents(tmp_path, monkeypatch):
+def test_an_interrupted_run_goes_on_only_from_what_the_same_code_made_of_the_same_contents(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     video, mask = tmp_path / "video.mp4", tmp_path / "mask.png"
 
     def mark(**changes):
@@ -178,7 +184,7 @@ def test_an_interrupted_run_goes_on_only_from_what_the_same_code_made_of_the_sam
         (lambda p: (p / "g.csv").write_text("a,b\n1,2\n"), ("VIDEO", "--gps", "g.csv"), "g.csv"),
     ],
 )
-def test_bad_input_is_named(corridor, tmp_path, change, arguments, text):
+def test_bad_input_is_named(corridor, tmp_path: Path, change, arguments, text) -> None:
     change(tmp_path)
     made = ("absent.mp4", "v.mp4", "empty", "m.png", "g.csv")
     video = corridor.folder / "video.mp4"
@@ -188,7 +194,7 @@ def test_bad_input_is_named(corridor, tmp_path, change, arguments, text):
     assert text in str(error.value)
 
 
-def test_a_video_that_ends_early_and_frames_of_another_size_are_told(corridor, tmp_path):
+def test_a_video_that_ends_early_and_frames_of_another_size_are_told(corridor, tmp_path: Path) -> None:
     import cv2
 
     for i in range(12):
@@ -202,7 +208,7 @@ def test_a_video_that_ends_early_and_frames_of_another_size_are_told(corridor, t
         list(open_video(tmp_path).frames())
 
 
-def test_half_a_video_file_is_read_as_far_as_it_goes(corridor, tmp_path):
+def test_half_a_video_file_is_read_as_far_as_it_goes(corridor, tmp_path: Path) -> None:
     av = pytest.importorskip("av")
     assert av
     whole = tmp_path / "whole.ts"
@@ -219,7 +225,7 @@ def test_half_a_video_file_is_read_as_far_as_it_goes(corridor, tmp_path):
     shutil.rmtree(tmp_path, ignore_errors=True)
 
 
-def test_frames_out_of_order_are_left_out_and_told(corridor, tmp_path):
+def test_frames_out_of_order_are_left_out_and_told(corridor, tmp_path: Path) -> None:
     import cv2
 
     for i in range(4):

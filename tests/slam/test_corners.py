@@ -39,7 +39,7 @@ def frame(world, R):
     return world(pixel_rays(CAMERA).astype(np.float64) @ R.T).astype(np.uint8)
 
 
-def test_charts_and_sphere_agree_everywhere():
+def test_charts_and_sphere_agree_everywhere() -> None:
     charts, rng = Charts(CAMERA), np.random.default_rng(0)
     bearing = rng.normal(size=(3000, 3))
     bearing /= np.linalg.norm(bearing, axis=1, keepdims=True)
@@ -51,7 +51,7 @@ def test_charts_and_sphere_agree_everywhere():
 
 
 @pytest.mark.parametrize("axis", [[0, 1, 0], [1, 0, 0], [0, 0, 1]])
-def test_corners_are_followed_across_seam_and_poles(axis):
+def test_corners_are_followed_across_seam_and_poles(axis) -> None:
     world, charts = sphere(), Charts(CAMERA)
     tracker = CornerTracker(charts, None, 500)
     tracker.look(frame(world, np.eye(3)))
@@ -75,7 +75,7 @@ def test_corners_are_followed_across_seam_and_poles(axis):
         assert polar.sum() > 5 and np.median(off[polar]) < 0.25
 
 
-def test_nothing_is_found_or_followed_on_the_car():
+def test_nothing_is_found_or_followed_on_the_car() -> None:
     world, charts = sphere(), Charts(CAMERA)
     mask = np.full((CAMERA.height, CAMERA.width), 255, np.uint8)
     mask[300:] = 0
@@ -87,7 +87,7 @@ def test_nothing_is_found_or_followed_on_the_car():
     assert len(uv) > 100 and uv[:, 1].max() < 302
 
 
-def test_corners_are_shared_out_over_the_sphere():
+def test_corners_are_shared_out_over_the_sphere() -> None:
     tracker = CornerTracker(Charts(CAMERA), None, 400)
     tracker.look(frame(sphere(), np.eye(3)))
     tracker.refill()
@@ -96,7 +96,7 @@ def test_corners_are_shared_out_over_the_sphere():
     assert counts.min() > 0.4 * counts.mean()
 
 
-def test_a_relative_pose_is_found_among_outliers():
+def test_a_relative_pose_is_found_among_outliers() -> None:
     rng = np.random.default_rng(0)
     T = rigid(exp_so3([0.02, 0.3, -0.05]), np.array([0.6, 0.0, 0.8]))
     xyz = rng.normal(0, 8, (300, 3))

@@ -22,7 +22,7 @@ def drifted(truth, turn=0.002, stretch=1.01):
     return np.stack(out)
 
 
-def test_a_loop_takes_most_of_the_drift_away_and_a_false_one_doesnt_harm():
+def test_a_loop_takes_most_of_the_drift_away_and_a_false_one_doesnt_harm() -> None:
     truth = ring()
     path = drifted(truth)
     way = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(path[:, :3, 3], axis=0), axis=1))])
@@ -37,7 +37,7 @@ def test_a_loop_takes_most_of_the_drift_away_and_a_false_one_doesnt_harm():
     assert off(both).max() < 0.5 * off(path).max()
 
 
-def test_a_panorama_is_known_at_any_heading():
+def test_a_panorama_is_known_at_any_heading() -> None:
     rng = np.random.default_rng(0)
     import cv2
 

@@ -18,7 +18,7 @@ def error(found, poses, which=slice(None)):
     return np.sqrt(((umeyama(found[which], truth, scaled=True).apply(found[which]) - truth) ** 2).sum(axis=1).mean())
 
 
-def test_a_drive_is_found_up_to_scale_and_a_standing_car_stands():
+def test_a_drive_is_found_up_to_scale_and_a_standing_car_stands() -> None:
     times, poses = drive(20)
     odometry = run(times, Follower(poses, scatter(poses)))
     found = positions(odometry)
@@ -28,7 +28,7 @@ def test_a_drive_is_found_up_to_scale_and_a_standing_car_stands():
     assert not any(p.unsure for p in odometry.placed)
 
 
-def test_a_perspective_cameras_narrow_view_is_enough():
+def test_a_perspective_cameras_narrow_view_is_enough() -> None:
     times, poses = drive(10)
 
     class Narrow(Follower):
@@ -40,7 +40,7 @@ def test_a_perspective_cameras_narrow_view_is_enough():
     assert error(positions(odometry), poses) < 0.6
 
 
-def test_gps_ties_the_scale_and_places_the_path():
+def test_gps_ties_the_scale_and_places_the_path() -> None:
     times, poses = drive(30)
     gps = gps_of(times, poses, sigma=0.5)
     trajectory, _ = finish(run(times, Follower(poses, scatter(poses)), gps=gps), gps)
@@ -52,7 +52,7 @@ def test_gps_ties_the_scale_and_places_the_path():
     assert (up < -0.99).all()
 
 
-def test_adjacent_gps_distances_work_too():
+def test_adjacent_gps_distances_work_too() -> None:
     times, poses = drive(15)
     gps = gps_of(times, poses, sigma=0.3)
     odometry = run(times, Follower(poses, scatter(poses)), gps=gps, gps_chords="adjacent")
@@ -60,7 +60,7 @@ def test_adjacent_gps_distances_work_too():
 
 
 @pytest.mark.parametrize("seconds", [0.3, 2.0])
-def test_a_black_stretch_is_bridged_marked_and_never_restarts_at_the_origin(seconds):
+def test_a_black_stretch_is_bridged_marked_and_never_restarts_at_the_origin(seconds) -> None:
     times, poses = drive(20)
     gps, said = gps_of(times, poses, sigma=0.2), []
 
@@ -80,7 +80,7 @@ def test_a_black_stretch_is_bridged_marked_and_never_restarts_at_the_origin(seco
     assert sigma[-1] > 3 * sigma[np.searchsorted(times, 9.5)]
 
 
-def test_a_bus_that_covers_all_is_noticed_by_gps():
+def test_a_bus_that_covers_all_is_noticed_by_gps() -> None:
     times, poses = drive(20)
     gps, said = gps_of(times, poses, sigma=0.2), []
     covered = (times >= 10) & (times < 14)
@@ -100,7 +100,7 @@ def test_a_bus_that_covers_all_is_noticed_by_gps():
     assert off.max() < 20  # of the 36 m that weren't seen
 
 
-def test_moving_cars_are_left_out():
+def test_moving_cars_are_left_out() -> None:
     times, poses = drive(15)
     rng = np.random.default_rng(3)
     moving = rng.random(6000) < 0.35
@@ -120,7 +120,7 @@ def test_moving_cars_are_left_out():
     assert error(positions(run(times, follower)), poses) < 0.6
 
 
-def test_rolling_shutter_is_estimated():
+def test_rolling_shutter_is_estimated() -> None:
     times, poses = drive(12, speed=15)
     readout = 0.03
 
@@ -140,7 +140,7 @@ def test_rolling_shutter_is_estimated():
     assert odometry.map.shared[0] == pytest.approx(readout, rel=0.25)
 
 
-def test_what_left_the_window_is_forgotten_unless_it_is_to_be_kept():
+def test_what_left_the_window_is_forgotten_unless_it_is_to_be_kept() -> None:
     times, poses = drive(25)
     odometry = run(times, Follower(poses, scatter(poses)), window=5, anchors=2)
     held = [len(k.ids) > 0 for k in odometry.map.keyframes]

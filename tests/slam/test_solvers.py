@@ -37,7 +37,7 @@ def positions(solved):
     return solved.poses[:, :3, 3]
 
 
-def test_levenberg_marquardt_ends_where_a_general_solver_does():
+def test_levenberg_marquardt_ends_where_a_general_solver_does() -> None:
     from scipy.optimize import minimize
 
     _, graph = street(4, 12)
@@ -62,7 +62,7 @@ def test_levenberg_marquardt_ends_where_a_general_solver_does():
 
 
 @pytest.mark.parametrize("name", names(solvers.__name__))
-def test_every_backend_finds_the_cameras(name):
+def test_every_backend_finds_the_cameras(name) -> None:
     if name == "adam":
         pytest.importorskip("torch")
     poses, graph = street()
@@ -74,7 +74,7 @@ def test_every_backend_finds_the_cameras(name):
 
 
 @pytest.mark.parametrize("name", names(solvers.__name__))
-def test_a_constraint_of_ones_own_takes_a_few_lines(name):
+def test_a_constraint_of_ones_own_takes_a_few_lines(name) -> None:
     """Wheel odometry: the second camera is where the wheels say, in the first's axes."""
     if name == "adam":
         pytest.importorskip("torch")
@@ -88,7 +88,7 @@ def test_a_constraint_of_ones_own_takes_a_few_lines(name):
         assert np.linalg.norm(positions(solved)[-1]) == pytest.approx(7 * 3.0, rel=0.02)
 
 
-def test_outliers_and_points_behind_the_camera_dont_pull():
+def test_outliers_and_points_behind_the_camera_dont_pull() -> None:
     poses, graph = street()
     bearing = graph.bearing.copy()
     wrong = np.random.default_rng(1).random(len(bearing)) < 0.15
@@ -98,7 +98,7 @@ def test_outliers_and_points_behind_the_camera_dont_pull():
     assert np.abs(positions(solved) - poses[:, :3, 3]).max() < 0.08
 
 
-def test_a_chord_sets_the_scale():
+def test_a_chord_sets_the_scale() -> None:
     poses, graph = street()
     length = float(np.linalg.norm(poses[-1, :3, 3] - poses[0, :3, 3]))
     graph = replace(graph, fixed=np.arange(8) < 1, chords=(Chord(0, 7, 1.2 * length, 0.01),))
@@ -106,7 +106,7 @@ def test_a_chord_sets_the_scale():
     assert np.linalg.norm(positions(solved)[-1]) == pytest.approx(1.2 * length, rel=1e-3)
 
 
-def test_the_gradient_is_half_the_costs_slope():
+def test_the_gradient_is_half_the_costs_slope() -> None:
     """Of everything that a graph may hold, with no end of a chord or factor fixed."""
     _, graph = street(5, 20)
     rng = np.random.default_rng(4)
@@ -131,7 +131,7 @@ def test_the_gradient_is_half_the_costs_slope():
     assert np.allclose(np.concatenate([g, gp.ravel()]), slope / 2, rtol=1e-4, atol=1e-4 * np.abs(slope).max())
 
 
-def test_covariance_grows_away_from_what_is_fixed_and_fits_the_scatter():
+def test_covariance_grows_away_from_what_is_fixed_and_fits_the_scatter() -> None:
     found = []
     for seed in range(12):
         poses, graph = street(5, 60)

@@ -136,5 +136,5 @@ def points(colour=True, n=40_000, rgb=None):
     rng = np.random.default_rng(0)
     xyz = np.column_stack([rng.uniform(-5, 5, (n, 2)), np.zeros(n)]).astype(np.float32)
     colours = np.clip(paint(xyz), 0, 255).astype(np.uint8) if rgb is None else np.tile(np.uint8(rgb), (n, 1))
-    normal = np.tile(np.float32([0, 0, 1]), (n, 1))
+    normal = np.tile(np.array([0, 0, 1], np.float32), (n, 1))
     return PointCloud(Frame(), xyz, colours if colour else None, normal, np.full(n, 11, np.uint8))

@@ -32,7 +32,7 @@ def rows_of(folder):
     return {row["name"]: row for row in json.loads((folder.parent / "agreement" / "agreement.json").read_text())}
 
 
-def test_a_passing_car_leaves_no_ghost(street):
+def test_a_passing_car_leaves_no_ghost(street) -> None:
     for i, pose in enumerate(POSES):
         image = photograph(CAMERA, pose)
         if i == 2:
@@ -52,7 +52,7 @@ def test_a_passing_car_leaves_no_ghost(street):
 
 
 @pytest.mark.parametrize("turn, shift", [(0.5, 0.0), (0.0, 0.2)])
-def test_a_wrong_pose_is_named_and_left_out(street, turn, shift):
+def test_a_wrong_pose_is_named_and_left_out(street, turn, shift) -> None:
     for i, pose in enumerate(POSES):
         true = pose.copy()
         if i == 3:
@@ -68,7 +68,7 @@ def test_a_wrong_pose_is_named_and_left_out(street, turn, shift):
     assert "photo3" not in done.facts["texels_by_photo"]
 
 
-def test_a_blurred_photo_gives_little(street):
+def test_a_blurred_photo_gives_little(street) -> None:
     for i, pose in enumerate(POSES):
         image = grainy(pose)
         street.add(CAMERA, pose, cv2.GaussianBlur(image, (0, 0), 4) if i == 2 else image)
@@ -79,7 +79,7 @@ def test_a_blurred_photo_gives_little(street):
     assert any("photo2" in warning and "blurred" in warning for warning in done.warnings)
 
 
-def test_an_overexposed_photo_is_left_out(street):
+def test_an_overexposed_photo_is_left_out(street) -> None:
     for i, pose in enumerate(POSES):
         street.add(CAMERA, pose, np.full((480, 640, 3), 255, np.uint8) if i == 1 else None)
     _, done = street.run()
@@ -87,7 +87,7 @@ def test_an_overexposed_photo_is_left_out(street):
     assert "photo1" not in done.facts["texels_by_photo"]
 
 
-def test_photos_that_agree_are_all_used_whole(street):
+def test_photos_that_agree_are_all_used_whole(street) -> None:
     for pose in POSES:
         street.add(CAMERA, pose)
     folder, done = street.run()
@@ -95,7 +95,7 @@ def test_photos_that_agree_are_all_used_whole(street):
     assert max(row.get("ghost_share", 0) for row in rows_of(folder).values()) < 0.01
 
 
-def test_one_photo_alone_will_do(street):
+def test_one_photo_alone_will_do(street) -> None:
     street.add(CAMERA, POSES[2])
     _, done = street.run()
     assert done.facts["photos"] == 1 and not done.warnings

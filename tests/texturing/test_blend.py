@@ -49,7 +49,7 @@ def test_texels_show_what_the_photo_shows_there(size: int, warp: tuple[float, fl
         ),
         eye(CAMERA, POSE), blend.Hides(everywhere, pixel_angle(CAMERA), everywhere, everywhere, 1),
     )  # fmt: skip
-    rows = blend.NumbaRows(blend.Laid(owner, flat, corners, np.tile(np.float32([0, 0, 1]), (2, 1))))
+    rows = blend.NumbaRows(blend.Laid(owner, flat, corners, np.tile(np.array([0, 0, 1], np.float32), (2, 1))))
     weighing = blend.Weighing(bias=0.1, power=1.0, feather=4.0, min_cos=0.1, band=-1)
     rows.add(np.arange(2), np.zeros((2, 3), np.float32), look, weighing)
     rgb, seen = np.zeros((size, size, 3), np.uint8), np.zeros((size, size), np.uint8)

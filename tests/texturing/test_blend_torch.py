@@ -14,7 +14,7 @@ pytest.importorskip("torch", reason="torch is not installed (pip install 'scan2s
 
 @pytest.mark.parametrize("name", CAMERAS)
 @pytest.mark.parametrize("band", [2, 0, -1])
-def test_torch_paints_the_same(street, name, band):
+def test_torch_paints_the_same(street, name, band) -> None:
     camera = CAMERAS[name]
     mask = np.full((camera.height, camera.width), 255, np.uint8)
     mask[: camera.height // 3, : camera.width // 4] = 0
@@ -33,7 +33,7 @@ def test_torch_paints_the_same(street, name, band):
 
 @pytest.mark.parametrize("band", [2, 0, -1])
 @pytest.mark.parametrize("name", scattered.CAMERAS)
-def test_torch_adds_the_same(name, band):
+def test_torch_adds_the_same(name, band) -> None:
     from scan2sim.texturing.blend_torch import TorchRows
 
     camera, rng = scattered.CAMERAS[name], np.random.default_rng(7)
@@ -51,7 +51,7 @@ def test_torch_adds_the_same(name, band):
     assert abs(pages[0] - pages[1]).max() <= 1
 
 
-def test_a_device_that_is_not_there_is_named(street):
+def test_a_device_that_is_not_there_is_named(street) -> None:
     street.add(CAMERAS["pinhole"], POSES[0])
     with pytest.raises(SettingError, match="xpu:7"):
         street.run(device="xpu:7")

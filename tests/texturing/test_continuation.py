@@ -29,7 +29,7 @@ def error(rgb, truth, where):
 
 
 @pytest.mark.parametrize("rows", [slice(60, 140), slice(150, 230), slice(230, 310)])
-def test_paving_kerb_and_line_go_on(rows):
+def test_paving_kerb_and_line_go_on(rows) -> None:
     truth, wanted = street(), hole(rows, slice(200, 290))
     rgb, filled = continued(np.where(wanted[..., None], 255, truth), ~wanted, wanted)
     assert filled[wanted].all() and not filled[~wanted].any()
@@ -37,7 +37,7 @@ def test_paving_kerb_and_line_go_on(rows):
     assert (rgb[~wanted] == truth[~wanted]).all()
 
 
-def test_shade_on_one_side_is_met_on_both():
+def test_shade_on_one_side_is_met_on_both() -> None:
     truth = street() * np.linspace(0.4, 1.0, 480, dtype=np.float32)[None, :, None]
     wanted = hole(slice(60, 140), slice(200, 290))
     rgb, _ = continued(truth, ~wanted, wanted)
@@ -46,14 +46,14 @@ def test_shade_on_one_side_is_met_on_both():
         assert abs(rgb[rim].mean() - truth[rim].mean()) < 6
 
 
-def test_other_kinds_of_ground_are_not_copied():
+def test_other_kinds_of_ground_are_not_copied() -> None:
     truth, wanted = street(), hole(slice(160, 192), slice(180, 300))
     kind = np.repeat(np.where(np.arange(360)[::FACTOR] < 200, 1, 2)[:, None], 480 // FACTOR, axis=1).astype(np.int32)
     rgb, _ = continued(truth, ~wanted, wanted, kind)
     assert (rgb[wanted].mean(axis=-1) < 75).mean() < 0.15  # the joints alone, no road
 
 
-def test_what_is_not_wanted_is_left_and_nothing_is_copied_from_it():
+def test_what_is_not_wanted_is_left_and_nothing_is_copied_from_it() -> None:
     truth, wanted = street(), hole(slice(60, 140), slice(200, 290))
     unknown = hole(slice(0, 50), slice(0, 480))
     rgb, filled = continued(np.where(unknown[..., None], 255, truth), ~wanted & ~unknown, wanted)
@@ -61,12 +61,12 @@ def test_what_is_not_wanted_is_left_and_nothing_is_copied_from_it():
     assert rgb[wanted].max() < 230
 
 
-def test_a_picture_of_nothing_known_is_left_alone():
+def test_a_picture_of_nothing_known_is_left_alone() -> None:
     wanted = np.ones((64, 64), bool)
     rgb, filled = continued(np.zeros((64, 64, 3), np.float32), ~wanted, wanted)
     assert not filled.any() and not rgb.any()
 
 
-def test_the_same_picture_is_filled_the_same():
+def test_the_same_picture_is_filled_the_same() -> None:
     truth, wanted = street(), hole(slice(150, 230), slice(200, 290))
     assert (continued(truth, ~wanted, wanted)[0] == continued(truth, ~wanted, wanted)[0]).all()

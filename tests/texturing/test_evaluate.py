@@ -22,36 +22,36 @@ def photo():
 EVERYWHERE = np.ones((120, 160), bool)
 
 
-def test_the_photo_itself_is_perfect(photo):
+def test_the_photo_itself_is_perfect(photo) -> None:
     figures = score(photo, photo, EVERYWHERE)
     assert figures["psnr_db"] > 70 and figures["ssim"] == pytest.approx(1) and figures["sharpness"] == 1
 
 
-def test_a_darker_rendering_is_forgiven_by_the_gain_alone(photo):
+def test_a_darker_rendering_is_forgiven_by_the_gain_alone(photo) -> None:
     figures = score(photo, (photo * 0.8).astype(np.uint8), EVERYWHERE)
     assert figures["psnr_db"] < 22 and figures["psnr_gain_db"] > 45
 
 
-def test_sharpness_tells_soft_from_crisp(photo):
+def test_sharpness_tells_soft_from_crisp(photo) -> None:
     soft = score(photo, cv2.GaussianBlur(photo, (0, 0), 1.5), EVERYWHERE)["sharpness"]
     crisp = np.clip(photo + 1.0 * (photo - cv2.GaussianBlur(photo, (0, 0), 1.5).astype(float)), 0, 255)
     assert soft < 0.5 < 1.2 < score(photo, crisp.astype(np.uint8), EVERYWHERE)["sharpness"]
 
 
-def test_what_lies_outside_the_mask_has_no_say(photo):
+def test_what_lies_outside_the_mask_has_no_say(photo) -> None:
     mask = np.zeros_like(EVERYWHERE)
     mask[30:90, 40:120] = True
     spoiled = np.where(mask[..., None], photo, 255 - photo)
     assert score(photo, spoiled, mask) == pytest.approx(score(photo, photo, mask))
 
 
-def test_nothing_to_count_is_not_a_number(photo):
+def test_nothing_to_count_is_not_a_number(photo) -> None:
     assert all(math.isnan(value) for value in score(photo, photo, ~EVERYWHERE).values())
     flat = np.full_like(photo, 90)
     assert math.isnan(score(flat, flat, EVERYWHERE)["sharpness"])
 
 
-def test_parts_are_pooled_by_pixel_over_photos(photo):
+def test_parts_are_pooled_by_pixel_over_photos(photo) -> None:
     """Errors of 10 and 20 grey levels in parts of different sizes, over two photos."""
     photo = np.full_like(photo, 100)
     sums = np.zeros((3, 5))
@@ -66,7 +66,7 @@ def test_parts_are_pooled_by_pixel_over_photos(photo):
     assert none["pixels"] == 0 and math.isnan(none["psnr_db"]) and math.isnan(none["ssim"])
 
 
-def test_parts_of_one_photo_add_up_to_its_own_figures(photo):
+def test_parts_of_one_photo_add_up_to_its_own_figures(photo) -> None:
     render = cv2.GaussianBlur(photo, (0, 0), 1.0)
     part = np.arange(160)[None] // 40 + 0 * EVERYWHERE
     together = figures(tally(errors(photo, render, EVERYWHERE), part, 4).sum(axis=0))
@@ -76,7 +76,7 @@ def test_parts_of_one_photo_add_up_to_its_own_figures(photo):
     )
 
 
-def test_bands_are_named_by_their_metres():
+def test_bands_are_named_by_their_metres() -> None:
     names = [BAND_NAMES[i] for i in np.digitize([4.99, 5.0, 39.0, 41.0], BANDS)]
     assert names == ["0-5 m", "5-10 m", "20-40 m", "40+ m"]
 
@@ -87,7 +87,7 @@ def held(photo, render, mask):
     return HeldOut(None, photo, shot, mask, errors(photo, render, mask), 1.0, 0.0, 0.0, 0.0, 0.0)
 
 
-def test_error_picture_is_dark_where_alike_bright_where_apart_and_grey_where_nothing_counts(photo):
+def test_error_picture_is_dark_where_alike_bright_where_apart_and_grey_where_nothing_counts(photo) -> None:
     render, mask = photo.copy(), EVERYWHERE.copy()
     render[:60], mask[:, 80:] = np.where(photo[:60] > 127, 0, 255), False
     picture = error_picture(held(photo, render, mask))
@@ -98,7 +98,7 @@ def test_error_picture_is_dark_where_alike_bright_where_apart_and_grey_where_not
     assert (difference[:, 80:] == 128).all()
 
 
-def test_error_picture_of_a_large_photo_is_1600_pixels_wide_at_most():
+def test_error_picture_of_a_large_photo_is_1600_pixels_wide_at_most() -> None:
     large, mask = np.zeros((1000, 2000, 3), np.uint8), np.ones((1000, 2000), bool)
     height, width, _ = error_picture(held(large, large, mask)).shape
     assert 1590 < width <= 1600 and height == pytest.approx(width / 3 / 2, abs=2)

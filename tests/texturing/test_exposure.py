@@ -1,5 +1,7 @@
 """Exposures solved jointly, against those that photos were taken with."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -52,7 +54,7 @@ def stops_of(exposures, street):
     return np.array([np.log2(exposures.gain[view.name]) for view in street.views])
 
 
-def test_exposures_and_tints_are_found(taken, tmp_path):
+def test_exposures_and_tints_are_found(taken, tmp_path: Path) -> None:
     found, facts = solved(taken, tmp_path / "x")
     relative = stops_of(found, taken)
     relative -= relative.mean()
@@ -62,12 +64,12 @@ def test_exposures_and_tints_are_found(taken, tmp_path):
     assert facts["disagreement_after"] < 0.3 * facts["disagreement_before"]
 
 
-def test_the_whole_stays_as_bright_as_the_photos_are(taken, tmp_path):
+def test_the_whole_stays_as_bright_as_the_photos_are(taken, tmp_path: Path) -> None:
     found, _ = solved(taken, tmp_path / "x")
     assert abs(stops_of(found, taken).mean()) < 0.05
 
 
-def test_what_an_earlier_tile_found_stays(taken, tmp_path):
+def test_what_an_earlier_tile_found_stays(taken, tmp_path: Path) -> None:
     first, _ = solved(taken, tmp_path / "x")
     brighter = Exposures({taken.views[1].name: tuple(2 * g for g in first.gain[taken.views[1].name])}, {})
     brighter.save(tmp_path / "prior.json")
@@ -75,7 +77,7 @@ def test_what_an_earlier_tile_found_stays(taken, tmp_path):
     np.testing.assert_allclose(stops_of(found, taken), stops_of(first, taken) + 1, atol=0.1)
 
 
-def test_vignetting_is_found_where_there_is_some(street, tmp_path):
+def test_vignetting_is_found_where_there_is_some(street, tmp_path: Path) -> None:
     for pose in POSES:
         street.add(CAMERAS["pinhole"], pose, exposed(photograph(CAMERAS["pinhole"], pose), -0.2, corners=0.8))
     found, _ = solved(street, tmp_path / "x")
@@ -83,20 +85,20 @@ def test_vignetting_is_found_where_there_is_some(street, tmp_path):
     assert (a + b) / np.log(2) == pytest.approx(0.8, abs=0.25)
 
 
-def test_photos_alike_are_left_alone(street, tmp_path):
+def test_photos_alike_are_left_alone(street, tmp_path: Path) -> None:
     for pose in POSES:
         street.add(CAMERAS["pinhole"], pose)
     found, _ = solved(street, tmp_path / "x")
     assert np.abs(stops_of(found, street)).max() < 0.02 and not found.vignetting
 
 
-def test_switched_off_or_alone_nothing_changes(taken, tmp_path):
+def test_switched_off_or_alone_nothing_changes(taken, tmp_path: Path) -> None:
     assert not solved(taken, tmp_path / "x", solve=False)[0].gain
     taken.views = taken.views[:1]
     assert not solved(taken, tmp_path / "y")[0].gain
 
 
-def test_no_exposure_file_is_refused_by_name(tmp_path):
+def test_no_exposure_file_is_refused_by_name(tmp_path: Path) -> None:
     (tmp_path / "prior.json").write_text('{"gain": {"a": [1, 1]}}')
     with pytest.raises(InputError, match=r"prior\.json"):
         Exposures.load(tmp_path / "prior.json")

@@ -15,7 +15,7 @@ def energy(labels, view, cost, pairs, price):
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_no_labelling_is_much_better(seed):
+def test_no_labelling_is_much_better(seed) -> None:
     rng = np.random.default_rng(seed)
     view = np.array([rng.choice(4, 3, replace=False) for _ in range(7)], np.int32)
     quality = (rng.random((7, 3)) + 0.01).astype(np.float32)
@@ -29,10 +29,10 @@ def test_no_labelling_is_much_better(seed):
     assert solution.energy <= 1.002 * best + 1e-5
 
 
-def test_seams_that_cost_are_fewer():
+def test_seams_that_cost_are_fewer() -> None:
     rng = np.random.default_rng(0)
     n = 400
-    view = np.tile(np.int32([0, 1]), (n, 1))
+    view = np.tile(np.array([0, 1], np.int32), (n, 1))
     quality = (1 + 0.3 * rng.random((n, 2))).astype(np.float32)
     pairs = np.column_stack([np.arange(n - 1), np.arange(1, n)]).astype(np.int32)
 
@@ -43,14 +43,14 @@ def test_seams_that_cost_are_fewer():
     assert seams(0.0) > 100 and seams(0.02) < seams(0.0) / 2 and seams(10.0) == 0
 
 
-def test_unseen_faces_have_no_photo_and_bind_nobody():
-    view = np.int32([[0, 1], [-1, -1], [1, -1]])
-    quality = np.float32([[1, 0.9], [0, 0], [1, 0]])
-    pairs = np.int32([[0, 1], [1, 2]])
-    assert label(view, quality, pairs, np.float32([9, 9])).tolist() == [0, -1, 1]
+def test_unseen_faces_have_no_photo_and_bind_nobody() -> None:
+    view = np.array([[0, 1], [-1, -1], [1, -1]], np.int32)
+    quality = np.array([[1, 0.9], [0, 0], [1, 0]], np.float32)
+    pairs = np.array([[0, 1], [1, 2]], np.int32)
+    assert label(view, quality, pairs, np.array([9, 9], np.float32)).tolist() == [0, -1, 1]
 
 
-def test_neighbours_share_an_edge():
-    pairs, edge = adjacent(np.int32([[0, 1, 2], [2, 1, 3], [3, 1, 4]]))
+def test_neighbours_share_an_edge() -> None:
+    pairs, edge = adjacent(np.array([[0, 1, 2], [2, 1, 3], [3, 1, 4]], np.int32))
     assert sorted(map(tuple, pairs.tolist())) == [(0, 1), (1, 2)]
     assert {tuple(sorted(e)) for e in edge.tolist()} == {(1, 2), (1, 3)}

@@ -133,14 +133,14 @@ def change(before: Path, after: Path):
 
 
 @pytest.fixture
-def pair(tmp_path):
+def pair(tmp_path: Path):
     """Two tiles with the same border and all else different."""
     one = tile(tmp_path / "one", half(-1, 20), bright)
     two = tile(tmp_path / "two", half(1, 31), paint, origin=(4.0, -2.0, 1.0), texel=0.037, turned=True)
     return one, two
 
 
-def test_two_tiles_meet(pair):
+def test_two_tiles_meet(pair) -> None:
     one, two = pair
     mean, _, length = step(one, two)
     assert mean > 15 and length == pytest.approx(8.22, abs=0.01)  # 6.2 m of bent ground, 2 m of wall
@@ -152,7 +152,7 @@ def test_two_tiles_meet(pair):
     assert facts["neighbours"]["two"]["border_m"] == facts["border_m"]
 
 
-def test_what_is_far_from_the_border_stays(pair):
+def test_what_is_far_from_the_border_stays(pair) -> None:
     one, two = pair
     levelled, _ = run(one, [two], reach=1.5)
     added, places = change(one, levelled)
@@ -164,7 +164,7 @@ def test_what_is_far_from_the_border_stays(pair):
         assert (levelled / name).read_bytes() == (one / name).read_bytes()
 
 
-def test_a_step_fades_evenly(tmp_path):
+def test_a_step_fades_evenly(tmp_path: Path) -> None:
     one, two = tile(tmp_path / "a", flat(-6, 0, -3, 3), plain(120, 90, 60)), tmp_path / "b"
     tile(two, flat(0, 6, -3, 3), plain(100, 90, 80))
     added, places = change(one, run(one, [two])[0])
@@ -177,7 +177,7 @@ def test_a_step_fades_evenly(tmp_path):
     assert (added[:, 1] == 0).all()
 
 
-def test_three_tiles_meet_in_a_corner(tmp_path):
+def test_three_tiles_meet_in_a_corner(tmp_path: Path) -> None:
     made = {
         "a": tile(tmp_path / "a", flat(-4, 0, -4, 4), plain(140, 110, 100)),
         "b": tile(tmp_path / "b", flat(0, 4, 0, 4), plain(110, 110, 100), texel=0.026, turned=True),
@@ -197,14 +197,14 @@ def test_three_tiles_meet_in_a_corner(tmp_path):
         assert abs(added[here] + image.read_rgb(made[name] / "page_0.png")[8, 8] - [115, 103, 110]).max() <= 2
 
 
-def test_shared_vertices_are_enough(tmp_path):
+def test_shared_vertices_are_enough(tmp_path: Path) -> None:
     one = tile(tmp_path / "one", half(-1, 20), bright)
     two = tile(tmp_path / "two", half(1, 20, YS[::2]), paint)
     assert step(one, two)[0] > 15
     assert step(run(one, [two])[0], run(two, [one])[0])[0] < 1
 
 
-def test_a_short_border_changes_little(tmp_path):
+def test_a_short_border_changes_little(tmp_path: Path) -> None:
     one = tile(tmp_path / "one", flat(-4, 0, -4, 4), plain(120, 120, 120))
     two = tile(tmp_path / "two", flat(0, 4, 4, 8), plain(120, 120, 120))  # touches at one vertex
     tile(tmp_path / "three", flat(0, 0.5, 0, 0.25), plain(80, 80, 80))  # along one edge
@@ -215,7 +215,7 @@ def test_a_short_border_changes_little(tmp_path):
     assert abs(added[distance > 1.5]).max() <= 4
 
 
-def test_carried_inwards_as_the_slow_way_does():
+def test_carried_inwards_as_the_slow_way_does() -> None:
     rng = np.random.default_rng(0)
     y = np.arange(0, 4, 0.015)
     places = np.column_stack([0.3 * np.sin(y), y, 0 * y])
@@ -237,11 +237,11 @@ def test_carried_inwards_as_the_slow_way_does():
     assert off.mean() < 0.3 and off.max() < 1.5  # rounding, and far places taken together
 
 
-def test_the_same_again_byte_for_byte(pair):
+def test_the_same_again_byte_for_byte(pair) -> None:
     assert same_bytes(run(pair[0], [pair[1]])[0], run(pair[0], [pair[1]])[0])
 
 
-def test_without_neighbours_nothing_changes(pair, tmp_path):
+def test_without_neighbours_nothing_changes(pair, tmp_path: Path) -> None:
     one, _ = pair
     empty, far = tmp_path / "empty", tile(tmp_path / "far", flat(50, 52, 0, 2), paint)
     empty.mkdir()
@@ -253,19 +253,19 @@ def test_without_neighbours_nothing_changes(pair, tmp_path):
     assert same_bytes(folder, empty) and facts["border_m"] == 0
 
 
-def test_inputs_are_left_alone(pair):
+def test_inputs_are_left_alone(pair) -> None:
     before = {path: path.read_bytes() for folder in pair for path in folder.iterdir()}
     run(pair[0], [pair[1]])
     assert all(path.read_bytes() == content for path, content in before.items())
 
 
-def test_a_neighbours_broken_page_is_named(pair):
+def test_a_neighbours_broken_page_is_named(pair) -> None:
     (pair[1] / "page_0.png").write_bytes(b"broken")
     with pytest.raises(InputError, match=r"two/page_0\.png"):
         run(pair[0], [pair[1]])
 
 
-def test_padding_shows_what_the_charts_show(pair):
+def test_padding_shows_what_the_charts_show(pair) -> None:
     page = cv2.imread(str(run(pair[0], [pair[1]])[0] / "page_0.png"))[..., ::-1]
     seen = cv2.imread(str(pair[0] / "page_0_seen.png"), cv2.IMREAD_GRAYSCALE)
     padded = np.ascontiguousarray(page)

@@ -19,7 +19,7 @@ def both():
     return mesh, label
 
 
-def test_charts_are_metric_and_seen_faces_are_laid():
+def test_charts_are_metric_and_seen_faces_are_laid() -> None:
     mesh, label = both()
     charts = photo_charts.cut(mesh, label, CENTRES, 0.02, 2000)
     assert len(charts.face) > 0.95 * (label >= 0).sum()
@@ -31,14 +31,14 @@ def test_charts_are_metric_and_seen_faces_are_laid():
     assert (label[charts.face] >= 0).all()
 
 
-def test_a_chart_belongs_to_one_photo():
+def test_a_chart_belongs_to_one_photo() -> None:
     mesh, label = both()
     charts = photo_charts.cut(mesh, label, CENTRES, 0.02, 2000)
     for k in np.unique(charts.chart):
         assert len(np.unique(label[charts.face[charts.chart == k]])) == 1
 
 
-def test_rectangles_never_meet_and_stay_on_their_page():
+def test_rectangles_never_meet_and_stay_on_their_page() -> None:
     rng = np.random.default_rng(0)
     size = rng.integers(1, 90, (300, 2))
     place, page, pages = photo_charts.pack(size, 256, 3)
@@ -53,13 +53,15 @@ def test_rectangles_never_meet_and_stay_on_their_page():
         assert (place[page == k] >= 0).all()
 
 
-def test_faces_under_others_are_told():
-    flat = np.float32([[[0, 0], [20, 0], [0, 20]], [[0, 0], [20, 0], [0, 20]], [[30, 30], [50, 30], [30, 50]]])
+def test_faces_under_others_are_told() -> None:
+    flat = np.array(
+        [[[0, 0], [20, 0], [0, 20]], [[0, 0], [20, 0], [0, 20]], [[30, 30], [50, 30], [30, 50]]], np.float32
+    )
     covered = photo_charts.overlapping(flat, np.zeros(3, int), [(64, 64)])
     assert covered.tolist() == [False, True, False]
 
 
-def test_no_seen_face_no_chart():
+def test_no_seen_face_no_chart() -> None:
     mesh, label = both()
     charts = photo_charts.cut(mesh, np.full_like(label, -1), CENTRES, 0.02, 2000)
     assert len(charts.face) == 0 and photo_charts.pack(charts.size, 256, 3)[2] == []

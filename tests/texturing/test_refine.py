@@ -94,7 +94,7 @@ def disturbed(rng, *, photo=(0.002, 0.03), turn=(0.005, -0.003, 0.004), shift=(0
 
 
 @pytest.mark.parametrize("model", ["pinhole", "opencv", "fisheye", "equirectangular"])
-def test_disturbed_poses_come_back(tmp_path, model):
+def test_disturbed_poses_come_back(tmp_path: Path, model) -> None:
     camera = CAMERAS[model]
     wrong = disturbed(np.random.default_rng(1))
     views, done = run(tmp_path, made(tmp_path, camera, wrong))
@@ -104,14 +104,14 @@ def test_disturbed_poses_come_back(tmp_path, model):
     assert np.median(after) < 0.35 * np.median(before) and (after < before).all()
 
 
-def test_right_poses_stay_to_the_last_bit(tmp_path):
+def test_right_poses_stay_to_the_last_bit(tmp_path: Path) -> None:
     inputs = made(tmp_path, CAMERAS["pinhole"], POSES)
     views, done = run(tmp_path, inputs)
     assert not done.facts["moved"] and done.facts["matches"] > 1000
     assert all((view.T_world_cam == pose).all() for view, pose in zip(views, POSES, strict=True))
 
 
-def test_a_photo_held_out_moves_nobody_and_goes_with_its_neighbours(tmp_path):
+def test_a_photo_held_out_moves_nobody_and_goes_with_its_neighbours(tmp_path: Path) -> None:
     camera, rng = CAMERAS["pinhole"], np.random.default_rng(2)
     wrong = disturbed(rng, photo=(0.0, 0.0))
     (tmp_path / "a").mkdir(), (tmp_path / "b").mkdir()
@@ -123,7 +123,7 @@ def test_a_photo_held_out_moves_nobody_and_goes_with_its_neighbours(tmp_path):
     assert all((a.T_world_cam == b.T_world_cam).all() for a, b in zip(views, again, strict=True))
 
 
-def test_an_unbelievable_pose_is_left_and_named(tmp_path):
+def test_an_unbelievable_pose_is_left_and_named(tmp_path: Path) -> None:
     camera = CAMERAS["pinhole"]
     wrong = disturbed(np.random.default_rng(3))
     wrong[3] = turned(POSES[3], (0.0, 0.02, 0.0), (0, 0, 0))
@@ -133,14 +133,14 @@ def test_an_unbelievable_pose_is_left_and_named(tmp_path):
     assert off(camera, views[2].T_world_cam, POSES[2]) < 0.5 * off(camera, wrong[2], POSES[2])
 
 
-def test_cameras_of_a_pair_are_two():
+def test_cameras_of_a_pair_are_two() -> None:
     camera = CAMERAS["pinhole"]
     view = View("left/0", camera, np.eye(4), None)
     names, index = lenses([view, replace(view, name="right/0"), replace(view, name="left/1")])
     assert names == ["left", "right"] and index.tolist() == [0, 1, 0]
 
 
-def test_photos_that_cannot_be_compared_stay(tmp_path):
+def test_photos_that_cannot_be_compared_stay(tmp_path: Path) -> None:
     camera = CAMERAS["pinhole"]
     for name, views in (
         ("alone", [View("cam/0", camera, POSES[0], tmp_path / "0.png", time=0.0)]),
@@ -154,7 +154,7 @@ def test_photos_that_cannot_be_compared_stay(tmp_path):
         assert all((a.T_world_cam == b.T_world_cam).all() for a, b in zip(refined, views, strict=True))
 
 
-def test_tiles_without_photos_have_no_such_node():
+def test_tiles_without_photos_have_no_such_node() -> None:
     tile = read_tile(ROOT / "data_samples" / "tile" / "tile.toml")
     nodes = {node.id.name: node for node in recipe(tile, Settings())}
     assert nodes["visibility"].inputs["views"] == nodes["score"].inputs["views"] == Output(NodeId("refine"), "views")

@@ -1,6 +1,7 @@
 """Textures of a made-up street corner against its known paint."""
 
 import json
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -32,7 +33,7 @@ def psnr(a, b):
 
 
 @pytest.mark.parametrize("name", CAMERAS)
-def test_photos_come_back_as_texture(street, name):
+def test_photos_come_back_as_texture(street, name) -> None:
     for pose in POSES:
         street.add(CAMERAS[name], pose)
     street.clouds["terrain"] = points()
@@ -45,7 +46,7 @@ def test_photos_come_back_as_texture(street, name):
     assert done.facts["seen_m2"] == pytest.approx(100 * done.facts["coverage"], rel=0.02)
 
 
-def test_what_the_box_hides_is_not_painted_with_the_box(street):
+def test_what_the_box_hides_is_not_painted_with_the_box(street) -> None:
     street.add(CAMERAS["pinhole"], look_at((-4, 0, 1.2), (0, 0, 0.6)))
     street.clouds["terrain"] = points(rgb=(0, 255, 0))
     folder, done = street.run()
@@ -58,7 +59,7 @@ def test_what_the_box_hides_is_not_painted_with_the_box(street):
     assert 0 < done.facts["coverage"] < 1
 
 
-def test_the_wall_is_painted_from_the_front_only(street):
+def test_the_wall_is_painted_from_the_front_only(street) -> None:
     street.mesh = BOX
     for pose in POSES:
         street.add(CAMERAS["pinhole"], pose)
@@ -71,7 +72,7 @@ def test_the_wall_is_painted_from_the_front_only(street):
     assert (back.seen[back.hit] != 255).mean() > 0.9
 
 
-def test_the_nearer_photo_counts_more(street):
+def test_the_nearer_photo_counts_more(street) -> None:
     camera = CAMERAS["pinhole"]
     white, black = np.full((480, 640, 3), 220, np.uint8), np.full((480, 640, 3), 20, np.uint8)
     street.occluders = (GROUND,)
@@ -84,7 +85,7 @@ def test_the_nearer_photo_counts_more(street):
     assert 60 < rgb[lit & (abs(x) < 0.1)].mean() < 180
 
 
-def test_more_power_is_sharper(street):
+def test_more_power_is_sharper(street) -> None:
     camera = CAMERAS["pinhole"]
     street.occluders = (GROUND,)
     street.add(camera, look_at((-4.5, 0, 2), (-2, 0, 0)), np.full((480, 640, 3), 220, np.uint8))
@@ -93,7 +94,7 @@ def test_more_power_is_sharper(street):
     assert sharp.mean() > soft.mean() + 10
 
 
-def test_unseen_texels_get_the_colours_of_the_points(street):
+def test_unseen_texels_get_the_colours_of_the_points(street) -> None:
     street.clouds["terrain"] = points()
     folder, done = street.run()
     rgb, seen, truth, _, _ = from_above(folder)
@@ -102,7 +103,7 @@ def test_unseen_texels_get_the_colours_of_the_points(street):
     assert done.facts["coverage"] == 0 and done.facts["coloured_m2"] == pytest.approx(100, rel=0.02)
 
 
-def test_points_without_a_colour_lend_none(street):
+def test_points_without_a_colour_lend_none(street) -> None:
     cloud = points()
     grey = cloud.xyz[:, 0] > 0.5
     cloud.rgb[grey] = 128
@@ -114,7 +115,7 @@ def test_points_without_a_colour_lend_none(street):
     assert abs(rgb[far].mean() - truth[x < 0].mean()) < 25
 
 
-def test_the_ground_goes_on_where_no_photo_saw_it(street):
+def test_the_ground_goes_on_where_no_photo_saw_it(street) -> None:
     for pose in POSES:
         street.add(CAMERAS["pinhole"], pose)
     cloud = points()
@@ -133,7 +134,7 @@ def test_the_ground_goes_on_where_no_photo_saw_it(street):
     assert (flat[seen == 255] == rgb[seen == 255]).all(axis=-1).mean() > 0.97  # but where lookups mix both
 
 
-def test_the_black_below_a_car_that_was_taken_out_is_painted_over(street):
+def test_the_black_below_a_car_that_was_taken_out_is_painted_over(street) -> None:
     camera, pose = CAMERAS["pinhole"], look_at((-4.5, 0, 3.0), (-1, 0, 0))
     street.occluders = (GROUND,)
     photo = photograph(camera, pose, meshes=(GROUND,))
@@ -154,13 +155,13 @@ def test_the_black_below_a_car_that_was_taken_out_is_painted_over(street):
     assert not (seen[(abs(x + 1.5) < 1.0) & (abs(y) < 0.5)] == 255).any()
 
 
-def test_the_classes_left_out_lend_no_colours(street):
+def test_the_classes_left_out_lend_no_colours(street) -> None:
     street.clouds["terrain"], street.clouds["rest"] = points(rgb=(10, 200, 10)), points(rgb=(255, 0, 0))
     rgb, *_ = from_above(street.run()[0])
     assert (rgb == [10, 200, 10]).all()
 
 
-def test_points_without_colours_give_their_classes(street):
+def test_points_without_colours_give_their_classes(street) -> None:
     street.clouds["terrain"] = points(colour=False)
     folder, done = street.run()
     rgb, seen, *_ = from_above(folder)
@@ -171,7 +172,7 @@ def test_points_without_colours_give_their_classes(street):
     assert done.facts["filled_m2"] == pytest.approx(100, rel=0.02)
 
 
-def test_without_coloured_points_what_is_unseen_takes_after_its_seen_neighbours(street):
+def test_without_coloured_points_what_is_unseen_takes_after_its_seen_neighbours(street) -> None:
     street.add(CAMERAS["pinhole"], POSES[1], np.full((480, 640, 3), (20, 90, 200), np.uint8))
     street.clouds["terrain"] = points(colour=False)
     rgb, seen, *_ = from_above(street.run()[0])
@@ -179,12 +180,12 @@ def test_without_coloured_points_what_is_unseen_takes_after_its_seen_neighbours(
     assert (rgb[seen == 64] == [20, 90, 200]).all(axis=1).mean() > 0.95
 
 
-def test_nothing_at_all_is_grey(street):
+def test_nothing_at_all_is_grey(street) -> None:
     rgb, seen, *_ = from_above(street.run()[0])
     assert (rgb == 128).all() and (seen == 64).all()
 
 
-def test_masked_pixels_are_not_used(street):
+def test_masked_pixels_are_not_used(street) -> None:
     camera, pose = CAMERAS["pinhole"], POSES[1]
     image = photograph(camera, pose)
     image[240:, :320] = (255, 0, 255)  # the recording car
@@ -198,7 +199,7 @@ def test_masked_pixels_are_not_used(street):
     assert magenta.sum() == 0
 
 
-def test_an_unreadable_photo_is_skipped_and_named(street):
+def test_an_unreadable_photo_is_skipped_and_named(street) -> None:
     for pose in POSES:
         street.add(CAMERAS["pinhole"], pose)
     street.views[1].photo.write_bytes(b"broken")
@@ -213,7 +214,7 @@ def test_an_unreadable_photo_is_skipped_and_named(street):
     assert psnr(rgb[near], truth[near]) > 30
 
 
-def test_held_out_photos_are_never_used(street):
+def test_held_out_photos_are_never_used(street) -> None:
     street.add(CAMERAS["pinhole"], POSES[1])
     street.add(CAMERAS["pinhole"], POSES[2], np.full((480, 640, 3), (255, 0, 255), np.uint8))
     street.held_out = (False, True)
@@ -224,7 +225,7 @@ def test_held_out_photos_are_never_used(street):
     assert list(done.facts["texels_by_photo"]) == ["photo0"]
 
 
-def test_grey_and_sixteen_bit_photos_are_read(street):
+def test_grey_and_sixteen_bit_photos_are_read(street) -> None:
     view = street.add(CAMERAS["pinhole"], POSES[1])
     grey = cv2.imread(str(view.photo), cv2.IMREAD_GRAYSCALE)
     cv2.imwrite(str(view.photo), grey.astype(np.uint16) * 257)
@@ -233,7 +234,7 @@ def test_grey_and_sixteen_bit_photos_are_read(street):
     assert np.ptp(rgb[seen == 255], axis=1).max() <= 1
 
 
-def test_the_same_again_byte_for_byte(street):
+def test_the_same_again_byte_for_byte(street) -> None:
     for pose in POSES:
         street.add(CAMERAS["pinhole"], pose)
     street.clouds["terrain"] = points()
@@ -242,7 +243,7 @@ def test_the_same_again_byte_for_byte(street):
         assert (one / name).read_bytes() == (two / name).read_bytes()
 
 
-def test_room_between_charts_carries_their_colours(street):
+def test_room_between_charts_carries_their_colours(street) -> None:
     street.mesh, street.clouds["terrain"] = BOX, points(rgb=(200, 10, 10))
     folder, _ = street.run()
     page = cv2.imread(str(folder / "page_0.png"))[..., ::-1]
@@ -251,14 +252,14 @@ def test_room_between_charts_carries_their_colours(street):
     assert (abs(page.astype(int) - [200, 10, 10]) <= 1).all()
 
 
-def test_a_mesh_without_faces_passes(street):
+def test_a_mesh_without_faces_passes(street) -> None:
     street.mesh = Mesh(Frame(), np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
     folder, done = street.run()
     assert len(Mesh.load(folder / "mesh.npz")) == 0
     assert done.facts["area_m2"] == 0
 
 
-def test_several_pages_meet_without_a_seam(street):
+def test_several_pages_meet_without_a_seam(street) -> None:
     street.clouds["terrain"] = points()
     street.texel, street.page_size = 0.01, 512
     folder, done = street.run()
@@ -267,7 +268,7 @@ def test_several_pages_meet_without_a_seam(street):
     assert np.abs(rgb - truth).max() < 12  # grey levels, at the seams, too
 
 
-def test_views_survive_their_json(street, tmp_path):
+def test_views_survive_their_json(street, tmp_path: Path) -> None:
     view = street.add(CAMERAS["opencv"], POSES[0], mask=np.zeros((480, 640), np.uint8))
     views_io.save(tmp_path / "v.json", [view], [True])
     (read,) = views_io.load(tmp_path / "v.json")
@@ -278,7 +279,7 @@ def test_views_survive_their_json(street, tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["16 bit", "grey", "cmyk"])
-def test_photos_of_other_kinds_are_read(street, kind):
+def test_photos_of_other_kinds_are_read(street, kind) -> None:
     for pose in POSES:
         view = street.add(CAMERAS["pinhole"], pose)
         rgb = photograph(CAMERAS["pinhole"], pose)
@@ -297,7 +298,7 @@ def test_photos_of_other_kinds_are_read(street, kind):
     assert psnr(rgb[near], truth[near]) > 28
 
 
-def test_an_orthophoto_drapes_what_it_sees_and_no_facade(street):
+def test_an_orthophoto_drapes_what_it_sees_and_no_facade(street) -> None:
     down = np.diag([1.0, -1, -1, 1])
     down[2, 3] = 30.0
     camera = Camera("orthographic", 480, 480, 40.0, 40.0, 239.5, 239.5)  # 12 m, 2.5 cm a pixel

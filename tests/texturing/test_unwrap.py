@@ -1,6 +1,7 @@
 """Unwrapping: charts don't overlap, density is as asked, pages are bounded, and the other backend steps in."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,13 +27,13 @@ def hills(n=24, cell=0.25, seed=0):
 def with_fin(mesh):
     """The mesh with a face standing on an inner edge (three faces there), a repeated face, and an empty one."""
     a, b, c = mesh.faces[len(mesh) // 2]
-    top = mesh.vertices[[a, b]].mean(axis=0) + np.float32([0, 0, 0.4])
+    top = mesh.vertices[[a, b]].mean(axis=0) + np.array([0, 0, 0.4], np.float32)
     vertices = np.concatenate([mesh.vertices, top[None]])
     faces = np.concatenate([mesh.faces, [[a, b, len(vertices) - 1], [a, b, c], [a, a, b]]])
     return Mesh(mesh.frame, vertices, faces.astype(np.int32))
 
 
-def run(mesh, tmp_path, **params):
+def run(mesh, tmp_path: Path, **params):
     mesh.save(tmp_path / "in.npz")
     done = unwrap({"mesh": tmp_path / "in.npz"}, UnwrapParams(**params), tmp_path, silent)
     return Mesh.load(done.files["mesh"]), json.loads(done.files["pages"].read_text()), done
@@ -57,7 +58,7 @@ def owners(mesh, pages, k):
 
 
 @pytest.mark.parametrize("backend", ["uvatlas", "xatlas"])
-def test_charts_do_not_overlap_and_density_is_as_asked(backend, tmp_path):
+def test_charts_do_not_overlap_and_density_is_as_asked(backend, tmp_path: Path) -> None:
     mesh, pages, done = run(hills(), tmp_path, backend=backend, texel=0.02)
     assert mesh.uv.min() >= 0 and mesh.uv.max() <= 1
     assert owners(mesh, pages, 0).max() == 1
@@ -68,7 +69,7 @@ def test_charts_do_not_overlap_and_density_is_as_asked(backend, tmp_path):
 
 
 @pytest.mark.parametrize("backend", ["uvatlas", "xatlas"])
-def test_pages_stay_within_their_size_and_blocks_are_compact(backend, tmp_path):
+def test_pages_stay_within_their_size_and_blocks_are_compact(backend, tmp_path: Path) -> None:
     mesh, pages, _ = run(hills(), tmp_path, backend=backend, texel=0.02, page_size=256)
     assert len(pages) > 1 and sorted(set(mesh.page.tolist())) == list(range(len(pages)))
     assert all(max(p.values()) <= 256 for p in pages)
@@ -77,7 +78,7 @@ def test_pages_stay_within_their_size_and_blocks_are_compact(backend, tmp_path):
     assert np.median(spread) < 5  # of 6 m
 
 
-def test_a_mesh_that_is_no_manifold_is_mended_for_uvatlas(tmp_path):
+def test_a_mesh_that_is_no_manifold_is_mended_for_uvatlas(tmp_path: Path) -> None:
     mesh, _, done = run(with_fin(hills()), tmp_path, backend="uvatlas", texel=0.02)
     assert done.facts["fallbacks"] == 0
     flat = mesh.uv[:-1]
@@ -85,7 +86,7 @@ def test_a_mesh_that_is_no_manifold_is_mended_for_uvatlas(tmp_path):
     assert (area > 0).all()
 
 
-def test_cutting_leaves_every_edge_to_two_faces_at_most():
+def test_cutting_leaves_every_edge_to_two_faces_at_most() -> None:
     faces, old = manifold(with_fin(hills()).faces[:-1])
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     assert np.unique(edges, axis=0, return_counts=True)[1].max() <= 2
@@ -94,7 +95,7 @@ def test_cutting_leaves_every_edge_to_two_faces_at_most():
     assert len(same) == len(hills().vertices)  # a manifold stays in one piece
 
 
-def test_the_other_backend_steps_in(tmp_path, monkeypatch):
+def test_the_other_backend_steps_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     real = unwrap_module._in_child
 
     def refuse(mesh, blocks, backend, params):
@@ -106,23 +107,23 @@ def test_the_other_backend_steps_in(tmp_path, monkeypatch):
     assert "xatlas" in done.warnings[0]
 
 
-def test_a_mesh_without_faces_passes(tmp_path):
+def test_a_mesh_without_faces_passes(tmp_path: Path) -> None:
     mesh, pages, done = run(hills().keep(np.zeros(1152, bool)), tmp_path)
     assert len(mesh) == 0 and mesh.uv.shape == (0, 3, 2) and pages == []
     assert done.facts["pages"] == 0
 
 
-def test_the_same_again(tmp_path):
+def test_the_same_again(tmp_path: Path) -> None:
     first, _, _ = run(hills(), tmp_path, backend="xatlas", texel=0.02)
     again, _, _ = run(hills(), tmp_path, backend="xatlas", texel=0.02)
     np.testing.assert_array_equal(first.uv, again.uv)
 
 
-def test_vegetation_is_textured_at_three_centimetres():
+def test_vegetation_is_textured_at_three_centimetres() -> None:
     assert UnwrapParams(**UNWRAP.class_defaults["vegetation"]).texel == 0.03
 
 
-def test_what_an_orthophoto_drapes_is_laid_flat_at_half_its_pixels(tmp_path):
+def test_what_an_orthophoto_drapes_is_laid_flat_at_half_its_pixels(tmp_path: Path) -> None:
     from scan2sim.pipeline.io import views as views_io
     from scan2sim.pipeline.types import Camera, View
     from scan2sim.texturing.choose import Choice

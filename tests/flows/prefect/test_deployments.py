@@ -111,7 +111,7 @@ def test_other_versions_are_refused(folder: Path) -> None:
     item = planned(folder, 1)[0]
     check_version(item, versions())
     with pytest.raises(UnavailableError, match=r"this worker has scan2sim \S+ instead of 9\.9.*same version on all"):
-        check_version(item, versions() | {"scan2sim": "9.9"})
+        check_version(item, {**versions(), "scan2sim": "9.9"})
 
 
 @on("sqlite")

@@ -8,7 +8,8 @@ from unittest.mock import patch
 
 import scan2sim.flows.deployed.prefect_settings  # noqa: F401  # isort: skip
 from prefect import flow
-from prefect.states import Completed, State
+from prefect.client.schemas.objects import State
+from prefect.states import Completed
 
 from scan2sim.flows.deployed.tile import by_tasks
 from scan2sim.flows.engine.lock import locked
@@ -20,10 +21,10 @@ from tests.flows.prefect.toy_steps import STEPS, planned
 
 def toy_tiles(folder: str, tiles: int, gate: str | None, runner: str, pretend: str | None) -> int:
     """All tiles; returns the sum of what came out."""
-    told = versions() | ({"scan2sim": pretend} if pretend else {})
+    told = {**versions(), **({"scan2sim": pretend} if pretend else {})}
     with patch("scan2sim.flows.deployed.tile.versions", lambda: told):
         run = by_tasks(runner, 2)
-    outcome = run(planned(Path(folder), tiles, gate and Path(gate)), Store(Path(folder) / "steps"))
+    outcome = run(planned(Path(folder), tiles, Path(gate) if gate else None), Store(Path(folder) / "steps"))
     outcome.check()
     return sum(outcome.of_tile(str(tile))[STEPS[-1]].facts["total"] for tile in range(tiles))
 

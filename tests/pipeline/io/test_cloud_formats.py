@@ -7,6 +7,7 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from scan2sim.pipeline.io.las_csv import import_las
 from scan2sim.pipeline.io.tile import read_tile, write_tile
 from scan2sim.pipeline.types import Frame, PointCloud
 from tests.pipeline.io.test_clouds import FRAME, made, write_ply
+from tests.present import present
 
 N = 1000
 
@@ -43,14 +45,16 @@ def write_copc(path: Path, cloud: PointCloud, levels: int = 2) -> None:
     cell = np.minimum(np.floor((xyz - low) / span * 2.0 ** depth[:, None]), 2.0 ** depth[:, None] - 1).astype(int)
     keys, node = np.unique(np.column_stack([depth, cell]), axis=0, return_inverse=True)
     writer = copclib.FileWriter(str(path), config)
+    rgb, time = present(cloud.rgb), present(cloud.time)
+    label, intensity = present(cloud.label), present(cloud.intensity)
     for k, key in enumerate(keys.tolist()):
         points = copclib.Points(header)
         for i in np.flatnonzero(node.ravel() == k):
             point = points.CreatePoint()
             point.x, point.y, point.z = xyz[i]
-            point.red, point.green, point.blue = (int(v) * 257 for v in cloud.rgb[i])
-            point.classification, point.intensity = int(cloud.label[i]), int(cloud.intensity[i])
-            point.gps_time = cloud.time[i]
+            point.red, point.green, point.blue = (int(v) * 257 for v in rgb[i])
+            point.classification, point.intensity = int(label[i]), int(intensity[i])
+            point.gps_time = time[i]
             points.AddPoint(point)
         writer.AddNode(copclib.VoxelKey(*key), points)
     writer.Close()
@@ -68,11 +72,12 @@ def write_e57(path: Path, cloud: PointCloud) -> None:
         own = turn.inv().apply(part.frame.to_crs(part.xyz) - at)
         x, y, z, w = turn.as_quat()
         data = {f"cartesian{axis}": own[:, i] for i, axis in enumerate("XYZ")}
-        data |= {f"color{name}": part.rgb[:, i] for i, name in enumerate(("Red", "Green", "Blue"))}
-        data["intensity"] = part.intensity / 65535.0
+        data |= {f"color{name}": present(part.rgb)[:, i] for i, name in enumerate(("Red", "Green", "Blue"))}
+        data["intensity"] = present(part.intensity) / 65535.0
         limits = type("Limits", (), {"intensityMinimum": 0.0, "intensityMaximum": 1.0})()
         for axis, low, high in zip("xyz", own.min(axis=0), own.max(axis=0), strict=True):
-            setattr(limits, f"{axis}Minimum", low), setattr(limits, f"{axis}Maximum", high)
+            setattr(limits, f"{axis}Minimum", low)
+            setattr(limits, f"{axis}Maximum", high)
         file.write_scan_raw(data, rotation=np.array([w, x, y, z]), translation=at, scan_header=limits)
     file.close()
 
@@ -84,7 +89,7 @@ def pcd(data: str, double: bool = True) -> Callable[[Path, PointCloud], None]:
         rows = np.zeros(len(cloud), row)
         for i, axis in enumerate("xyz"):
             rows[axis] = cloud.frame.to_crs(cloud.xyz)[:, i] if double else cloud.xyz[:, i]
-        red, green, blue = cloud.rgb.astype(np.uint32).T
+        red, green, blue = present(cloud.rgb).astype(np.uint32).T
         rows["rgb"] = red << 16 | green << 8 | blue
         rows["label"], rows["intensity"] = cloud.label, cloud.intensity
         write_pcd(path, rows, data)
@@ -94,7 +99,7 @@ def pcd(data: str, double: bool = True) -> Callable[[Path, PointCloud], None]:
 
 def write_pcd(path: Path, rows: np.ndarray, data: str, count: int | None = None) -> None:
     kinds = {"f": "F", "u": "U", "i": "I", "V": "U"}
-    names = rows.dtype.names
+    names = present(rows.dtype.names)
     types = [rows.dtype[name] for name in names]
     n = len(rows) if count is None else count
     head = "\n".join(
@@ -123,7 +128,8 @@ def write_pcd(path: Path, rows: np.ndarray, data: str, count: int | None = None)
 
 def lzf(plain: bytes) -> bytes:
     """Lehmann's LZF, greedy: back references of three bytes and more, found by a table of triples."""
-    out, literal, seen, i = bytearray(), bytearray(), {}, 0
+    out, literal, i = bytearray(), bytearray(), 0
+    seen: dict[bytes, int] = {}
 
     def flush() -> None:
         for at in range(0, len(literal), 32):
@@ -157,9 +163,9 @@ def lzf(plain: bytes) -> bytes:
 def text(delimiter: str, heading: str | None, wide: bool = False) -> Callable[[Path, PointCloud], None]:
     def write(path: Path, cloud: PointCloud) -> None:
         rows = [heading] if heading else []
-        colours = cloud.rgb.astype(int) * (257 if wide else 1)
+        colours = present(cloud.rgb).astype(int) * (257 if wide else 1)
         for place, rgb, intensity, label in zip(
-            cloud.frame.to_crs(cloud.xyz), colours, cloud.intensity, cloud.label, strict=True
+            cloud.frame.to_crs(cloud.xyz), colours, present(cloud.intensity), present(cloud.label), strict=True
         ):
             rows.append(delimiter.join([*(f"{v:.4f}" for v in place), *map(str, rgb), str(intensity), str(label)]))
         path.write_text("\n".join(rows) + "\n")
@@ -174,7 +180,7 @@ def ept(kind: str) -> Callable[[Path, PointCloud], None]:
         from pyproj import CRS
 
         places = {"type": "signed", "size": 4, "scale": 0.001}
-        schema = [
+        schema: list[dict[str, Any]] = [
             *({"name": axis, "offset": float(o), **places} for axis, o in zip("XYZ", FRAME.origin, strict=True)),
             *({"name": name, "type": "unsigned", "size": 2} for name in ("Intensity", "Red", "Green", "Blue")),
             {"name": "Classification", "type": "unsigned", "size": 1},
@@ -194,7 +200,7 @@ def ept(kind: str) -> Callable[[Path, PointCloud], None]:
             for i, axis in enumerate("XYZ"):
                 rows[axis] = np.rint(part.xyz[:, i].astype(float) / 0.001)
             for i, name in enumerate(("Red", "Green", "Blue")):
-                rows[name] = part.rgb[:, i].astype(np.uint16) * 257
+                rows[name] = present(part.rgb)[:, i].astype(np.uint16) * 257
             rows["Intensity"], rows["Classification"], rows["GpsTime"] = part.intensity, part.label, part.time
             if kind == "binary":
                 file.with_suffix(".bin").write_bytes(rows.tobytes())
@@ -254,7 +260,7 @@ def same(form: Format, read: PointCloud, cloud: PointCloud, precision: float) ->
     """Points come in the order of writing, but for those of an octree, which are told by their times."""
     assert len(read) == len(cloud)
     if not form.ordered:
-        read, cloud = read.take(np.argsort(read.time)), cloud.take(np.argsort(cloud.time))
+        read, cloud = read.take(np.argsort(present(read.time))), cloud.take(np.argsort(present(cloud.time)))
     error = read.frame.to_crs(read.xyz) - cloud.frame.to_crs(cloud.xyz)
     assert np.abs(error).max() < precision
     for name in ("rgb", "label", "time", "intensity"):
@@ -269,7 +275,7 @@ def test_a_cloud_comes_back(written: tuple[Format, Path, PointCloud]) -> None:
     form, path, cloud = written
     header = clouds.read_header(path)
     assert header.count == N and (header.crs is not None) == form.crs
-    assert not form.crs or "UTM zone 32N" in header.crs
+    assert not form.crs or "UTM zone 32N" in present(header.crs)
     places = cloud.frame.to_crs(cloud.xyz)
     assert np.abs(header.low - places.min(axis=0)).max() < 2e-3
     assert np.abs(header.high - places.max(axis=0)).max() < 2e-3
@@ -389,7 +395,7 @@ def test_pcd_files_of_open3d(tmp_path: Path, compressed: bool) -> None:
     assert o3d.io.write_point_cloud(str(tmp_path / "c.pcd"), cloud, compressed=compressed)
     read = clouds.read(tmp_path / "c.pcd", Frame())
     assert np.abs(read.xyz - np.asarray(cloud.points)).max() < 1e-5
-    assert np.array_equal(read.rgb, np.rint(np.asarray(cloud.colors) * 255))
+    assert np.array_equal(present(read.rgb), np.rint(np.asarray(cloud.colors) * 255))
 
 
 @pytest.mark.parametrize(
@@ -494,7 +500,7 @@ def test_a_real_tile_as_copc(real_data: Path, tmp_path: Path) -> None:
         assert len(reader.query()) == len(cloud) and reader.header.point_count == len(cloud)
     read = clouds.read(tmp_path / "c.copc.laz", frame)
     assert np.abs(np.sort(read.xyz, axis=0) - np.sort(cloud.xyz, axis=0)).max() < 1e-3
-    assert np.array_equal(np.bincount(read.label), np.bincount(cloud.label))
-    assert np.array_equal(np.sort(read.time), np.sort(cloud.time))
+    assert np.array_equal(np.bincount(present(read.label)), np.bincount(present(cloud.label)))
+    assert np.array_equal(np.sort(present(read.time)), np.sort(present(cloud.time)))
     tile = read_tile(import_las([tmp_path / "c.copc.laz"], tmp_path / "tile"))
     assert tile.frame.crs == "EPSG:2154" and len(clouds.read(tile.clouds[0], tile.frame)) == len(cloud)

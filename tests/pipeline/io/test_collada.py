@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -10,15 +11,17 @@ import pytest
 from scan2sim.pipeline.io import textured
 from scan2sim.pipeline.io.meshes import Look
 from scan2sim.pipeline.io.meshes import collada as dae
+from scan2sim.pipeline.types import Mesh
 from tests.pipeline import made_up
+from tests.present import present
 
 
 @pytest.mark.parametrize("make", [made_up.ground, made_up.house])
-def test_triangles_uv_and_pages_survive(tmp_path: Path, make) -> None:
+def test_triangles_uv_and_pages_survive(tmp_path: Path, make: Callable[[], Mesh]) -> None:
     import collada
 
     mesh = make()
-    surface = textured.read(made_up.textured(tmp_path / "in", mesh))
+    surface = present(textured.read(made_up.textured(tmp_path / "in", mesh)))
     dae.write(tmp_path / "a.dae", surface, Look("a", ("m_0", "m_1"), ("m_0.png", "m_1.png"), (0, 1)))
     read = collada.Collada(str(tmp_path / "a.dae"))
     assert read.assetInfo.upaxis == "Z_UP" and read.assetInfo.unitmeter == 1.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,7 +17,8 @@ from scan2sim.pipeline.io.import_model import import_model
 from scan2sim.pipeline.io.models import Photos
 from scan2sim.pipeline.io.models.colmap import camera_of, read
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.pipeline.types import Frame, PointCloud
+from scan2sim.pipeline.types import F64, Frame, PointCloud
+from tests.present import present
 
 pycolmap = pytest.importorskip("pycolmap")
 
@@ -36,7 +38,7 @@ CAMERAS = {
 }
 
 
-def make_model(folder: Path, kinds: list[str], n: int = 40) -> tuple[object, dict[str, np.ndarray]]:
+def make_model(folder: Path, kinds: list[str], n: int = 40) -> tuple[Any, dict[str, F64]]:
     """A reconstruction with a camera and a photo of each kind, and COLMAP's own projections of its points."""
     rng = np.random.default_rng(1)
     model = pycolmap.Reconstruction()
@@ -84,7 +86,7 @@ def test_text_and_binary_give_the_same_tile(tmp_path: Path) -> None:
     assert tiles[0].read_text() == tiles[1].read_text()
     first, second = (read_tile(tile) for tile in tiles)
     a, b = (clouds.read(tile.clouds[0], tile.frame) for tile in (first, second))
-    assert np.array_equal(a.xyz, b.xyz) and np.array_equal(a.rgb, b.rgb)
+    assert np.array_equal(a.xyz, b.xyz) and np.array_equal(present(a.rgb), present(b.rgb))
 
 
 def test_sparse_points_keep_place_and_colour(tmp_path: Path) -> None:
@@ -93,7 +95,7 @@ def test_sparse_points_keep_place_and_colour(tmp_path: Path) -> None:
     cloud = clouds.read(tile.clouds[0], tile.frame)
     points = [point for _, point in sorted(model.points3D.items())]
     assert np.abs(tile.frame.to_crs(cloud.xyz) - [p.xyz for p in points]).max() < 1e-3
-    assert np.array_equal(cloud.rgb, [p.color for p in points])
+    assert np.array_equal(present(cloud.rgb), [p.color for p in points])
 
 
 def test_up_and_scale_turn_photos_and_points_together(tmp_path: Path) -> None:

@@ -12,11 +12,12 @@ import numpy as np
 from scan2sim.pipeline.io import textured
 from scan2sim.pipeline.io.meshes.glb import write_world
 from tests.pipeline import made_up
+from tests.present import present
 
 
 def _write(folder: Path) -> Path:
     surfaces = {
-        group: textured.read(made_up.textured(folder / group, mesh))
+        group: present(textured.read(made_up.textured(folder / group, mesh)))
         for group, mesh in {"terrain": made_up.ground(), "building": made_up.house()}.items()
     }
     write_world(folder / "a.glb", surfaces)
@@ -26,7 +27,7 @@ def _write(folder: Path) -> Path:
 def test_a_reader_gets_all_triangles_y_up(tmp_path: Path) -> None:
     import trimesh
 
-    scene = trimesh.load(_write(tmp_path), process=False)
+    scene = trimesh.load_scene(_write(tmp_path), process=False)
     assert set(scene.geometry) == {"terrain_0", "terrain_1", "building_0", "building_1"}
     np.testing.assert_allclose(scene.bounds, [[-10, -0.5, -10], [10, 4.5, 10]], atol=1e-4)
     for group, mesh in {"terrain": made_up.ground(), "building": made_up.house()}.items():

@@ -62,8 +62,8 @@ def gpx(version: str) -> str:
 
 def nmea() -> str:
     lines = []
-    for time, *place in points():
-        lines += [gga(time, *place), rmc(time)]  # the date follows its fix, over midnight too
+    for time, lat, lon, height in points():
+        lines += [gga(time, lat, lon, height), rmc(time)]  # the date follows its fix, over midnight too
     lines.insert(2, gga(START + 0.5, LAT + 0.1, LON, 250, quality=0))
     lines.insert(5, gga(START + 1.5, LAT, LON, 250).replace("250", "251"))  # wrong checksum
     lines.append(gga(START + 20, LAT, LON, 250, hdop=9.9))

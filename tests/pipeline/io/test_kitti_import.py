@@ -146,7 +146,7 @@ def test_points_and_photos_are_where_they_were_in_the_world(drive: Drive, tmp_pa
 def test_points_get_the_colour_of_their_own_photo_and_others_are_grey(drive: Drive, tmp_path: Path) -> None:
     tile = read_tile(import_kitti_raw(drive.folder, tmp_path / "tile", frames=(0, 0)))
     cloud = clouds.read(tile.clouds[0], tile.frame)
-    inside = (drive.pixels > 5).all(axis=1) & (drive.pixels < [WIDTH - 5, HEIGHT - 5]).all(axis=1)
+    inside = np.all((drive.pixels > 5) & (drive.pixels < [WIDTH - 5, HEIGHT - 5]), axis=1)
     inside[45:] = False
     assert inside.sum() > 30 and cloud.rgb is not None
     assert np.array_equal(cloud.rgb[inside], drive.rgb[inside])

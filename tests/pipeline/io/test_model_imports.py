@@ -67,7 +67,7 @@ def agrees(model: Model, lens: Lens, size: tuple[int, int] = (W, H), wide: float
 
 def brown(
     f: tuple[float, float], c: tuple[float, float], k: tuple[float, ...], p: tuple[float, float], skew: float = 0
-):
+) -> Lens:
     """Brown's lens as photogrammetry writes it: k of r2, r4, ...; p[0] belongs to r2 + 2 x2 in x."""
 
     def lens(xyz: F64) -> F64:
@@ -148,7 +148,8 @@ def on_earth(xyz: F64, crs: str = "EPSG:32633") -> F64:
     """East, north, up of the reference to the CRS, by PROJ's own topocentric conversion."""
     steps = "+proj=pipeline +step +inv +proj=topocentric +ellps=WGS84 +lat_0=52.52 +lon_0=13.4 +h_0=40 "
     steps += "+step +inv +proj=cart +ellps=WGS84 +step +proj=unitconvert +xy_in=rad +xy_out=deg"
-    lon, lat, height = Transformer.from_pipeline(steps).transform(*xyz.T)
+    x, y, z = xyz.T
+    lon, lat, height = Transformer.from_pipeline(steps).transform(x, y, z)
     return np.column_stack([*Transformer.from_crs("EPSG:4326", crs, always_xy=True).transform(lon, lat), height])
 
 
@@ -235,7 +236,9 @@ def test_metashape_sees_the_same_pixels(tmp_path: Path, case: str) -> None:
         ("frame", {"f": -1.0}, "its focal length"),
     ],
 )
-def test_a_metashape_lens_without_a_counterpart_is_refused(tmp_path: Path, kind: str, values: dict, cause: str) -> None:
+def test_a_metashape_lens_without_a_counterpart_is_refused(
+    tmp_path: Path, kind: str, values: dict[str, float], cause: str
+) -> None:
     with pytest.raises(InputError, match=cause):
         read("metashape", metashape(tmp_path / "cameras.xml", kind, values), images())
 

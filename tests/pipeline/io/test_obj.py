@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -9,21 +10,23 @@ import pytest
 
 from scan2sim.pipeline.io import textured
 from scan2sim.pipeline.io.meshes import Look, obj
+from scan2sim.pipeline.types import Mesh
 from tests.pipeline import made_up
+from tests.present import present
 
 LOOK = Look("a", ("m_0", "m_1"), ("m_0.png", "m_1.png"), (0, 1))
 
 
 @pytest.mark.parametrize("make", [made_up.ground, made_up.house])
-def test_triangles_uv_and_pages_survive(tmp_path: Path, make) -> None:
+def test_triangles_uv_and_pages_survive(tmp_path: Path, make: Callable[[], Mesh]) -> None:
     import trimesh
 
     mesh = make()
-    surface = textured.read(made_up.textured(tmp_path / "in", mesh))
+    surface = present(textured.read(made_up.textured(tmp_path / "in", mesh)))
     obj.write(tmp_path / "a.obj", surface, LOOK)
     for page in (0, 1):
         (tmp_path / f"m_{page}.png").write_bytes(surface.pages[page].read_bytes())
-    read = trimesh.load(tmp_path / "a.obj", process=False, force="scene")
+    read = trimesh.load_scene(tmp_path / "a.obj", process=False)
     for page, (corners, uv) in made_up.by_page(mesh).items():
         part = next(g for g in read.geometry.values() if g.visual.material.name == f"m_{page}")
         np.testing.assert_allclose(part.vertices[part.faces], corners, atol=1e-4)
@@ -32,7 +35,7 @@ def test_triangles_uv_and_pages_survive(tmp_path: Path, make) -> None:
 
 
 def test_texture_coordinates_are_said_once_and_v_goes_up(tmp_path: Path) -> None:
-    surface = textured.read(made_up.textured(tmp_path / "in", made_up.house()))
+    surface = present(textured.read(made_up.textured(tmp_path / "in", made_up.house())))
     obj.write(tmp_path / "a.obj", surface, LOOK)
     lines = (tmp_path / "a.obj").read_text().splitlines()
     vt = [line for line in lines if line.startswith("vt ")]
@@ -45,14 +48,14 @@ def test_texture_coordinates_are_said_once_and_v_goes_up(tmp_path: Path) -> None
 
 
 def test_normals_point_outwards(tmp_path: Path) -> None:
-    surface = textured.read(made_up.textured(tmp_path / "in", made_up.ground()))
+    surface = present(textured.read(made_up.textured(tmp_path / "in", made_up.ground())))
     assert surface.normal[:, 2].min() > 0.9
     np.testing.assert_allclose(np.linalg.norm(surface.normal, axis=1), 1, atol=1e-5)
 
 
 def test_parts_are_small_and_lose_nothing(tmp_path: Path) -> None:
     mesh = made_up.ground()
-    parts = textured.read(made_up.textured(tmp_path / "in", mesh)).parts(1000)
+    parts = present(textured.read(made_up.textured(tmp_path / "in", mesh))).parts(1000)
     assert max(map(len, parts)) <= 1000
     assert sum(map(len, parts)) == len(mesh)
     assert sum(part.mesh.face_area.sum() for part in parts) == pytest.approx(mesh.face_area.sum(), rel=1e-5)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from PIL import Image, TiffImagePlugin
 
@@ -12,18 +14,18 @@ from scan2sim.pipeline.cameras import project, ray_origins, unproject
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.io import image
 from scan2sim.pipeline.io.orthophoto import read_view
-from scan2sim.pipeline.types import Frame
+from scan2sim.pipeline.types import F32, Frame, View
 
 FEET = Frame("local", (300.0, 600.0, 10.0), 0.3048)
 UTM = Frame("EPSG:32633", (500000.0, 5400000.0, 200.0))
 
 
-def picture(path: Path, **how: object) -> Path:
+def picture(path: Path, **how: Any) -> Path:
     Image.fromarray(np.zeros((40, 60, 3), np.uint8)).save(path, **how)
     return path
 
 
-def pixel_of(view, xyz):
+def pixel_of(view: View, xyz: npt.ArrayLike) -> F32:
     T = np.linalg.inv(view.T_world_cam)
     uv, valid = project(view.camera, np.atleast_2d(xyz) @ T[:3, :3].T + T[:3, 3])
     assert valid.all()

@@ -11,13 +11,16 @@ import pytest
 from scan2sim.pipeline.io import sdf
 from scan2sim.pipeline.types import Frame
 from tests.pipeline import made_up
+from tests.present import present
 
 
-def _world(path: Path, place: sdf.Georeference | None, offset: tuple[float, float, float] = (0.0, 0.0, 0.0)):
+def _world(
+    path: Path, place: sdf.Georeference | None, offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+) -> ET.Element:
     sdf.write_world(path, "street", place, offset)
     root = ET.parse(path).getroot()
     assert root.get("version") == "1.9"
-    return root.find("world")
+    return present(root.find("world"))
 
 
 def test_spherical_coordinates_are_those_of_the_origin(tmp_path: Path) -> None:
@@ -26,10 +29,10 @@ def test_spherical_coordinates_are_those_of_the_origin(tmp_path: Path) -> None:
     world = _world(tmp_path / "a.sdf", sdf.Georeference.of(made_up.UTM))
     x, y, z = made_up.UTM.origin
     lon, lat = Transformer.from_crs("EPSG:32632", "EPSG:4326", always_xy=True).transform(x, y)
-    place = world.find("spherical_coordinates")
-    assert float(place.findtext("latitude_deg")) == pytest.approx(lat, abs=1e-8)
-    assert float(place.findtext("longitude_deg")) == pytest.approx(lon, abs=1e-8)
-    assert float(place.findtext("elevation")) == z
+    place = present(world.find("spherical_coordinates"))
+    assert float(place.findtext("latitude_deg", "")) == pytest.approx(lat, abs=1e-8)
+    assert float(place.findtext("longitude_deg", "")) == pytest.approx(lon, abs=1e-8)
+    assert float(place.findtext("elevation", "")) == z
     assert place.findtext("surface_model") == "EARTH_WGS84"
     assert place.findtext("world_frame_orientation") == "ENU"
 
@@ -37,14 +40,14 @@ def test_spherical_coordinates_are_those_of_the_origin(tmp_path: Path) -> None:
 def test_heading_is_minus_the_convergence(tmp_path: Path) -> None:
     # east of the central meridian, north of the equator, grid north lies east of true north:
     # the world is turned clockwise, which SDF counts as negative
-    assert sdf.Georeference.of(made_up.UTM).heading == pytest.approx(-1.90, abs=0.01)
+    assert present(sdf.Georeference.of(made_up.UTM)).heading == pytest.approx(-1.90, abs=0.01)
     west = replace(made_up.UTM, origin=(310_000.0, 5_335_000.0, 500.0))
-    assert sdf.Georeference.of(west).heading == pytest.approx(1.90, abs=0.01)
+    assert present(sdf.Georeference.of(west)).heading == pytest.approx(1.90, abs=0.01)
 
 
 def test_feet_are_brought_to_metres() -> None:
     feet = Frame("EPSG:2263", (300_000.0, 60_000.0, 30.0), 1200 / 3937)  # New York, US survey feet
-    place = sdf.Georeference.of(feet)
+    place = present(sdf.Georeference.of(feet))
     assert (place.latitude, place.longitude) == pytest.approx((40.7, -74.0), abs=0.1)
     assert place.elevation == pytest.approx(30.0)
 

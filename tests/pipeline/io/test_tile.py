@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,22 +25,28 @@ def cloud(path: Path, crs: str = "EPSG:32632", unit: float = 1.0, n: int = 100) 
     return path
 
 
-def body(folder: Path, **changes: object) -> dict:
+def body(folder: Path, **changes: Any) -> dict[str, Any]:
     """A tile that is right, but for `changes`; `photo` changes its photo, `camera` its camera."""
     cloud(folder / "cloud.laz")
-    camera = {"id": "front", "model": "pinhole", "size": [64, 48], "focal": [50.0, 50.0], "centre": [31.5, 23.5]}
-    photo = {
+    camera: dict[str, Any] = {
+        "id": "front",
+        "model": "pinhole",
+        "size": [64, 48],
+        "focal": [50.0, 50.0],
+        "centre": [31.5, 23.5],
+    }
+    photo: dict[str, Any] = {
         "file": "1.jpg",
         "camera": "front",
         "position": [500_010.0, 5_400_010.0, 102.0],
         "rotation": [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
     }
-    photo |= changes.pop("photo", {})  # type: ignore[arg-type]
-    camera |= changes.pop("camera", {})  # type: ignore[arg-type]
+    photo |= changes.pop("photo", {})
+    camera |= changes.pop("camera", {})
     return {"name": "t", "clouds": ["cloud.laz"], "cameras": [camera], "photos": [photo]} | changes
 
 
-def save(folder: Path, content: dict) -> Path:
+def save(folder: Path, content: dict[str, Any]) -> Path:
     (folder / "tile.toml").write_text(tomli_w.dumps(content))
     return folder
 
@@ -106,7 +113,7 @@ def test_what_write_tile_writes_read_tile_reads(tmp_path: Path) -> None:
         ({"trajectory": "bad.csv"}, r"bad\.csv: is no trajectory.*time,x,y,z"),
     ],
 )
-def test_bad_tiles_are_refused_by_name(tmp_path: Path, changes: dict, message: str) -> None:
+def test_bad_tiles_are_refused_by_name(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
     cloud(tmp_path / "bare.laz", crs="local")
     cloud(tmp_path / "lambert.laz", crs="EPSG:2154")
     (tmp_path / "cloud.shp").write_text("0 0 0")

@@ -55,7 +55,7 @@ def scanned(label: str, rgb: tuple[int, int, int], seed: int = 0) -> PointCloud:
     roof = within(xy, HOUSE) | within(xy, ANNEX)
     chosen = roof if label == "building" else ~roof
     xyz = np.column_stack([xy, z + random.normal(0, 0.02, len(xy))])[chosen].astype(np.float32)
-    colour = np.tile(np.uint8(rgb), (len(xyz), 1))
+    colour = np.tile(np.array(rgb, np.uint8), (len(xyz), 1))
     return PointCloud(FRAME, xyz, colour, label=np.full(len(xyz), CODE[label], np.uint8))
 
 
@@ -86,7 +86,7 @@ def test_the_ground_is_closed_under_roofs_as_it_slopes(house: dict[str, Path]) -
     gaps = np.linalg.norm(places[:, None] - made.xyz[None], axis=2).min(axis=1)
     assert gaps.max() < 0.4
     assert np.abs(made.xyz[:, 2] - floor(made.xyz[:, :2])).max() < 0.1
-    assert made.rgb is not None and (np.abs(made.rgb - np.int16([90, 120, 60])) <= 1).all()
+    assert made.rgb is not None and (np.abs(made.rgb.astype(int) - [90, 120, 60]) <= 1).all()
     assert made.normal is not None and (made.normal[:, 2] > 0.95).all()
 
 
@@ -107,7 +107,7 @@ def test_walls_stand_where_the_truths_walls_are(house: dict[str, Path]) -> None:
         assert top - 0.6 < z[at].max() < top + 0.15, name
         assert bottom - 0.8 < z[at].min() < bottom + 0.2, name
     assert made.normal is not None
-    outward = np.einsum("ij,ij->i", made.normal[:, :2], made.xyz[:, :2] - np.float32([1.5, 0]))
+    outward = np.einsum("ij,ij->i", made.normal[:, :2], made.xyz[:, :2] - np.array([1.5, 0], np.float32))
     between = sides["between"][0]
     assert (outward[~between] > 0).all() and (made.normal[between][:, 0] > 0.9).all()
 
@@ -121,11 +121,11 @@ def test_the_house_is_closed_and_the_roof_stays(house: dict[str, Path], tmp_path
     t = np.linspace(0.3, 0.7, 5)
     walls = [(-6, 8 * (s - 0.5), 6 * h) for s in t for h in t] + [(9, 8 * (s - 0.5), 3 * h) for s in t for h in t]
     walls += [(10 * (s - 0.6), y, 6 * h) for s in t for h in t for y in (-4, 4)] + [(4, 0, 4.5)]
-    assert distances(np.float32(walls), mesh).max() < 0.3
+    assert distances(np.array(walls, np.float32), mesh).max() < 0.3
     roof = [(-3, 0, 6), (2, 3, 6), (6.5, 0, 3), (8, -3, 3)]
-    assert distances(np.float32(roof), mesh).max() < 0.1
+    assert distances(np.array(roof, np.float32), mesh).max() < 0.1
     inside = [(-1, 0, 3), (6.5, 0, 1.5)]
-    assert distances(np.float32(inside), mesh).min() > 1.0
+    assert distances(np.array(inside, np.float32), mesh).min() > 1.0
 
 
 def test_walls_that_were_seen_are_left_alone(house: dict[str, Path], tmp_path: Path) -> None:
@@ -133,7 +133,7 @@ def test_walls_that_were_seen_are_left_alone(house: dict[str, Path], tmp_path: P
     y, z = (a.ravel() for a in np.meshgrid(np.arange(-4, 4, 0.25), np.arange(-0.2, 6, 0.25)))
     seen = np.column_stack([np.full(len(y), -6.0), y, z]).astype(np.float32)
     wall = PointCloud(
-        FRAME, seen, np.full((len(seen), 3), 200, np.uint8), np.tile(np.float32([-1, 0, 0]), (len(seen), 1)),
+        FRAME, seen, np.full((len(seen), 3), 200, np.uint8), np.tile(np.array([-1, 0, 0], np.float32), (len(seen), 1)),
         np.full(len(seen), CODE["building"], np.uint8),
     )  # fmt: skip
     PointCloud.join([building, wall]).save(tmp_path / "building.npz")
@@ -248,9 +248,9 @@ def test_points_far_from_the_mesh_are_warned_of_and_made_up_area_is_told(
     from scan2sim.pipeline.types import Mesh
 
     x0, y0, x1, y1, top = HOUSE
-    roof = np.float32([(x0, y0, top), (x1, y0, top), (x1, y1, top), (x0, y1, top)])
-    mesh = Mesh(FRAME, np.concatenate([roof, roof - np.float32([0, 0, 3])]),
-                np.int32([(0, 1, 2), (0, 2, 3), (4, 0, 7), (0, 3, 7)]))  # fmt: skip
+    roof = np.array([(x0, y0, top), (x1, y0, top), (x1, y1, top), (x0, y1, top)], np.float32)
+    mesh = Mesh(FRAME, np.concatenate([roof, roof - np.array([0, 0, 3], np.float32)]),
+                np.array([(0, 1, 2), (0, 2, 3), (4, 0, 7), (0, 3, 7)], np.int32))  # fmt: skip
     mesh.save(tmp_path / "mesh.npz")
     inputs = {"mesh.building": tmp_path / "mesh.npz", "cloud.building": house["building"]}
     done = go(GEOMETRY, tmp_path / "geometry", inputs | {"made.building": house["walls"]})
@@ -266,7 +266,7 @@ def test_a_street_scanned_from_the_ground_gets_nothing_made_up_without_a_path_ei
     building = PointCloud.load(house["building"])
     y, z = (a.ravel() for a in np.meshgrid(np.arange(-4, 4, 0.1), np.arange(0, 6, 0.1)))
     wall = np.column_stack([np.full(len(y), -6.0), y, z]).astype(np.float32)
-    seen = PointCloud(FRAME, wall, normal=np.tile(np.float32([-1, 0, 0]), (len(wall), 1)),
+    seen = PointCloud(FRAME, wall, normal=np.tile(np.array([-1, 0, 0], np.float32), (len(wall), 1)),
                       label=np.full(len(wall), CODE["building"], np.uint8))  # fmt: skip
     ledge = building.take(np.flatnonzero(building.xyz[:, 0] < -5))
     PointCloud.join([ledge, seen]).save(tmp_path / "building.npz")

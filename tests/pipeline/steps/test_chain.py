@@ -109,7 +109,7 @@ def test_voxel_matches_a_plain_implementation() -> None:
 
 def test_normals_look_to_the_scanner_even_under_a_bridge(tmp_path: Path) -> None:
     floor = bumpy(20_000)
-    ceiling = replace(floor, xyz=floor.xyz + np.float32([0, 0, 4]))
+    ceiling = replace(floor, xyz=floor.xyz + np.array([0, 0, 4], np.float32))
     PointCloud.join([floor, ceiling]).save(tmp_path / "cloud.npz")
     Trajectory(np.array([np.nan]), np.array([[0.0, 0.0, 2.0]])).save(tmp_path / "path.npz")
     done = go(VOXEL, tmp_path / "out", {"cloud": tmp_path / "cloud.npz", "path": tmp_path / "path.npz"})
@@ -181,8 +181,8 @@ def test_trim_removes_what_no_point_bears_out(ground: dict[str, Path], tmp_path:
 
 
 def test_islands_go_by_area(tmp_path: Path) -> None:
-    square = np.float32([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
-    faces = np.int32([[0, 1, 2], [0, 2, 3]])
+    square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
+    faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
     vertices = np.concatenate([square, square * 0.5 + 5, square * 3 + 10])
     Mesh(FRAME, vertices, np.concatenate([faces, faces + 4, faces + 8])).save(tmp_path / "mesh.npz")
     done = go(ISLANDS, tmp_path / "out", {"mesh": tmp_path / "mesh.npz"}, min_area=0.5)

@@ -16,6 +16,7 @@ from scan2sim.pipeline.step import silent
 from scan2sim.pipeline.steps.export import EXPORT, ExportParams
 from scan2sim.pipeline.types import Frame, Mesh
 from tests.pipeline import made_up
+from tests.present import present
 
 
 def _files(world: Path) -> set[str]:
@@ -48,13 +49,13 @@ def test_layout(tmp_path: Path) -> None:
 
 def test_model_names_files_that_exist(tmp_path: Path) -> None:
     world = made_up.world(tmp_path, friction=0.7).files["world"]
-    model = ET.parse(world / "models/street/model.sdf").getroot().find("model")
+    model = present(ET.parse(world / "models/street/model.sdf").getroot().find("model"))
     assert model.findtext("static") == "true"
-    uris = [uri.text for uri in model.iter("uri")]
+    uris = [present(uri.text) for uri in model.iter("uri")]
     assert len(uris) == 3
     for uri in uris:
         assert (world / uri.replace("model://", "models/")).is_file()
-    friction = model.find("link/collision/surface/friction")
+    friction = present(model.find("link/collision/surface/friction"))
     assert {value.text for value in friction.iter() if value.tag.startswith(("mu", "friction")) and not len(value)} == {
         "0.7"
     }
@@ -93,7 +94,7 @@ def test_tiles_share_a_georeference_through_the_pose_alone(tmp_path: Path) -> No
     meshes = "models/street/meshes"
     assert (alone / meshes / "terrain.obj").read_bytes() == (placed / meshes / "terrain.obj").read_bytes()
     latitude = [
-        float(ET.parse(w / "street.sdf").getroot().findtext("world/spherical_coordinates/latitude_deg"))
+        float(ET.parse(w / "street.sdf").getroot().findtext("world/spherical_coordinates/latitude_deg", ""))
         for w in (alone, placed)
     ]
     assert latitude[1] > latitude[0]
@@ -177,7 +178,9 @@ def test_pages_as_jpeg(tmp_path: Path) -> None:
 
 def test_normals_and_uv_have_no_nan(tmp_path: Path) -> None:
     house = made_up.house()
-    flat = replace(house, faces=np.concatenate([house.faces, [[0, 0, 1]]]).astype(np.int32),
-                   uv=np.concatenate([house.uv, house.uv[:1]]), page=np.append(house.page, np.int16(0)))  # fmt: skip
+    faces, uv = np.concatenate([house.faces, [[0, 0, 1]]]).astype(np.int32), present(house.uv)
+    flat = replace(
+        house, faces=faces, uv=np.concatenate([uv, uv[:1]]), page=np.append(present(house.page), np.int16(0))
+    )
     EXPORT.run(_inputs(tmp_path, building=flat), ExportParams(), tmp_path / "out", silent)
     assert not [p for p in (tmp_path / "out").rglob("*.obj") if "nan" in p.read_text()]

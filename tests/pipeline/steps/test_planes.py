@@ -97,8 +97,7 @@ def test_a_wall_with_noise_and_boards_is_flat(tmp_path: Path) -> None:
 def test_a_border_with_another_tile_stays_as_it_was(tmp_path: Path) -> None:
     """The neighbour's planes aren't the same, what both made of the points is."""
     corner = np.concatenate([wall((0, 0), (0, 4)), wall((0, 0), (4, 0))])
-    cell = {"seed": (-1.0, 1.0), "neighbours": {"east": (5.0, 1.0)}}
-    before, after, _ = laid(corner, tmp_path, **cell)
+    before, after, _ = laid(corner, tmp_path, seed=(-1.0, 1.0), neighbours={"east": (5.0, 1.0)})
     was, now = (mesh.vertices[np.abs(mesh.vertices[:, 0] - 2) < 0.25] for mesh in (before, after))
     assert len(was) == len(now) > 100
     assert cKDTree(now).query(was)[0].max() < 0.003  # noise for decimation

@@ -34,7 +34,7 @@ def scene(done: Done) -> trimesh.Scene:
     """What is inside the script."""
     script = (done.files["preview"] / "world.js").read_bytes()
     assert script.startswith(CALL + b'("') and script.endswith(b'");\n')
-    return trimesh.load(io.BytesIO(base64.b64decode(script[len(CALL) + 2 : -4])), file_type="glb")
+    return trimesh.load_scene(io.BytesIO(base64.b64decode(script[len(CALL) + 2 : -4])), file_type="glb")
 
 
 @pytest.mark.parametrize(("megapixels", "side"), [(32, 256), (0.1, 158)])

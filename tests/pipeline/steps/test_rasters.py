@@ -93,7 +93,8 @@ def test_neighbours_fit_together_in_one_virtual_raster(tmp_path: Path) -> None:
 
 
 def test_a_raster_beyond_bounds_is_refused_with_the_size_that_fits(tmp_path: Path) -> None:
-    far = Mesh(made_up.UTM, np.float32([[0, 0, 0], [9e4, 0, 0], [0, 9e4, 0]]), np.int32([[0, 1, 2]]),
-               uv=np.zeros((1, 3, 2), np.float32), page=np.zeros(1, np.int16))  # fmt: skip
+    corners = np.array([[0, 0, 0], [9e4, 0, 0], [0, 9e4, 0]], np.float32)
+    uv, page = np.zeros((1, 3, 2), np.float32), np.zeros(1, np.int16)
+    far = Mesh(made_up.UTM, corners, np.array([[0, 1, 2]], np.int32), uv=uv, page=page)
     with pytest.raises(SettingError, match=r"export.rasters=3\.1 or more"):
         RASTERS.run({"terrain": made_up.textured(tmp_path / "t", far)}, RastersParams(pixel=0.1), tmp_path, silent)

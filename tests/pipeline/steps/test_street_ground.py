@@ -13,7 +13,7 @@ from scan2sim.flows.recipes.tile import recipe
 from scan2sim.pipeline.classes import CODE
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.step import silent
-from scan2sim.pipeline.steps.ground import GROUND
+from scan2sim.pipeline.steps.ground import GROUND, GroundParams
 from scan2sim.pipeline.types import UNCOLOURED, Frame, PointCloud
 
 FRAME = Frame("local", (100.0, 200.0, 30.0))
@@ -27,7 +27,7 @@ def true(xy: np.ndarray) -> np.ndarray:
 
 def within(xy: np.ndarray, box: tuple[float, ...], by: float = 0.0) -> np.ndarray:
     low, high = np.array(box[:2]) - by, np.array(box[2:]) + by
-    return ((xy > low) & (xy < high)).all(axis=1)
+    return np.all((xy > low) & (xy < high), axis=1)
 
 
 def scanned(holes: tuple[tuple[float, ...], ...]) -> PointCloud:
@@ -37,7 +37,7 @@ def scanned(holes: tuple[tuple[float, ...], ...]) -> PointCloud:
     xyz = np.column_stack([xy, true(xy)]).astype(np.float32)
     n = len(xyz)
     return PointCloud(
-        FRAME, xyz, np.full((n, 3), 90, np.uint8), np.tile(np.float32([0, 0, 1]), (n, 1)),
+        FRAME, xyz, np.full((n, 3), 90, np.uint8), np.tile(np.array([0, 0, 1], np.float32), (n, 1)),
         np.full(n, CODE["road"], np.uint8),
     )  # fmt: skip
 
@@ -58,7 +58,7 @@ def closed(folder: Path, holes: tuple[tuple[float, ...], ...], *, moved: bool = 
     for name, part in files.items():
         part.save(inputs[name])
     inputs["things"] = things(folder / "things.geojson", moved=moved)
-    done = GROUND.run(inputs, GROUND.params(gap=gap), folder, silent)
+    done = GROUND.run(inputs, GroundParams(gap=gap), folder, silent)
     return PointCloud.load(done.files["made"])
 
 

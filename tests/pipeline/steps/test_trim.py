@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,12 +14,14 @@ from scan2sim.pipeline.types import F32, Frame, Mesh, PointCloud
 CORNERS = np.array([[0, 0, 0], [0.15, 0, 0], [0, 0.15, 0]], np.float32)
 
 
-def trimmed(folder: Path, triangles: list[F32], density: list[list[float]], points: F32) -> tuple[list[int], dict]:  # type: ignore[type-arg]
+def trimmed(
+    folder: Path, triangles: list[F32], density: list[list[float]], points: F32
+) -> tuple[list[int], dict[str, Any]]:
     """Which of the triangles stay, and what is told."""
     vertices = np.concatenate(triangles).astype(np.float32)
     faces = np.arange(len(vertices), dtype=np.int32).reshape(-1, 3)
     label = np.arange(len(faces), dtype=np.uint8)
-    Mesh(Frame(), vertices, faces, np.float32(density).ravel(), label=label).save(folder / "in.npz")
+    Mesh(Frame(), vertices, faces, np.ravel(density).astype(np.float32), label=label).save(folder / "in.npz")
     PointCloud(Frame(), points).save(folder / "points.npz")
     done = trim({"mesh": folder / "in.npz", "cloud": folder / "points.npz"}, TrimParams(), folder, silent)
     left = Mesh.load(done.files["mesh"]).label
@@ -29,11 +32,12 @@ def trimmed(folder: Path, triangles: list[F32], density: list[list[float]], poin
 def test_long_edges_sparse_samples_and_what_is_far_from_points_go(tmp_path: Path) -> None:
     x, y = np.mgrid[0:40, 0:6]
     points = np.stack([x.ravel() * 0.1, y.ravel() * 0.1, 0.0 * x.ravel()], axis=1).astype(np.float32)
-    long = CORNERS * np.float32([1.6, 1, 1]) + np.float32([3.5, 0, 0])  # 24 cm and 15 cm, and 28 cm between their ends
-    away = CORNERS + np.float32([2, 0.7, 0])  # 20 cm beyond the points, and one corner 35 cm
+    shift = np.array([3.5, 0, 0], np.float32)
+    long = CORNERS * np.array([1.6, 1, 1], np.float32) + shift  # 24 cm and 15 cm, and 28 cm between their ends
+    away = CORNERS + np.array([2, 0.7, 0], np.float32)  # 20 cm beyond the points, and one corner 35 cm
     dense, sparse = [10.0] * 3, [10.0, 10.0, 5.9]  # samples at one corner are 5 cm x 2^4.1 = 86 cm apart
-    still = CORNERS + np.float32([3, 0, 0]), [9.0, 8.0, 6.1]
-    triangles = [CORNERS, CORNERS + np.float32([1, 0, 0]), away, long, still[0]]
+    still = CORNERS + np.array([3, 0, 0], np.float32), [9.0, 8.0, 6.1]
+    triangles = [CORNERS, CORNERS + np.array([1, 0, 0], np.float32), away, long, still[0]]
     left, facts = trimmed(tmp_path, triangles, [dense, sparse, dense, dense, still[1]], points)
     assert left == [0, 4]
     assert [facts[name] for name in ("long_edges", "sparse", "far_from_points", "widened")] == [1, 1, 1, 1.0]

@@ -19,7 +19,7 @@ onnx = pytest.importorskip("onnx", reason="makes the networks")
 
 LABELS = ["road", "building", "sky", "car"]
 WEIGHTS = np.random.default_rng(1).normal(0, 1, (4, 3, 2, 2)).astype(np.float32)
-MEAN, STD = np.float32([0.485, 0.456, 0.406]), np.float32([0.229, 0.224, 0.225])
+MEAN, STD = np.array([0.485, 0.456, 0.406], np.float32), np.array([0.229, 0.224, 0.225], np.float32)
 
 
 def write(
@@ -110,7 +110,7 @@ def test_photos_are_resized_to_a_size_that_is_fixed(tmp_path: Path, size: tuple[
 
 def test_photos_are_normalised_as_the_file_tells(tmp_path: Path) -> None:
     path = write(tmp_path / "net.onnx", mean="[0, 0.1, -0.2]", std="[1, 2, 0.5]")
-    expected = reference(photo(), np.float32([0, 0.1, -0.2]), np.float32([1, 2, 0.5]))
+    expected = reference(photo(), np.array([0, 0.1, -0.2], np.float32), np.array([1, 2, 0.5], np.float32))
     assert np.abs(load("onnx", path, "cpu").probabilities(photo()) - expected).max() < 1e-4
     for wrong in ({"std": "[1, 0, 1]"}, {"mean": "[1, 1]"}, {"mean": "grey"}, {"std": "null"}):
         assert "to normalise photos with" in told_of(write(path, **wrong)).cause

@@ -2,6 +2,7 @@
 
 import json
 import pickle
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from tests.conftest import ROOT  # noqa: E402
 
 
 @pytest.fixture(scope="module")
-def weights(tmp_path_factory):
+def weights(tmp_path_factory: pytest.TempPathFactory):
     torch.manual_seed(0)
     path = tmp_path_factory.mktemp("weights") / "w.onnx"
     save(StreetNet(len(CLASSES)), path, {"iou": {}})
@@ -36,7 +37,7 @@ def photos():
         yield np.concatenate([rgb, np.full((*rgb.shape[:2], 4), 60 * i, np.uint8)], axis=2)
 
 
-def test_the_weights_that_come_along_are_small_and_tell_every_class():
+def test_the_weights_that_come_along_are_small_and_tell_every_class() -> None:
     network = load("street", None, "cpu")
     assert OWN.stat().st_size < 8e6 and OWN.with_suffix(".safetensors").stat().st_size < 8e6
     assert network.facts.labels == CLASSES and len(network.facts.sha256) == 64
@@ -44,7 +45,7 @@ def test_the_weights_that_come_along_are_small_and_tell_every_class():
     assert found.shape == (len(CLASSES), 24, 32) and found.sum(axis=0) == pytest.approx(1, abs=1e-4)
 
 
-def test_the_same_weights_and_photo_give_the_same_classes(weights):
+def test_the_same_weights_and_photo_give_the_same_classes(weights) -> None:
     photo = np.random.default_rng(0).integers(0, 255, (100, 130, 7), np.uint8)
     for form in (weights, weights.with_suffix(".onnx")):
         a, b = (load("street", form, "cpu").probabilities(photo) for _ in range(2))
@@ -52,7 +53,7 @@ def test_the_same_weights_and_photo_give_the_same_classes(weights):
 
 
 @pytest.mark.parametrize("own", [True, False], ids=["the project's own", "just trained"])
-def test_onnxruntime_and_torch_tell_the_same_classes(weights, own):
+def test_onnxruntime_and_torch_tell_the_same_classes(weights, own) -> None:
     form = OWN.with_suffix(".safetensors") if own else weights
     by_torch, by_onnx = load("street", form, "cpu"), load("street", form.with_suffix(".onnx"), "cpu")
     assert by_torch.facts.labels == by_onnx.facts.labels
@@ -64,7 +65,7 @@ def test_onnxruntime_and_torch_tell_the_same_classes(weights, own):
         assert (a.argmax(axis=0) == b.argmax(axis=0)).mean() > 0.9999
 
 
-def test_classes_do_not_depend_on_the_number_of_cores(monkeypatch):
+def test_classes_do_not_depend_on_the_number_of_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     photo = np.random.default_rng(0).integers(0, 255, (256, 320, 7), np.uint8)
     told = []
     for cores in ("1", "2", "3"):
@@ -74,19 +75,19 @@ def test_classes_do_not_depend_on_the_number_of_cores(monkeypatch):
     np.testing.assert_array_equal(told[0], told[2])
 
 
-def test_a_damaged_network_is_named(weights, tmp_path):
+def test_a_damaged_network_is_named(weights, tmp_path: Path) -> None:
     (tmp_path / "cut.onnx").write_bytes(OWN.read_bytes()[:-1000])
     with pytest.raises(InputError, match=r"cut\.onnx"):
         load("street", tmp_path / "cut.onnx", "cpu")
 
 
-def test_truncated_weights(weights, tmp_path):
+def test_truncated_weights(weights, tmp_path: Path) -> None:
     (tmp_path / "cut.safetensors").write_bytes(weights.read_bytes()[:-1000])
     with pytest.raises(InputError, match=r"cut\.safetensors"):
         load("street", tmp_path / "cut.safetensors", "cpu")
 
 
-def test_weights_of_another_network_are_named(tmp_path):
+def test_weights_of_another_network_are_named(tmp_path: Path) -> None:
     safetensors.save_file({"x": torch.zeros(3)}, tmp_path / "a.safetensors", {"network": "UNet", "labels": "[]"})
     with pytest.raises(InputError, match=r"UNet, not StreetNet"):
         load("street", tmp_path / "a.safetensors", "cpu")
@@ -96,7 +97,7 @@ def test_weights_of_another_network_are_named(tmp_path):
         load("street", tmp_path / "b.safetensors", "cpu")
 
 
-def test_a_pickle_is_refused_and_not_run(tmp_path):
+def test_a_pickle_is_refused_and_not_run(tmp_path: Path) -> None:
     class Bad:
         def __reduce__(self):
             return (open, (str(tmp_path / "harm"), "w"))
@@ -124,7 +125,7 @@ def colourful(folder, n=6):
     return folder
 
 
-def test_training_learns_and_repeats(tmp_path):
+def test_training_learns_and_repeats(tmp_path: Path) -> None:
     from scan2sim.segmentation.train import Recipe, train
 
     folder = colourful(tmp_path / "set")
@@ -136,7 +137,7 @@ def test_training_learns_and_repeats(tmp_path):
         assert torch.equal(a, b)
 
 
-def test_training_goes_on_from_weights_that_took_colours_alone(tmp_path, weights):
+def test_training_goes_on_from_weights_that_took_colours_alone(tmp_path: Path, weights) -> None:
     from scan2sim.segmentation.train import Recipe, train
 
     state = safetensors.load_file(weights)
@@ -148,7 +149,7 @@ def test_training_goes_on_from_weights_that_took_colours_alone(tmp_path, weights
     assert torch.allclose(first[:, :3], state["stem.0.weight"].float()) and not first[:, 3:].any()
 
 
-def test_a_folder_without_labels_is_named(tmp_path):
+def test_a_folder_without_labels_is_named(tmp_path: Path) -> None:
     from scan2sim.segmentation.train import Recipe, train
 
     with pytest.raises(DataError, match="images"):
