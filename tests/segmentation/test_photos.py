@@ -1,12 +1,14 @@
 """A network over photos of any size and lens, by a network that is known: it tells a pixel's class by its colour."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.types import Camera
+from scan2sim.pipeline.types import F32, U8, Camera
 from scan2sim.segmentation.backends import Facts
 from scan2sim.segmentation.labels import CLASSES, IGNORED, LABEL_SETS, code_of_index, index_of_code, mapped
 from scan2sim.segmentation.photos import OVERLAP, Labeller, labels_of
@@ -18,11 +20,12 @@ PANORAMA = Camera("equirectangular", 1024, 512)
 class ByColour:
     """Tells class k where red is 20 k; looks at `seen` sizes, and has memory for `memory` pixels."""
 
-    def __init__(self, labels=CLASSES, resolution=500.0, memory=10**9):
+    def __init__(self, labels: Sequence[str] = CLASSES, resolution: float = 500.0, memory: int = 10**9) -> None:
         self.facts = Facts("by colour", tuple(labels), "", "", resolution)
-        self.memory, self.seen = memory, []
+        self.memory = memory
+        self.seen: list[tuple[int, ...]] = []
 
-    def probabilities(self, rgb):
+    def probabilities(self, rgb: U8) -> F32:
         if rgb.shape[0] * rgb.shape[1] > self.memory:
             raise MemoryError("too large")
         self.seen.append(rgb.shape[:2])
@@ -31,7 +34,7 @@ class ByColour:
         return np.eye(len(self.facts.labels), dtype=np.float32)[index].transpose(2, 0, 1)
 
 
-def painted(camera, classes=12):
+def painted(camera: Camera, classes: int = 12) -> tuple[U8, npt.NDArray[np.int64]]:
     """A photo of upright stripes of all classes, and each pixel's class."""
     index = np.tile(np.arange(camera.width) * classes // camera.width, (camera.height, 1))
     return np.repeat((index * 20).astype(np.uint8)[..., None], 3, axis=2), index
@@ -45,7 +48,7 @@ def test_classes_come_back_where_they_are() -> None:
 
 
 @pytest.mark.parametrize("camera", [Camera("pinhole", 3000, 2000, 500.0, 500.0, 1499.5, 999.5)])
-def test_large_photos_are_looked_at_in_tiles_without_seams(camera) -> None:
+def test_large_photos_are_looked_at_in_tiles_without_seams(camera: Camera) -> None:
     rgb, truth = painted(camera)
     network = ByColour()
     labeller = Labeller(network, "")
@@ -72,9 +75,9 @@ def test_photos_are_looked_at_at_one_angular_resolution() -> None:
 
 
 @pytest.mark.parametrize("camera", [PINHOLE, PANORAMA])
-def test_a_network_that_takes_channels_gets_them_beside_the_colours(camera) -> None:
+def test_a_network_that_takes_channels_gets_them_beside_the_colours(camera: Camera) -> None:
     class ByChannel(ByColour):
-        def probabilities(self, seen):
+        def probabilities(self, seen: U8) -> F32:
             assert seen.shape[2] == 7
             return super().probabilities(np.ascontiguousarray(seen[..., 3:]))
 

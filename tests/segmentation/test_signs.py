@@ -15,7 +15,7 @@ from scan2sim.pipeline.io import image
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.plates import Plate, inside
 from scan2sim.pipeline.step import Done, silent
-from scan2sim.pipeline.types import F64, U8, Camera, Frame, Mesh, View
+from scan2sim.pipeline.types import F32, F64, U8, Camera, Frame, Mesh, View
 from scan2sim.segmentation.labels import CLASSES
 from scan2sim.segmentation.signs import SIGNS, SignsParams
 
@@ -107,7 +107,7 @@ def _run(folder: Path, plates: list[Plate], known: list[Plate]) -> Done:
     return SIGNS.run(inputs, SignsParams(), out, silent)
 
 
-def _hung(done: Done) -> list[F64]:
+def _hung(done: Done) -> list[F32]:
     """Corners of each plate in the mesh, that of the highest first."""
     from scan2sim.segmentation.hanging import pieces
 

@@ -23,7 +23,7 @@ def neighbours(xyz: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("away", [0.3, 2.0])
-def test_a_large_floating_piece_on_a_wall_is_the_walls_and_a_crown_in_the_air_is_not(away) -> None:
+def test_a_large_floating_piece_on_a_wall_is_the_walls_and_a_crown_in_the_air_is_not(away: float) -> None:
     wall, piece = sheet(6, 0, 6), sheet(3, 2, 5, away)
     xyz = np.concatenate([wall, piece])
     best = np.repeat([BUILDING, HIGH], [len(wall), len(piece)]).astype(np.uint8)

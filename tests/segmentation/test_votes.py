@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,15 +13,17 @@ from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.pipeline.step import silent
-from scan2sim.segmentation.label import LABEL
+from scan2sim.pipeline.step import Done, silent
+from scan2sim.pipeline.types import U8
+from scan2sim.segmentation.label import LABEL, LabelParams
 from scan2sim.segmentation.labels import CLASSES, index_of_code
 from scan2sim.segmentation.score import confusion
-from scan2sim.segmentation.segment import SEGMENT
+from scan2sim.segmentation.segment import SEGMENT, SegmentParams
+from tests.present import present
 
 
 @pytest.fixture(scope="module")
-def labelled(tmp_path_factory: pytest.TempPathFactory):
+def labelled(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, U8]:
     """A street, its cloud without classes, its photos' true labels as probabilities; and the true classes."""
     from scan2sim.data_samples.street import generate
     from scan2sim.pipeline.types import PointCloud
@@ -31,7 +34,7 @@ def labelled(tmp_path_factory: pytest.TempPathFactory):
     )
     cloud = las.read(tile.clouds[0], tile.frame)
     PointCloud(cloud.frame, cloud.xyz, cloud.rgb, time=cloud.time).save(folder / "cloud.npz")
-    tile.trajectory.save(folder / "path.npz")
+    present(tile.trajectory).save(folder / "path.npz")
     views_io.save(folder / "views.json", tile.views)
     (folder / "labels").mkdir()
     for i, view in enumerate(tile.views):
@@ -39,20 +42,22 @@ def labelled(tmp_path_factory: pytest.TempPathFactory):
         index = index_of_code()[codes[::2, ::2]]
         np.save(folder / "labels" / f"{i}.npy", np.uint8(255) * (index[..., None] == np.arange(len(CLASSES))))
     (folder / "labels" / "network.json").write_text(json.dumps({"tells": CLASSES}))
-    return folder, cloud.label
+    return folder, present(cloud.label)
 
 
-def segment(folder, out, names=("views", "labels", "path"), **params):
+def segment(
+    folder: Path, out: Path, names: tuple[str, ...] = ("views", "labels", "path"), **params: Any
+) -> tuple[U8, dict[str, U8], Done]:
     files = {"views": "views.json", "labels": "labels", "path": "path.npz"}
     inputs = {"cloud": folder / "cloud.npz"} | {name: folder / files[name] for name in names}
-    done = SEGMENT.run(inputs, SEGMENT.params(**params), out, silent)
+    done = SEGMENT.run(inputs, SegmentParams(**params), out, silent)
     from scan2sim.pipeline.types import PointCloud
 
     with np.load(done.files["confidence"]) as beside:
-        return PointCloud.load(done.files["cloud"]).label, dict(beside), done
+        return present(PointCloud.load(done.files["cloud"]).label), dict(beside), done
 
 
-def test_photos_that_are_right_make_points_right(labelled, tmp_path: Path) -> None:
+def test_photos_that_are_right_make_points_right(labelled: tuple[Path, U8], tmp_path: Path) -> None:
     folder, truth = labelled
     (tmp_path / "photos").mkdir()
     (tmp_path / "shape").mkdir()
@@ -69,7 +74,7 @@ def test_photos_that_are_right_make_points_right(labelled, tmp_path: Path) -> No
     assert set(np.unique(source)) <= {1, 2} and (right[source == 1].mean()) > right[source == 2].mean()
 
 
-def test_a_wrong_pose_shows_in_the_skys_share(labelled, tmp_path: Path) -> None:
+def test_a_wrong_pose_shows_in_the_skys_share(labelled: tuple[Path, U8], tmp_path: Path) -> None:
     folder, _ = labelled
     views = list(views_io.load(folder / "views.json"))
     for view in views:
@@ -82,7 +87,9 @@ def test_a_wrong_pose_shows_in_the_skys_share(labelled, tmp_path: Path) -> None:
     assert done.facts["sky_share"] > 0.15 and any("poses" in w for w in done.warnings)
 
 
-def test_a_network_that_knows_only_vegetation_has_it_parted_by_height(labelled, tmp_path: Path) -> None:
+def test_a_network_that_knows_only_vegetation_has_it_parted_by_height(
+    labelled: tuple[Path, U8], tmp_path: Path
+) -> None:
     folder, truth = labelled
     labels = tmp_path / "labels"
     labels.mkdir()
@@ -96,11 +103,11 @@ def test_a_network_that_knows_only_vegetation_has_it_parted_by_height(labelled, 
     done = SEGMENT.run(inputs, SEGMENT.params(), tmp_path, silent)
     from scan2sim.pipeline.types import PointCloud
 
-    iou = confusion(truth, PointCloud.load(done.files["cloud"]).label).iou
+    iou = confusion(truth, present(PointCloud.load(done.files["cloud"]).label)).iou
     assert iou["low_vegetation"] > 0.5 and iou["high_vegetation"] > 0.85
 
 
-def test_photos_without_overlap_leave_it_to_shape(labelled, tmp_path: Path) -> None:
+def test_photos_without_overlap_leave_it_to_shape(labelled: tuple[Path, U8], tmp_path: Path) -> None:
     folder, _ = labelled
     (tmp_path / "labels").mkdir()
     done = SEGMENT.run(
@@ -110,7 +117,7 @@ def test_photos_without_overlap_leave_it_to_shape(labelled, tmp_path: Path) -> N
     assert done.facts["source"] == "shape" and any("shape alone" in w for w in done.warnings)
 
 
-def test_classes_that_are_there_are_kept_and_photos_not_looked_at(labelled, tmp_path: Path) -> None:
+def test_classes_that_are_there_are_kept_and_photos_not_looked_at(labelled: tuple[Path, U8], tmp_path: Path) -> None:
     from scan2sim.pipeline.types import PointCloud
 
     folder, truth = labelled
@@ -119,13 +126,13 @@ def test_classes_that_are_there_are_kept_and_photos_not_looked_at(labelled, tmp_
     for name in ("label", "kept"):
         (tmp_path / name).mkdir()
     inputs = {"cloud": tmp_path / "own.npz", "views": folder / "views.json"}
-    done = LABEL.run(inputs, LABEL.params(network="nonsense"), tmp_path / "label", silent)
+    done = LABEL.run(inputs, LabelParams(network="nonsense"), tmp_path / "label", silent)
     assert done.facts["photos"] == 0 and "classes" in done.facts["why"]
     kept = SEGMENT.run(inputs | {"labels": done.files["labels"]}, SEGMENT.params(), tmp_path / "kept", silent)
     np.testing.assert_array_equal(PointCloud.load(kept.files["cloud"]).label, truth)
 
 
-def test_ground_codes_and_vehicles_have_their_own_classes(labelled, tmp_path: Path) -> None:
+def test_ground_codes_and_vehicles_have_their_own_classes(labelled: tuple[Path, U8], tmp_path: Path) -> None:
     folder, _ = labelled
     told, *_ = segment(folder, tmp_path)
     assert {CODE[n] for n in ("road", "sidewalk", "terrain", "building", "high_vegetation")} <= set(told.tolist())

@@ -13,6 +13,7 @@ from scan2sim.pipeline.cameras import pixel_rays
 from scan2sim.pipeline.io.video import Encoder
 from scan2sim.pipeline.types import Camera, Trajectory
 from scan2sim.slam.geometry import exp_so3
+from tests.present import present
 
 HEIGHT, FPS, SECONDS, SPEED = 128, 10.0, 3.6, 6.0
 WIDE, LOW, HIGH = 4.0, -2.0, 5.0  # metres: half a corridor's width, its floor and its ceiling
@@ -44,7 +45,7 @@ def film(camera: Camera, truth: Trajectory) -> np.ndarray:
     rays = pixel_rays(camera.scaled(2)).astype(np.float64)
     walls = [paint(k) for k in range(5)]
     frames = []
-    for position, rotation in zip(truth.positions, truth.rotations, strict=True):
+    for position, rotation in zip(truth.positions, present(truth.rotations), strict=True):
         d = rays @ rotation.T
         picture, nearest = np.zeros(d.shape[:2], np.float32), np.full(d.shape[:2], np.inf)
         sides = ((1, WIDE), (1, -WIDE), (2, LOW), (2, HIGH), (0, 60.0))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -101,8 +102,13 @@ def gps_of(times: np.ndarray, poses: np.ndarray, sigma: float = 0.0, seed: int =
 
 
 def run(
-    times: np.ndarray, follower: Follower, *, gps: GpsTrack | None = None, warn=lambda _: None, **params
-) -> Odometry:  # type: ignore[no-untyped-def]
+    times: np.ndarray,
+    follower: Follower,
+    *,
+    gps: GpsTrack | None = None,
+    warn: Callable[[str], None] = lambda _: None,
+    **params: Any,
+) -> Odometry:
     """Odometry over a drive."""
     from scan2sim.pipeline.types import Camera
 

@@ -5,12 +5,14 @@ import json
 import os
 import pickle
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from typer.testing import CliRunner, Result
 
 import scan2sim.slam.track as tracking
 from scan2sim.flows.cli import app
@@ -20,13 +22,15 @@ from scan2sim.flows.recipes.video import Video, recipe
 from scan2sim.pipeline.errors import InputError, ScanError
 from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.store import Store
+from scan2sim.pipeline.types import U8
 from scan2sim.slam.odometry import Odometry, OdometryParams
 from scan2sim.slam.steps.track import TRACK, TrackParams, tracker_of
 from scan2sim.slam.track import VERSION, track
 from scan2sim.slam.video import open_video
+from tests.slam.conftest import Drive
 
 
-def command(*arguments):
+def command(*arguments: object) -> Result:
     """Run it; errors are raised."""
     result = CliRunner().invoke(app, [str(a) for a in arguments], catch_exceptions=True)
     if result.exception is not None and not isinstance(result.exception, SystemExit):
@@ -35,7 +39,7 @@ def command(*arguments):
 
 
 @pytest.fixture(scope="session")
-def done(corridor, tmp_path_factory: pytest.TempPathFactory):
+def done(corridor: Drive, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     out = tmp_path_factory.mktemp("slam") / "out"
     result = command(
         "slam", corridor.folder / "video.mp4", "--out", out, "--colmap", "--adjust", "--set", "track.count=300"
@@ -43,7 +47,9 @@ def done(corridor, tmp_path_factory: pytest.TempPathFactory):
     return out, result.output
 
 
-def test_it_writes_the_trajectory_in_all_formats_and_says_that_there_is_no_gps(done, corridor) -> None:
+def test_it_writes_the_trajectory_in_all_formats_and_says_that_there_is_no_gps(
+    done: tuple[Path, str], corridor: Drive
+) -> None:
     out, said = done
     found = trajectory_io.read(out / "trajectory.csv")
     assert len(found) == len(corridor.truth)
@@ -55,7 +61,7 @@ def test_it_writes_the_trajectory_in_all_formats_and_says_that_there_is_no_gps(d
     assert list((out / "steps").rglob("state*")) == []
 
 
-def test_what_was_tracked_is_kept_when_only_its_placing_changes(corridor, tmp_path: Path) -> None:
+def test_what_was_tracked_is_kept_when_only_its_placing_changes(corridor: Drive, tmp_path: Path) -> None:
     asked = ("slam", corridor.folder / "video.mp4", "--out", tmp_path, "--set", "track.count=300", "--until", "0.5")
     command(*asked, "--view")
     first = {path: path.stat().st_mtime_ns for path in tmp_path.glob("steps/track/*/*")}
@@ -67,14 +73,14 @@ def test_what_was_tracked_is_kept_when_only_its_placing_changes(corridor, tmp_pa
     assert not (tmp_path / "view.mp4").exists(), "of an earlier run nothing stays"
 
 
-def test_the_colmap_model_is_one(done) -> None:
+def test_the_colmap_model_is_one(done: tuple[Path, str]) -> None:
     pycolmap = pytest.importorskip("pycolmap")
     model = pycolmap.Reconstruction(done[0] / "colmap")
     assert model.num_points3D() > 100
     assert model.compute_mean_reprojection_error() < 1.0
 
 
-def test_evaluate_prints_the_missions_errors(done, corridor, tmp_path: Path) -> None:
+def test_evaluate_prints_the_missions_errors(done: tuple[Path, str], corridor: Drive, tmp_path: Path) -> None:
     trajectory_io.write(tmp_path / "truth.csv", corridor.truth)
     said = command("slam", "evaluate", done[0] / "trajectory.csv", tmp_path / "truth.csv", "--segment", "5").output
     figures = dict(line.split() for line in said.splitlines() if len(line.split()) == 2)
@@ -84,17 +90,17 @@ def test_evaluate_prints_the_missions_errors(done, corridor, tmp_path: Path) -> 
 
 @pytest.mark.parametrize("features", ["corners", "orb"])
 def test_an_interrupted_run_goes_on_and_ends_the_same(
-    corridor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, features
+    corridor: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, features: str
 ) -> None:
     monkeypatch.setattr(tracking, "KEEP_EVERY", 0.0)
     video, state = open_video(corridor.folder / "video.mp4"), tmp_path / "state.npz"
     params = TrackParams.model_validate({"count": 300, "features": features})
 
-    def start(warn):
+    def start(warn: Callable[[str], None]) -> Odometry:
         tracker, _ = tracker_of(corridor.camera, None, params, {})
         return Odometry(corridor.camera, params, tracker=tracker, keep=True, warn=warn)
 
-    def interrupt(odometry, grey):
+    def interrupt(odometry: Odometry, grey: U8) -> None:
         if len(odometry.placed) == 20:
             raise KeyboardInterrupt
 
@@ -103,21 +109,21 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(
     resumed = track(video, start, state=state)
     whole = track(video, start)
     assert resumed.names == whole.names
-    paths = [[run.odometry.pose_of(placed) for placed in run.odometry.placed] for run in (resumed, whole)]
-    assert np.array_equal(*paths)
+    first, second = ([run.odometry.pose_of(at) for at in run.odometry.placed] for run in (resumed, whole))
+    assert np.array_equal(first, second)
 
 
 class Trap:
     """Makes a file when it is unpickled."""
 
-    def __init__(self, path):
+    def __init__(self, path: Path) -> None:
         self.path = path
 
-    def __reduce__(self):
+    def __reduce__(self) -> tuple[Any, ...]:
         return os.mkdir, (str(self.path),)
 
 
-def damages(path):
+def damages(path: Path) -> dict[str, bytes]:
     """A state in all the ways in which it can't be one: by what was done to it."""
     whole, trap = path.read_bytes(), path.with_name("trap")
     objects = io.BytesIO()
@@ -131,13 +137,13 @@ def damages(path):
 
 
 def test_a_state_that_is_damaged_or_foreign_is_not_run_and_the_run_begins_anew(
-    corridor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    corridor: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tracking, "KEEP_EVERY", 0.0)
     video, state = open_video(corridor.folder / "video.mp4"), tmp_path / "state.npz"
     params = OdometryParams.model_validate({"count": 300})
 
-    def start(warn):
+    def start(warn: Callable[[str], None]) -> Odometry:
         return Odometry(corridor.camera, params, warn=warn)
 
     whole = track(video, start, until=0.5, state=state)
@@ -153,11 +159,12 @@ def test_an_interrupted_run_goes_on_only_from_what_the_same_code_made_of_the_sam
 ) -> None:
     video, mask = tmp_path / "video.mp4", tmp_path / "mask.png"
 
-    def mark(**changes):
+    def mark(**changes: object) -> str:
         nodes = recipe(Video.model_validate({"video": video, "mask": mask} | changes), Settings())
         return plan(nodes, Store(tmp_path / "steps"))[0].key
 
-    video.write_bytes(b"one"), mask.write_bytes(b"mask")
+    video.write_bytes(b"one")
+    mask.write_bytes(b"mask")
     before, times = mark(), video.stat()
     assert mark() == before
     (tmp_path / "moved").mkdir()
@@ -184,7 +191,9 @@ def test_an_interrupted_run_goes_on_only_from_what_the_same_code_made_of_the_sam
         (lambda p: (p / "g.csv").write_text("a,b\n1,2\n"), ("VIDEO", "--gps", "g.csv"), "g.csv"),
     ],
 )
-def test_bad_input_is_named(corridor, tmp_path: Path, change, arguments, text) -> None:
+def test_bad_input_is_named(
+    corridor: Drive, tmp_path: Path, change: Callable[[Path], object], arguments: tuple[str, ...], text: str
+) -> None:
     change(tmp_path)
     made = ("absent.mp4", "v.mp4", "empty", "m.png", "g.csv")
     video = corridor.folder / "video.mp4"
@@ -194,13 +203,13 @@ def test_bad_input_is_named(corridor, tmp_path: Path, change, arguments, text) -
     assert text in str(error.value)
 
 
-def test_a_video_that_ends_early_and_frames_of_another_size_are_told(corridor, tmp_path: Path) -> None:
+def test_a_video_that_ends_early_and_frames_of_another_size_are_told(corridor: Drive, tmp_path: Path) -> None:
     import cv2
 
     for i in range(12):
         size = (256, 128) if i < 8 else (128, 64)
         cv2.imwrite(str(tmp_path / f"{i:03d}.png"), cv2.resize(corridor.greys[i], size))
-    said = []
+    said: list[str] = []
     assert len(list(open_video(tmp_path).frames(warn=said.append))) == 8
     assert "128x64 instead of 256x128" in said[0]
     (tmp_path / "003.png").write_bytes(b"")
@@ -208,7 +217,7 @@ def test_a_video_that_ends_early_and_frames_of_another_size_are_told(corridor, t
         list(open_video(tmp_path).frames())
 
 
-def test_half_a_video_file_is_read_as_far_as_it_goes(corridor, tmp_path: Path) -> None:
+def test_half_a_video_file_is_read_as_far_as_it_goes(corridor: Drive, tmp_path: Path) -> None:
     av = pytest.importorskip("av")
     assert av
     whole = tmp_path / "whole.ts"
@@ -225,13 +234,13 @@ def test_half_a_video_file_is_read_as_far_as_it_goes(corridor, tmp_path: Path) -
     shutil.rmtree(tmp_path, ignore_errors=True)
 
 
-def test_frames_out_of_order_are_left_out_and_told(corridor, tmp_path: Path) -> None:
+def test_frames_out_of_order_are_left_out_and_told(corridor: Drive, tmp_path: Path) -> None:
     import cv2
 
     for i in range(4):
         cv2.imwrite(str(tmp_path / f"{i}.png"), corridor.greys[i])
     (tmp_path / "times.txt").write_text("0\n0.1\n0.05\n0.2\n")
-    said = []
+    said: list[str] = []
     frames = list(open_video(tmp_path, times=tmp_path / "times.txt").frames(warn=said.append))
     assert [f.name for f in frames] == ["0.png", "1.png", "3.png"] and "out of order" in said[0]
     (tmp_path / "times.txt").write_text("0\n0.1\n")

@@ -1,10 +1,12 @@
 """Corners on the sphere: seam and poles are no special places."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
 from scan2sim.pipeline.cameras import pixel_rays, project
-from scan2sim.pipeline.types import Camera
+from scan2sim.pipeline.types import F32, F64, U8, Camera
 from scan2sim.slam.charts import Charts
 from scan2sim.slam.geometry import exp_so3, relative_pose, rigid
 from scan2sim.slam.trackers.corners import CornerTracker
@@ -12,7 +14,7 @@ from scan2sim.slam.trackers.corners import CornerTracker
 CAMERA = Camera("equirectangular", 768, 384)
 
 
-def sphere(seed=0):
+def sphere(seed: int = 0) -> Callable[[F64], F32]:
     """A function of directions with texture everywhere, alike in all of them."""
     import cv2
     from scipy.ndimage import map_coordinates
@@ -21,7 +23,7 @@ def sphere(seed=0):
     faces = [cv2.GaussianBlur(rng.integers(0, 255, (400, 400), np.uint8), (0, 0), 2.0) for _ in range(6)]
     faces = [cv2.normalize(f, None, 0, 255, cv2.NORM_MINMAX) for f in faces]
 
-    def look(rays):
+    def look(rays: F64) -> F32:
         axis = np.abs(rays).argmax(axis=-1)
         out = np.zeros(rays.shape[:-1], np.float32)
         for k in range(3):
@@ -34,7 +36,7 @@ def sphere(seed=0):
     return look
 
 
-def frame(world, R):
+def frame(world: Callable[[F64], F32], R: F64) -> U8:
     """What an equirectangular camera with rotation R (camera to world) sees."""
     return world(pixel_rays(CAMERA).astype(np.float64) @ R.T).astype(np.uint8)
 
@@ -51,7 +53,7 @@ def test_charts_and_sphere_agree_everywhere() -> None:
 
 
 @pytest.mark.parametrize("axis", [[0, 1, 0], [1, 0, 0], [0, 0, 1]])
-def test_corners_are_followed_across_seam_and_poles(axis) -> None:
+def test_corners_are_followed_across_seam_and_poles(axis: list[int]) -> None:
     world, charts = sphere(), Charts(CAMERA)
     tracker = CornerTracker(charts, None, 500)
     tracker.look(frame(world, np.eye(3)))

@@ -128,7 +128,7 @@ def test_real_panoramas_have_no_special_places(real_data: Path) -> None:
             uv, _ = project(source, pixel_rays(camera).reshape(-1, 3) @ R.T)
             x, y = uv.reshape(400, 800, 2).transpose(2, 0, 1)
             frames.append(cv2.remap(large, np.ascontiguousarray(x), np.ascontiguousarray(y), 1, borderMode=3))
-        first, _, error = followed(tracker("rootsift", camera=camera, bridge=False), frames, turns)  # type: ignore[arg-type]
+        first, _, error = followed(tracker("rootsift", camera=camera, bridge=False), frames, turns)
         assert len(first) > 0.3 * NUMBER and np.median(error) < 0.1 and (error < 0.5).mean() > 0.9
 
 
@@ -142,7 +142,9 @@ def test_leaps_that_lucas_kanade_cannot_follow_are_made() -> None:
 
 def test_wrong_matches_are_not_believed() -> None:
     class Wrong:
-        name, takes, dimension = "wrong", None, None
+        name = "wrong"
+        takes: str | None = None
+        dimension: int | None = None
 
         def match(self, a: Found, b: Found, sizes: Any) -> Any:
             assert sizes[0] == sizes[1] and (a.uv[:, 0] < sizes[0][0]).all() and (a.uv[:, 1] < sizes[0][1]).all()

@@ -217,7 +217,7 @@ def theirs_of(model: Any, a: Found, b: Found, *scores: Any) -> tuple[Any, Any]:
     with torch.inference_mode():
         seen = torch.ones(1, 2, len(a.uv), dtype=torch.int)
         out = model._match_image_pair(uv, what, *scores, 480, 640, mask=seen)
-    return tuple(x.reshape(-1, len(a.uv))[0].numpy() for x in out[:2])  # type: ignore[return-value]
+    return tuple(x.reshape(-1, len(a.uv))[0].numpy() for x in out[:2])
 
 
 def agree(ours: Any, a: Found, b: Found, theirs: Any, share: Any) -> None:

@@ -4,16 +4,17 @@ import itertools
 
 import numpy as np
 
+from scan2sim.pipeline.types import F64
 from scan2sim.slam.geometry import exp_so3, inverse, rigid
 from scan2sim.slam.loops import alike, pose_graph, thumbnail
 
 
-def ring(n=80, radius=30.0):
+def ring(n: int = 80, radius: float = 30.0) -> F64:
     angles = np.linspace(0, 2 * np.pi * 1.1, n)
     return np.stack([rigid(exp_so3([0, a, 0]), radius * np.array([np.sin(a), 0, np.cos(a)])) for a in angles])
 
 
-def drifted(truth, turn=0.002, stretch=1.01):
+def drifted(truth: F64, turn: float = 0.002, stretch: float = 1.01) -> F64:
     out = [truth[0]]
     for a, b in itertools.pairwise(truth):
         step = inverse(a) @ b
@@ -27,7 +28,7 @@ def test_a_loop_takes_most_of_the_drift_away_and_a_false_one_doesnt_harm() -> No
     path = drifted(truth)
     way = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(path[:, :3, 3], axis=0), axis=1))])
 
-    def off(found):
+    def off(found: F64) -> F64:
         return np.linalg.norm(found[:, :3, 3] - truth[:, :3, 3], axis=1)
 
     loops = [(j, k, inverse(truth[j]) @ truth[k]) for j, k in ((0, 73), (2, 75), (4, 77))]

@@ -1,21 +1,27 @@
 """Frames to poses: on drives whose truth is known, and what goes wrong on the road."""
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from scan2sim.pipeline.similarity import umeyama
+from scan2sim.pipeline.types import F64
 from scan2sim.slam.finish import finish
+from scan2sim.slam.mapped import Mapped
+from scan2sim.slam.odometry import Odometry
+from tests.present import present
 from tests.slam.made_up import Follower, drive, gps_of, run, scatter
 
 
-def positions(odometry):
+def positions(odometry: Odometry) -> F64:
     return np.stack([odometry.pose_of(p)[:3, 3] for p in odometry.placed])
 
 
-def error(found, poses, which=slice(None)):
+def error(found: F64, poses: F64, which: slice | npt.NDArray[np.bool_] = slice(None)) -> float:
     """Root mean square metres after a similarity."""
     truth = poses[which, :3, 3]
-    return np.sqrt(((umeyama(found[which], truth, scaled=True).apply(found[which]) - truth) ** 2).sum(axis=1).mean())
+    off = umeyama(found[which], truth, scaled=True).apply(found[which]) - truth
+    return float(np.sqrt((off**2).sum(axis=1).mean()))
 
 
 def test_a_drive_is_found_up_to_scale_and_a_standing_car_stands() -> None:
@@ -32,7 +38,7 @@ def test_a_perspective_cameras_narrow_view_is_enough() -> None:
     times, poses = drive(10)
 
     class Narrow(Follower):
-        def _seen(self, points):
+        def _seen(self, points: F64) -> tuple[F64, npt.NDArray[np.bool_]]:
             bearing, seen = super()._seen(points)
             return bearing, seen & (bearing[:, 2] > 0.7)
 
@@ -43,12 +49,12 @@ def test_a_perspective_cameras_narrow_view_is_enough() -> None:
 def test_gps_ties_the_scale_and_places_the_path() -> None:
     times, poses = drive(30)
     gps = gps_of(times, poses, sigma=0.5)
-    trajectory, _ = finish(run(times, Follower(poses, scatter(poses)), gps=gps), gps)
+    trajectory, _ = finish(Mapped.of(run(times, Follower(poses, scatter(poses)), gps=gps), ()), gps)
     off = np.linalg.norm((trajectory.positions - poses[:, :3, 3])[:, :2], axis=1)
     assert off.mean() < 1.0
     length = np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1).sum()
     assert length == pytest.approx(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum(), rel=0.02)
-    up = trajectory.rotations[:, 2, 1]
+    up = present(trajectory.rotations)[:, 2, 1]
     assert (up < -0.99).all()
 
 
@@ -60,64 +66,66 @@ def test_adjacent_gps_distances_work_too() -> None:
 
 
 @pytest.mark.parametrize("seconds", [0.3, 2.0])
-def test_a_black_stretch_is_bridged_marked_and_never_restarts_at_the_origin(seconds) -> None:
+def test_a_black_stretch_is_bridged_marked_and_never_restarts_at_the_origin(seconds: float) -> None:
     times, poses = drive(20)
-    gps, said = gps_of(times, poses, sigma=0.2), []
+    gps = gps_of(times, poses, sigma=0.2)
+    said: list[str] = []
 
-    def black(frame, points):
+    def black(frame: int, points: F64) -> npt.NDArray[np.bool_]:
         return np.full(len(points), 10 <= times[frame] < 10 + seconds)
 
     odometry = run(times, Follower(poses, scatter(poses), hide=black), gps=gps, warn=said.append)
-    trajectory, _ = finish(odometry, gps)
+    trajectory, _ = finish(Mapped.of(odometry, ()), gps)
     off = np.linalg.norm(trajectory.positions - poses[:, :3, 3], axis=1)
     dark = (times >= 10) & (times < 10 + seconds)
-    assert trajectory.unsure[dark].all() and not trajectory.unsure[times < 9.9].any()
-    assert not trajectory.unsure[-1] and any("lost" in text for text in said)
+    unsure = present(trajectory.unsure)
+    assert unsure[dark].all() and not unsure[times < 9.9].any()
+    assert not unsure[-1] and any("lost" in text for text in said)
     assert off.max() < 8
     step = np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1)
     assert step.max() < 4
-    sigma = np.sqrt(trajectory.covariance[:, 0, 0])
+    sigma = np.sqrt(present(trajectory.covariance)[:, 0, 0])
     assert sigma[-1] > 3 * sigma[np.searchsorted(times, 9.5)]
 
 
 def test_a_bus_that_covers_all_is_noticed_by_gps() -> None:
     times, poses = drive(20)
-    gps, said = gps_of(times, poses, sigma=0.2), []
+    gps = gps_of(times, poses, sigma=0.2)
+    said: list[str] = []
     covered = (times >= 10) & (times < 14)
     carried = 0.95 * (poses[:, :3, 3] - poses[times >= 10][0, :3, 3]) * covered[:, None]
 
     class Beside(Follower):
         """For four seconds, all that is seen drives along, a little slower than the car: a bus that is overtaken."""
 
-        def _seen(self, points):
+        def _seen(self, points: F64) -> tuple[F64, npt.NDArray[np.bool_]]:
             return super()._seen(points + carried[self._frame])
 
     odometry = run(times, Beside(poses, scatter(poses)), gps=gps, warn=said.append)
-    trajectory, _ = finish(odometry, gps)
+    trajectory, _ = finish(Mapped.of(odometry, ()), gps)
     off = np.linalg.norm(trajectory.positions - poses[:, :3, 3], axis=1)
     assert "lost" in said[0] and 10 < float(said[0].split()[0]) < 12
-    assert trajectory.unsure[(times >= 12) & (times < 14)].all() and not trajectory.unsure[-1]
+    unsure = present(trajectory.unsure)
+    assert unsure[(times >= 12) & (times < 14)].all() and not unsure[-1]
     assert off.max() < 20  # of the 36 m that weren't seen
 
 
 def test_moving_cars_are_left_out() -> None:
     times, poses = drive(15)
-    rng = np.random.default_rng(3)
+    rng, still = np.random.default_rng(3), scatter(poses)
+    kinds = {tuple(p): i for i, p in enumerate(still)}
     moving = rng.random(6000) < 0.35
     speed = rng.uniform(3, 12, (6000, 1)) * np.array([1.0, 0.2, 0.0])
 
     class Traffic(Follower):
-        def _seen(self, points):
+        def _seen(self, points: F64) -> tuple[F64, npt.NDArray[np.bool_]]:
             at = points
             if len(points):
-                kind = np.array([self._which[tuple(p)] for p in points])
+                kind = np.array([kinds[tuple(p)] for p in points])
                 at = points + np.where(moving[kind][:, None], speed[kind] * times[self._frame], 0)
             return super()._seen(at)
 
-    still = scatter(poses)
-    follower = Traffic(poses, still)
-    follower._which = {tuple(p): i for i, p in enumerate(still)}
-    assert error(positions(run(times, follower)), poses) < 0.6
+    assert error(positions(run(times, Traffic(poses, still))), poses) < 0.6
 
 
 def test_rolling_shutter_is_estimated() -> None:
@@ -125,7 +133,7 @@ def test_rolling_shutter_is_estimated() -> None:
     readout = 0.03
 
     class Rolling(Follower):
-        def _seen(self, points):
+        def _seen(self, points: F64) -> tuple[F64, npt.NDArray[np.bool_]]:
             pose = self.poses[self._frame]
             ahead = self.poses[min(self._frame + 1, len(self.poses) - 1)]
             rate = (ahead[:3, 3] - pose[:3, 3]) / 0.1

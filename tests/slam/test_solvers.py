@@ -6,13 +6,15 @@ import numpy as np
 import pytest
 
 from scan2sim.pipeline.backends import names
+from scan2sim.pipeline.types import F64
 from scan2sim.slam import solvers
 from scan2sim.slam.geometry import exp_so3
-from scan2sim.slam.graph import Chord, Factor, Graph, errors
+from scan2sim.slam.graph import Chord, Factor, Graph, Solution, errors
 from scan2sim.slam.solvers import lm
+from tests.present import present
 
 
-def street(cameras=8, points=120, noise=5e-4, seed=0):
+def street(cameras: int = 8, points: int = 120, noise: float = 5e-4, seed: int = 0) -> tuple[F64, Graph]:
     """Poses, and a graph that starts off them."""
     rng = np.random.default_rng(seed)
     poses = np.tile(np.eye(4), (cameras, 1, 1))
@@ -33,7 +35,7 @@ def street(cameras=8, points=120, noise=5e-4, seed=0):
     return poses, Graph(start, xyz, point, camera, bearing, fixed, np.radians(0.1))
 
 
-def positions(solved):
+def positions(solved: Solution) -> F64:
     return solved.poses[:, :3, 3]
 
 
@@ -44,13 +46,13 @@ def test_levenberg_marquardt_ends_where_a_general_solver_does() -> None:
     free = ~graph.fixed
     n = 6 * int(free.sum())
 
-    def unpack(x):
+    def unpack(x: F64) -> tuple[F64, F64]:
         poses = graph.poses.copy()
         poses[free, :3, 3] += x[:n].reshape(-1, 6)[:, :3]
         poses[free, :3, :3] = exp_so3(0.1 * x[:n].reshape(-1, 6)[:, 3:]) @ poses[free, :3, :3]
         return poses, graph.points + x[n:].reshape(-1, 3)
 
-    def cost(x):
+    def cost(x: F64) -> float:
         return np.log1p((np.sin(errors(graph, *unpack(x))) / graph.sigma) ** 2).sum()
 
     solved = lm.solve(graph, iterations=50)
@@ -62,7 +64,7 @@ def test_levenberg_marquardt_ends_where_a_general_solver_does() -> None:
 
 
 @pytest.mark.parametrize("name", names(solvers.__name__))
-def test_every_backend_finds_the_cameras(name) -> None:
+def test_every_backend_finds_the_cameras(name: str) -> None:
     if name == "adam":
         pytest.importorskip("torch")
     poses, graph = street()
@@ -74,7 +76,7 @@ def test_every_backend_finds_the_cameras(name) -> None:
 
 
 @pytest.mark.parametrize("name", names(solvers.__name__))
-def test_a_constraint_of_ones_own_takes_a_few_lines(name) -> None:
+def test_a_constraint_of_ones_own_takes_a_few_lines(name: str) -> None:
     """Wheel odometry: the second camera is where the wheels say, in the first's axes."""
     if name == "adam":
         pytest.importorskip("torch")
@@ -122,7 +124,7 @@ def test_the_gradient_is_half_the_costs_slope() -> None:
     starts = np.searchsorted(graph.point_of, np.arange(len(graph.points) + 1))
     _, g, _, gp, _ = lm._normal(graph, graph.poses, graph.points, shared, free, starts, size, True)
 
-    def cost(step):
+    def cost(step: F64) -> float:
         poses, bent = lm._moved(graph.poses, shared, step[:size], graph.fixed)
         return lm._cost(graph, poses, graph.points + step[size:].reshape(-1, 3), bent)
 
@@ -140,6 +142,6 @@ def test_covariance_grows_away_from_what_is_fixed_and_fits_the_scatter() -> None
         bearing /= np.linalg.norm(bearing, axis=1, keepdims=True)
         solved = lm.solve(replace(graph, bearing=bearing, sigma=np.radians(0.1)), iterations=20, covariance=True)
         found.append(positions(solved)[-1] - poses[-1, :3, 3])
-    sigma = np.sqrt(np.einsum("cii->ci", solved.covariance)[:, :3])
+    sigma = np.sqrt(np.einsum("cii->ci", present(solved.covariance))[:, :3])
     assert (np.diff(sigma[1:, 2]) > 0).all()
     assert 0.4 < np.std(found, axis=0)[2] / sigma[-1, 2] < 2.5

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.render import Body, Renderer, look_at, pinhole
-from scan2sim.pipeline.step import silent
-from scan2sim.pipeline.types import Camera, Frame, Mesh, PointCloud, View
+from scan2sim.pipeline.step import Done, silent
+from scan2sim.pipeline.types import F64, U8, Camera, Frame, Mesh, PointCloud, View
 from scan2sim.pipeline.visibility import depth_map, scene
 from scan2sim.texturing.agreement import AGREEMENT
 from scan2sim.texturing.choose import CHOOSE
@@ -20,7 +22,9 @@ from scan2sim.texturing.texture import TextureParams, texture
 from scan2sim.texturing.unwrap import UnwrapParams, unwrap
 
 
-def grid(corner, along, up, n=12):
+def grid(
+    corner: tuple[float, float, float], along: tuple[float, float, float], up: tuple[float, float, float], n: int = 12
+) -> tuple[F64, npt.NDArray[np.int64]]:
     """A rectangle from `corner`, spanned by two vectors, of n x n cells; its front is where along x up points."""
     s, t = np.meshgrid(np.linspace(0, 1, n + 1), np.linspace(0, 1, n + 1), indexing="ij")
     vertices = np.asarray(corner) + s.reshape(-1, 1) * np.asarray(along) + t.reshape(-1, 1) * np.asarray(up)
@@ -30,8 +34,9 @@ def grid(corner, along, up, n=12):
     return vertices, faces
 
 
-def join(*parts):
-    at, vertices, faces = 0, [], []
+def join(*parts: tuple[npt.NDArray[Any], npt.NDArray[Any]]) -> Mesh:
+    at = 0
+    vertices, faces = [], []
     for v, f in parts:
         vertices.append(v)
         faces.append(f + at)
@@ -49,7 +54,7 @@ BOX = join(
 )
 
 
-def paint(xyz):
+def paint(xyz: npt.ArrayLike) -> F64:
     """(N, 3) colour of the surface: soft stripes; the box is red all over."""
     x, y, z = np.moveaxis(np.asarray(xyz, float), -1, 0)
     ground = np.stack([60 + 40 * np.sin(3 * x), 120 + 50 * np.sin(2.5 * y + x), 130 + 60 * np.cos(2 * x - y)], axis=-1)
@@ -57,7 +62,7 @@ def paint(xyz):
     return np.where((z > 0.01)[..., None], red, ground)
 
 
-def photograph(camera, pose, meshes=(GROUND, BOX), gain=1.0):
+def photograph(camera: Camera, pose: F64, meshes: tuple[Mesh, ...] = (GROUND, BOX), gain: float = 1.0) -> U8:
     """(H, W, 3) uint8: the paint as a camera sees it."""
     from scan2sim.pipeline.cameras import pixel_rays, ray_origins
 
@@ -93,7 +98,7 @@ class Street:
     page_size: int = 4096
     runs: int = 0
 
-    def add(self, camera, pose, image=None, mask=None):
+    def add(self, camera: Camera, pose: F64, image: U8 | None = None, mask: U8 | None = None) -> View:
         """Take a photo (or put `image` in its place)."""
         name = f"photo{len(self.views)}"
         path = self.folder / f"{name}.png"
@@ -105,7 +110,13 @@ class Street:
         self.views.append(view)
         return view
 
-    def run(self, exposure=None, agreement=None, choose=None, **params):
+    def run(
+        self,
+        exposure: dict[str, Any] | None = None,
+        agreement: dict[str, Any] | None = None,
+        choose: dict[str, Any] | None = None,
+        **params: Any,
+    ) -> tuple[Path, Done]:
         """Unwrap and texture, settings by step; returns (folder of the textured mesh, what the steps said)."""
         out = self.folder / f"run{self.runs}"
         self.runs += 1
@@ -118,7 +129,7 @@ class Street:
             np.save(out / "depth" / f"{i}.npy", depth_map(view.camera, view.T_world_cam, hides).range)
         views_io.save(out / "views.json", self.views, self.held_out)
         inputs = {**flat.files, "views": out / "views.json", "depth": out / "depth"}
-        warnings = []
+        warnings: list[str] = []
         for step, given in ((EXPOSURE, exposure), (AGREEMENT, agreement), (CHOOSE, choose)):
             done = step.run(inputs, step.params(**(given or {})), out, silent)
             inputs |= done.files
@@ -131,10 +142,10 @@ class Street:
         return done.files["textured"], replace(done, warnings=warnings + done.warnings)
 
 
-def points(colour=True, n=40_000, rgb=None):
+def points(colour: bool = True, n: int = 40_000, rgb: tuple[int, int, int] | None = None) -> PointCloud:
     """Points all over the ground with its paint (or one colour)."""
     rng = np.random.default_rng(0)
     xyz = np.column_stack([rng.uniform(-5, 5, (n, 2)), np.zeros(n)]).astype(np.float32)
-    colours = np.clip(paint(xyz), 0, 255).astype(np.uint8) if rgb is None else np.tile(np.uint8(rgb), (n, 1))
+    colours = np.clip(paint(xyz), 0, 255).astype(np.uint8) if rgb is None else np.tile(np.array(rgb, np.uint8), (n, 1))
     normal = np.tile(np.array([0, 0, 1], np.float32), (n, 1))
     return PointCloud(Frame(), xyz, colours if colour else None, normal, np.full(n, 11, np.uint8))

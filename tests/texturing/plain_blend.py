@@ -2,16 +2,29 @@
 
 from __future__ import annotations
 
+from typing import Any, Literal
+
 import numpy as np
+import numpy.typing as npt
 from scipy.ndimage import map_coordinates
 
 from scan2sim.pipeline.cameras import ALIKE, inside, project_exactly
 from scan2sim.pipeline.looking import MAX_SLOPE, SLOPE_SHARE
+from scan2sim.pipeline.types import F32, F64, Camera
+from scan2sim.texturing import blend
 from scan2sim.texturing.blend import EDGE, WHITE
 from scan2sim.texturing.photos import OFFSET
 
 
-def accumulate(sums, laid, faces, share, look, weighing, camera):
+def accumulate(
+    sums: blend.Sums,
+    laid: blend.Laid,
+    faces: npt.NDArray[np.int64],
+    share: F32,
+    look: blend.Look,
+    weighing: blend.Weighing,
+    camera: Camera,
+) -> npt.NDArray[np.int64]:
     """Add what a photo says of `faces` to `sums`; returns the (N, 2) row and column of the texels that it sees.
 
     Args:
@@ -46,7 +59,7 @@ def accumulate(sums, laid, faces, share, look, weighing, camera):
     if shown.mask.size:
         ok &= nearest(shown.mask, uv, camera) > 0
     ok &= distance <= nearest(hides.first, uv, camera) + weighing.bias + SLOPE_SHARE * lean
-    row, column, part, share, uv = (a[ok] for a in (row, column, part, share, uv))
+    row, column, part, share, uv = row[ok], column[ok], part[ok], share[ok], uv[ok]
     distance, away, cos, wide, lean = (a[ok] for a in (distance, away, cos, wide, lean))
 
     # what it shows there
@@ -60,9 +73,9 @@ def accumulate(sums, laid, faces, share, look, weighing, camera):
     rgb = np.where((wide < 1.6)[:, None], finest, rgb)
 
     # how much that counts
-    border = uv[:, 1] + 0.5, camera.height - 0.5 - uv[:, 1], uv[:, 0] + 0.5, camera.width - 0.5 - uv[:, 0]
-    border = np.min(border[:2] if camera.model == "equirectangular" else border, axis=0)
-    worth = (cos / away) ** (2 * weighing.power) * (0.02 + 0.98 * np.minimum(1, border / weighing.feather))
+    border = np.stack([uv[:, 1] + 0.5, camera.height - 0.5 - uv[:, 1], uv[:, 0] + 0.5, camera.width - 0.5 - uv[:, 0]])
+    inwards = np.min(border[:2] if camera.model == "equirectangular" else border, axis=0)
+    worth = (cos / away) ** (2 * weighing.power) * (0.02 + 0.98 * np.minimum(1, inwards / weighing.feather))
     worth = np.where(rgb.max(axis=1) > WHITE, EDGE, 1) * worth
     beside = distance > nearest(hides.apart, uv, camera) + weighing.bias + (hides.reach + 0.5) * lean
     low = np.where(beside, EDGE, 1) * worth
@@ -81,50 +94,50 @@ def accumulate(sums, laid, faces, share, look, weighing, camera):
     return np.column_stack([row, column])
 
 
-def barycentric(flat, x, y):
+def barycentric(flat: F64, x: npt.NDArray[Any], y: npt.NDArray[Any]) -> F64:
     """(N, 3) weights of a triangle's corners (N, 3, 2) at (x, y)."""
     edges = np.stack([flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0]], axis=2)
     st = np.linalg.solve(edges, (np.column_stack([x, y]) - flat[:, 0])[..., None])[..., 0]
     return np.column_stack([1 - st.sum(axis=1), st])
 
 
-def texel_size(flat, corners):
+def texel_size(flat: F64, corners: F64) -> F64:
     """(F,) metres that a texel spans, across or down, whichever is more."""
     edges = np.stack([flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0]], axis=2)
     sides = np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], axis=2)
     return np.linalg.norm(sides @ np.linalg.inv(edges), axis=1).max(axis=1)
 
 
-def rescaled(picture, uv, camera):
+def rescaled(picture: npt.NDArray[Any], uv: F64, camera: Camera) -> F64:
     """(N, 2) where in a picture of any size is what a photo's pixels show."""
     size = np.array([camera.width, camera.height])
     return (uv + 0.5) * (picture.shape[1::-1] / size) - 0.5
 
 
-def nearest(picture, uv, camera):
+def nearest(picture: npt.NDArray[Any], uv: F64, camera: Camera) -> npt.NDArray[Any]:
     """(N,) what the picture's pixels hold that places of the photo are in."""
     column, row = np.floor(rescaled(picture, uv, camera) + 0.5).astype(int).T
     return picture[row.clip(0, picture.shape[0] - 1), column.clip(0, picture.shape[1] - 1)]
 
 
-def bilinear(picture, uv, camera):
+def bilinear(picture: npt.NDArray[Any], uv: F64, camera: Camera) -> F64:
     """(N, C)."""
     x, y = rescaled(picture, uv, camera).T
-    mode = "wrap" if camera.model == "equirectangular" else "edge"
-    wider = np.pad(picture.astype(float), ((0, 0), (2, 2), (0, 0)), mode)
+    around: Literal["wrap", "edge"] = "wrap" if camera.model == "equirectangular" else "edge"
+    wider = np.pad(picture.astype(float), ((0, 0), (2, 2), (0, 0)), around)
     channels = [map_coordinates(c, [y, x + 2], order=1, mode="nearest") for c in np.moveaxis(wider, 2, 0)]
     return np.stack(channels, axis=1)
 
 
-def bicubic(picture, uv, camera):
+def bicubic(picture: npt.NDArray[Any], uv: F64, camera: Camera) -> F64:
     """(N, C) by Keys' kernel with a = -1/2."""
 
-    def kernel(d):
+    def kernel(d: F64) -> F64:
         d = np.abs(d)
         return np.where(d < 1, 1.5 * d**3 - 2.5 * d**2 + 1, -0.5 * d**3 + 2.5 * d**2 - 4 * d + 2)
 
     (height, width), whole = picture.shape[:2], np.floor(uv).astype(int)
-    total = 0
+    total = np.zeros((len(uv), picture.shape[2]))
     for column in (whole[:, 0] + i for i in range(-1, 3)):
         for row in (whole[:, 1] + j for j in range(-1, 3)):
             weight = kernel(uv[:, 0] - column) * kernel(uv[:, 1] - row)

@@ -9,7 +9,7 @@ import numpy as np
 
 from scan2sim.pipeline.cameras import pixel_angle, unproject
 from scan2sim.pipeline.looking import eye
-from scan2sim.pipeline.types import Camera
+from scan2sim.pipeline.types import F32, Camera
 from scan2sim.texturing import blend, texels
 from scan2sim.texturing.photos import low_frequencies, shrunk
 
@@ -44,10 +44,10 @@ def scattered(rng: np.random.Generator, camera: Camera) -> blend.Laid:
     low = np.stack(np.divmod(np.arange(n), CELLS), axis=1)[:, None] * CELL - 0.3
     flat = low + np.array([[0.0, 0.0], [CELL, 0.0], [CELL, CELL], [0.0, CELL]]) * 0.93
     triangles = np.array([[0, 1, 2], [0, 2, 3]])
-    flat = flat[:, triangles].reshape(-1, 3, 2).astype(np.float32)
-    corners = corners.transpose(1, 0, 2)[:, triangles].reshape(-1, 3, 3).astype(np.float32)
-    owner = texels.owners(flat, CELL * CELLS, CELL * CELLS)
-    return blend.Laid(owner, flat, corners, np.repeat(facing, 2, axis=0).astype(np.float32))
+    on_page: F32 = flat[:, triangles].reshape(-1, 3, 2).astype(np.float32)
+    in_space: F32 = corners.transpose(1, 0, 2)[:, triangles].reshape(-1, 3, 3).astype(np.float32)
+    owner = texels.owners(on_page, CELL * CELLS, CELL * CELLS)
+    return blend.Laid(owner, on_page, in_space, np.repeat(facing, 2, axis=0).astype(np.float32))
 
 
 def taken(rng: np.random.Generator, camera: Camera, band: int) -> blend.Look:

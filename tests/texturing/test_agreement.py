@@ -1,20 +1,24 @@
 """Photos that disagree with the rest: ghosts, wrong poses, blur, overexposure."""
 
 import json
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
 from scan2sim.pipeline.render import look_at
-from tests.texturing.corner import CAMERAS, photograph, points
+from scan2sim.pipeline.step import Done
+from scan2sim.pipeline.types import F64, U8
+from tests.texturing.corner import CAMERAS, Street, photograph, points
 from tests.texturing.test_texture import from_above
 
 CAMERA = CAMERAS["pinhole"]
 POSES = [look_at((-4, y, 1.8), (0, y / 2, 0.6)) for y in (-3.0, -1.5, 0.0, 1.5, 3.0)]
 
 
-def grainy(pose):
+def grainy(pose: F64) -> U8:
     """A photo of the corner with a fine pattern on its ground: something to tell sharpness and displacement by."""
     from scan2sim.pipeline.cameras import pixel_rays
     from scan2sim.pipeline.render import Body, Renderer
@@ -27,12 +31,12 @@ def grainy(pose):
     return np.clip(plain + grain[..., None], 0, 255).astype(np.uint8)
 
 
-def rows_of(folder):
+def rows_of(folder: Path) -> dict[str, Any]:
     """What `agreement` said of each photo, by name."""
     return {row["name"]: row for row in json.loads((folder.parent / "agreement" / "agreement.json").read_text())}
 
 
-def test_a_passing_car_leaves_no_ghost(street) -> None:
+def test_a_passing_car_leaves_no_ghost(street: Street) -> None:
     for i, pose in enumerate(POSES):
         image = photograph(CAMERA, pose)
         if i == 2:
@@ -40,7 +44,7 @@ def test_a_passing_car_leaves_no_ghost(street) -> None:
         street.add(CAMERA, pose, image)
     street.clouds["terrain"] = points()
 
-    def magenta(**given):
+    def magenta(**given: Any) -> tuple[int, Done]:
         folder, done = street.run(band=0, **given)
         rgb, *_ = from_above(folder)
         return int(((rgb[..., 0] > 150) & (rgb[..., 1] < 90) & (rgb[..., 2] > 150)).sum()), done
@@ -52,7 +56,7 @@ def test_a_passing_car_leaves_no_ghost(street) -> None:
 
 
 @pytest.mark.parametrize("turn, shift", [(0.5, 0.0), (0.0, 0.2)])
-def test_a_wrong_pose_is_named_and_left_out(street, turn, shift) -> None:
+def test_a_wrong_pose_is_named_and_left_out(street: Street, turn: float, shift: float) -> None:
     for i, pose in enumerate(POSES):
         true = pose.copy()
         if i == 3:
@@ -68,7 +72,7 @@ def test_a_wrong_pose_is_named_and_left_out(street, turn, shift) -> None:
     assert "photo3" not in done.facts["texels_by_photo"]
 
 
-def test_a_blurred_photo_gives_little(street) -> None:
+def test_a_blurred_photo_gives_little(street: Street) -> None:
     for i, pose in enumerate(POSES):
         image = grainy(pose)
         street.add(CAMERA, pose, cv2.GaussianBlur(image, (0, 0), 4) if i == 2 else image)
@@ -79,7 +83,7 @@ def test_a_blurred_photo_gives_little(street) -> None:
     assert any("photo2" in warning and "blurred" in warning for warning in done.warnings)
 
 
-def test_an_overexposed_photo_is_left_out(street) -> None:
+def test_an_overexposed_photo_is_left_out(street: Street) -> None:
     for i, pose in enumerate(POSES):
         street.add(CAMERA, pose, np.full((480, 640, 3), 255, np.uint8) if i == 1 else None)
     _, done = street.run()
@@ -87,7 +91,7 @@ def test_an_overexposed_photo_is_left_out(street) -> None:
     assert "photo1" not in done.facts["texels_by_photo"]
 
 
-def test_photos_that_agree_are_all_used_whole(street) -> None:
+def test_photos_that_agree_are_all_used_whole(street: Street) -> None:
     for pose in POSES:
         street.add(CAMERA, pose)
     folder, done = street.run()
@@ -95,7 +99,7 @@ def test_photos_that_agree_are_all_used_whole(street) -> None:
     assert max(row.get("ghost_share", 0) for row in rows_of(folder).values()) < 0.01
 
 
-def test_one_photo_alone_will_do(street) -> None:
+def test_one_photo_alone_will_do(street: Street) -> None:
     street.add(CAMERA, POSES[2])
     _, done = street.run()
     assert done.facts["photos"] == 1 and not done.warnings

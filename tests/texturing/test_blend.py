@@ -10,7 +10,7 @@ import pytest
 from scan2sim.pipeline.cameras import pixel_angle, project
 from scan2sim.pipeline.looking import eye
 from scan2sim.pipeline.render import look_at
-from scan2sim.pipeline.types import Camera
+from scan2sim.pipeline.types import U8, Camera
 from scan2sim.texturing import blend, texels
 from scan2sim.texturing.photos import OFFSET
 from tests.texturing import plain_blend
@@ -31,9 +31,10 @@ def shown(u: Any, v: Any) -> Any:
 @pytest.mark.parametrize("warp", [(0.0, 0.0), (1.5, -2.25)])
 def test_texels_show_what_the_photo_shows_there(size: int, warp: tuple[float, float]) -> None:
     v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
-    levels = [np.uint8(shown(u, v))]
-    for _ in range(2):
-        levels.append(np.uint8(np.rint(levels[-1].reshape(len(levels[-1]) // 2, 2, -1, 2, 3).mean(axis=(1, 3)))))
+    whole: U8 = shown(u, v).astype(np.uint8)
+    half, quarter = (
+        whole.reshape(CAMERA.height // n, n, -1, n, 3).mean(axis=(1, 3)).round().astype(np.uint8) for n in (2, 4)
+    )
     corner = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * SIDE / 2
     corners = corner[[[0, 1, 2], [0, 2, 3]]].astype(np.float32)
     uv = (corners[..., :2] / SIDE + 0.5).astype(np.float32)
@@ -44,7 +45,7 @@ def test_texels_show_what_the_photo_shows_there(size: int, warp: tuple[float, fl
     everywhere = np.full((6, 8), np.inf, np.float32)
     look = blend.Look(
         blend.Shown(
-            *levels, levels[0], np.zeros((0, 0), np.uint8), np.tile(np.float32(warp), (3, 4, 1)),
+            whole, half, quarter, whole, np.zeros((0, 0), np.uint8), np.tile(np.array(warp, np.float32), (3, 4, 1)),
             np.concatenate([gain, fall]),
         ),
         eye(CAMERA, POSE), blend.Hides(everywhere, pixel_angle(CAMERA), everywhere, everywhere, 1),

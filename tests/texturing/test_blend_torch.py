@@ -6,15 +6,16 @@ import pytest
 from scan2sim.pipeline.errors import SettingError
 from scan2sim.pipeline.io import image
 from scan2sim.texturing import blend
+from tests.present import present
 from tests.texturing import scattered
-from tests.texturing.corner import CAMERAS, POSES, photograph, points
+from tests.texturing.corner import CAMERAS, POSES, Street, photograph, points
 
 pytest.importorskip("torch", reason="torch is not installed (pip install 'scan2sim[segmentation]')")
 
 
 @pytest.mark.parametrize("name", CAMERAS)
 @pytest.mark.parametrize("band", [2, 0, -1])
-def test_torch_paints_the_same(street, name, band) -> None:
+def test_torch_paints_the_same(street: Street, name: str, band: int) -> None:
     camera = CAMERAS[name]
     mask = np.full((camera.height, camera.width), 255, np.uint8)
     mask[: camera.height // 3, : camera.width // 4] = 0
@@ -24,7 +25,7 @@ def test_torch_paints_the_same(street, name, band) -> None:
     mine, done = street.run(band=band, device="numba")
     theirs, told = street.run(band=band, device="cpu")
     for page in range(done.facts["pages"]):
-        a, b = (image.read_rgb(folder / f"page_{page}.png").astype(int) for folder in (mine, theirs))
+        a, b = (present(image.read_rgb(folder / f"page_{page}.png")).astype(int) for folder in (mine, theirs))
         seen = [image.read_grey(folder / f"page_{page}_seen.png") for folder in (mine, theirs)]
         assert (seen[0] == seen[1]).mean() > 0.99999
         assert (abs(a - b).max(axis=2) <= 1).mean() > 0.99999
@@ -33,7 +34,7 @@ def test_torch_paints_the_same(street, name, band) -> None:
 
 @pytest.mark.parametrize("band", [2, 0, -1])
 @pytest.mark.parametrize("name", scattered.CAMERAS)
-def test_torch_adds_the_same(name, band) -> None:
+def test_torch_adds_the_same(name: str, band: int) -> None:
     from scan2sim.texturing.blend_torch import TorchRows
 
     camera, rng = scattered.CAMERAS[name], np.random.default_rng(7)
@@ -51,7 +52,7 @@ def test_torch_adds_the_same(name, band) -> None:
     assert abs(pages[0] - pages[1]).max() <= 1
 
 
-def test_a_device_that_is_not_there_is_named(street) -> None:
+def test_a_device_that_is_not_there_is_named(street: Street) -> None:
     street.add(CAMERAS["pinhole"], POSES[0])
     with pytest.raises(SettingError, match="xpu:7"):
         street.run(device="xpu:7")

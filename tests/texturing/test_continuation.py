@@ -1,12 +1,14 @@
 """Holes of a picture of the ground, whose pattern is known all over."""
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
+from scan2sim.pipeline.types import F32
 from scan2sim.texturing.continuation import FACTOR, continued
 
 
-def street(height=360, width=480):
+def street(height: int = 360, width: int = 480) -> F32:
     """(H, W, 3) paving of 40 x 40 cells with dark joints, a kerb and a road with a line, and some grain."""
     y, x = np.mgrid[:height, :width]
     rgb = np.full((height, width, 3), 150.0)
@@ -18,18 +20,18 @@ def street(height=360, width=480):
     return (rgb + np.random.default_rng(0).normal(0, 6, (height, width, 1))).astype(np.float32)
 
 
-def hole(rows, columns, shape=(360, 480)):
+def hole(rows: slice, columns: slice, shape: tuple[int, int] = (360, 480)) -> npt.NDArray[np.bool_]:
     mask = np.zeros(shape, bool)
     mask[rows, columns] = True
     return mask
 
 
-def error(rgb, truth, where):
-    return np.abs(rgb[where] - truth[where]).mean()
+def error(rgb: F32, truth: F32, where: npt.NDArray[np.bool_]) -> float:
+    return float(np.abs(rgb[where] - truth[where]).mean())
 
 
 @pytest.mark.parametrize("rows", [slice(60, 140), slice(150, 230), slice(230, 310)])
-def test_paving_kerb_and_line_go_on(rows) -> None:
+def test_paving_kerb_and_line_go_on(rows: slice) -> None:
     truth, wanted = street(), hole(rows, slice(200, 290))
     rgb, filled = continued(np.where(wanted[..., None], 255, truth), ~wanted, wanted)
     assert filled[wanted].all() and not filled[~wanted].any()

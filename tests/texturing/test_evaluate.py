@@ -1,17 +1,20 @@
 """Figures of a rendering against a photo: what they reward, what they leave out, and how they add up."""
 
 import math
+from pathlib import Path
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 import pytest
 
-from scan2sim.pipeline.render import Image
+from scan2sim.pipeline.render import Image, pinhole
+from scan2sim.pipeline.types import U8, View
 from scan2sim.texturing.evaluate import BAND_NAMES, BANDS, HeldOut, error_picture, errors, figures, psnr, score, tally
 
 
 @pytest.fixture
-def photo():
+def photo() -> U8:
     """(120, 160, 3): soft shapes and fine grain."""
     rng = np.random.default_rng(0)
     soft = cv2.GaussianBlur(rng.uniform(0, 255, (120, 160, 3)).astype(np.float32), (0, 0), 4)
@@ -22,36 +25,36 @@ def photo():
 EVERYWHERE = np.ones((120, 160), bool)
 
 
-def test_the_photo_itself_is_perfect(photo) -> None:
+def test_the_photo_itself_is_perfect(photo: U8) -> None:
     figures = score(photo, photo, EVERYWHERE)
     assert figures["psnr_db"] > 70 and figures["ssim"] == pytest.approx(1) and figures["sharpness"] == 1
 
 
-def test_a_darker_rendering_is_forgiven_by_the_gain_alone(photo) -> None:
+def test_a_darker_rendering_is_forgiven_by_the_gain_alone(photo: U8) -> None:
     figures = score(photo, (photo * 0.8).astype(np.uint8), EVERYWHERE)
     assert figures["psnr_db"] < 22 and figures["psnr_gain_db"] > 45
 
 
-def test_sharpness_tells_soft_from_crisp(photo) -> None:
+def test_sharpness_tells_soft_from_crisp(photo: U8) -> None:
     soft = score(photo, cv2.GaussianBlur(photo, (0, 0), 1.5), EVERYWHERE)["sharpness"]
     crisp = np.clip(photo + 1.0 * (photo - cv2.GaussianBlur(photo, (0, 0), 1.5).astype(float)), 0, 255)
     assert soft < 0.5 < 1.2 < score(photo, crisp.astype(np.uint8), EVERYWHERE)["sharpness"]
 
 
-def test_what_lies_outside_the_mask_has_no_say(photo) -> None:
+def test_what_lies_outside_the_mask_has_no_say(photo: U8) -> None:
     mask = np.zeros_like(EVERYWHERE)
     mask[30:90, 40:120] = True
     spoiled = np.where(mask[..., None], photo, 255 - photo)
     assert score(photo, spoiled, mask) == pytest.approx(score(photo, photo, mask))
 
 
-def test_nothing_to_count_is_not_a_number(photo) -> None:
+def test_nothing_to_count_is_not_a_number(photo: U8) -> None:
     assert all(math.isnan(value) for value in score(photo, photo, ~EVERYWHERE).values())
     flat = np.full_like(photo, 90)
     assert math.isnan(score(flat, flat, EVERYWHERE)["sharpness"])
 
 
-def test_parts_are_pooled_by_pixel_over_photos(photo) -> None:
+def test_parts_are_pooled_by_pixel_over_photos(photo: U8) -> None:
     """Errors of 10 and 20 grey levels in parts of different sizes, over two photos."""
     photo = np.full_like(photo, 100)
     sums = np.zeros((3, 5))
@@ -66,7 +69,7 @@ def test_parts_are_pooled_by_pixel_over_photos(photo) -> None:
     assert none["pixels"] == 0 and math.isnan(none["psnr_db"]) and math.isnan(none["ssim"])
 
 
-def test_parts_of_one_photo_add_up_to_its_own_figures(photo) -> None:
+def test_parts_of_one_photo_add_up_to_its_own_figures(photo: U8) -> None:
     render = cv2.GaussianBlur(photo, (0, 0), 1.0)
     part = np.arange(160)[None] // 40 + 0 * EVERYWHERE
     together = figures(tally(errors(photo, render, EVERYWHERE), part, 4).sum(axis=0))
@@ -81,13 +84,15 @@ def test_bands_are_named_by_their_metres() -> None:
     assert names == ["0-5 m", "5-10 m", "20-40 m", "40+ m"]
 
 
-def held(photo, render, mask):
+def held(photo: U8, render: U8, mask: npt.NDArray[np.bool_]) -> HeldOut:
     hit = np.ones(mask.shape, bool)
-    shot = Image(render, hit, *(np.zeros(mask.shape) for _ in range(4)), np.zeros((*mask.shape, 2)))
-    return HeldOut(None, photo, shot, mask, errors(photo, render, mask), 1.0, 0.0, 0.0, 0.0, 0.0)
+    seen, face, body = (np.zeros(mask.shape, kind) for kind in (np.uint8, np.int32, np.int16))
+    shot = Image(render, hit, seen, face, body, *(np.zeros((*mask.shape, *n), np.float32) for n in ((), (2,))))
+    view = View("held", pinhole(mask.shape[1], mask.shape[0]), np.eye(4), Path("held.png"))
+    return HeldOut(view, photo, shot, mask, errors(photo, render, mask), 1.0, 0.0, 0.0, 0.0, 0.0)
 
 
-def test_error_picture_is_dark_where_alike_bright_where_apart_and_grey_where_nothing_counts(photo) -> None:
+def test_error_picture_is_dark_where_alike_bright_where_apart_and_grey_where_nothing_counts(photo: U8) -> None:
     render, mask = photo.copy(), EVERYWHERE.copy()
     render[:60], mask[:, 80:] = np.where(photo[:60] > 127, 0, 255), False
     picture = error_picture(held(photo, render, mask))

@@ -1,21 +1,23 @@
 """The choice of one photo a face, against exhaustive search."""
 
 import itertools
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
 
+from scan2sim.pipeline.types import F32, I32
 from scan2sim.texturing.labels import adjacent, costs, label, solve
 
 
-def energy(labels, view, cost, pairs, price):
+def energy(labels: Sequence[int] | I32, view: I32, cost: F32, pairs: I32, price: F32) -> float:
     """What a labelling costs: photos worse than the best, and seams."""
     own = sum(cost[i, list(view[i]).index(labels[i])] for i in range(len(labels)))
     return own + sum(price[k] for k, (a, b) in enumerate(pairs) if labels[a] != labels[b])
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_no_labelling_is_much_better(seed) -> None:
+def test_no_labelling_is_much_better(seed: int) -> None:
     rng = np.random.default_rng(seed)
     view = np.array([rng.choice(4, 3, replace=False) for _ in range(7)], np.int32)
     quality = (rng.random((7, 3)) + 0.01).astype(np.float32)
@@ -36,9 +38,9 @@ def test_seams_that_cost_are_fewer() -> None:
     quality = (1 + 0.3 * rng.random((n, 2))).astype(np.float32)
     pairs = np.column_stack([np.arange(n - 1), np.arange(1, n)]).astype(np.int32)
 
-    def seams(price):
+    def seams(price: float) -> int:
         labels = label(view, quality, pairs, np.full(n - 1, price, np.float32))
-        return (labels[1:] != labels[:-1]).sum()
+        return int((labels[1:] != labels[:-1]).sum())
 
     assert seams(0.0) > 100 and seams(0.02) < seams(0.0) / 2 and seams(10.0) == 0
 

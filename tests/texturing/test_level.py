@@ -1,9 +1,12 @@
 """Tiles textured apart, levelled: made-up ground and walls in several tiles, each with its own exposure and atlas."""
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 import pytest
 from scipy.spatial import cKDTree
 
@@ -11,7 +14,7 @@ from scan2sim.pipeline.borders.grid import on_grid
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.io import image, textured
 from scan2sim.pipeline.step import silent
-from scan2sim.pipeline.types import Frame, Mesh
+from scan2sim.pipeline.types import F64, I32, Frame, Mesh
 from scan2sim.texturing import fill
 from scan2sim.texturing.borders.fading import changes, fade
 from scan2sim.texturing.borders.level import LevelParams, level
@@ -19,11 +22,18 @@ from scan2sim.texturing.borders.measure import colour_step
 from scan2sim.texturing.borders.meeting import meet, rim
 from scan2sim.texturing.texels import corners as laid_flat
 from scan2sim.texturing.texels import owners
+from tests.present import present
 
 YS = np.append(np.arange(-3, 3, 0.3), 3)
+I64: TypeAlias = npt.NDArray[np.int64]
+Paint: TypeAlias = Callable[[F64], F64]
+"""(N, 3) colours of places (N, 3)."""
+Place: TypeAlias = Callable[[F64, F64], F64]
+"""(N, 3) places of a sheet's own coordinates (N,) and (N,)."""
+Sheet: TypeAlias = tuple[F64, F64, I64]
 
 
-def paint(xyz):
+def paint(xyz: F64) -> F64:
     """(N, 3) grey levels of the surface at world places: wide waves and fine ones."""
     x, y, z = np.moveaxis(np.asarray(xyz, float), -1, 0)
     wide = np.stack([np.sin(x + y), np.cos(1.3 * y - z), np.sin(0.7 * x + 2 * z)], axis=-1)
@@ -31,16 +41,16 @@ def paint(xyz):
     return 110 + 25 * wide + 12 * fine[..., None]
 
 
-def bright(xyz):
+def bright(xyz: F64) -> F64:
     """The paint as another tile's photos show it: brighter, tinted, and with fine detail that is not quite the same."""
     return paint(xyz) + [24, 20, 15] + 5 * np.sin(60 * xyz[:, :1] + 50 * xyz[:, 1:2])
 
 
-def plain(*rgb):
+def plain(*rgb: float) -> Paint:
     return lambda xyz: np.broadcast_to(np.array(rgb, float), xyz.shape)
 
 
-def sheet(xs, ys, place):
+def sheet(xs: F64, ys: F64, place: Place) -> Sheet:
     """A rectangle of cells: its corners on the plane, their places in the world, its faces."""
     s, t = (a.ravel() for a in np.meshgrid(xs, ys, indexing="ij"))
     i, j = np.meshgrid(np.arange(len(xs) - 1), np.arange(len(ys) - 1), indexing="ij")
@@ -49,36 +59,45 @@ def sheet(xs, ys, place):
     return np.column_stack([s, t]), on_grid(place(s, t)), faces
 
 
-def half(sign, cells, ys=YS):
+def half(sign: int, cells: int, ys: F64 = YS) -> list[Sheet]:
     """Ground from a bent border to the left (-1) or right (1), and a wall that stands on its far side."""
     xs = np.sort(sign * np.linspace(0, 7, cells + 1))
 
-    def ground(s, t):
+    def ground(s: F64, t: F64) -> F64:
         return np.column_stack([0.4 * np.sin(t) + s, t, 0 * t])
 
-    def wall(s, t):
+    def wall(s: F64, t: F64) -> F64:
         return np.column_stack([0.4 * np.sin(3) + s, 3 + 0 * s, t])
 
     return [sheet(xs, ys, ground), sheet(xs, np.linspace(0, 2, 7), wall)]
 
 
-def flat(x0, x1, y0, y1):
+def flat(x0: float, x1: float, y0: float, y1: float) -> list[Sheet]:
     """Level ground."""
     xs, ys = (np.arange(a, b + 0.01, 0.25) for a, b in ((x0, x1), (y0, y1)))
     return [sheet(xs, ys, lambda s, t: np.column_stack([s, t, 0 * t]))]
 
 
-def tile(folder, sheets, colour, *, origin=(0.0, 0.0, 0.0), texel=0.03, turned=False):
+def tile(
+    folder: Path,
+    sheets: list[Sheet],
+    colour: Paint,
+    *,
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    texel: float = 0.03,
+    turned: bool = False,
+) -> Path:
     """Write a textured mesh: sheets side by side on one page, turned by a quarter or not, painted by place."""
     at, right = 0, 6.3
     on_page, world, faces = [], [], []
-    for plane, places, triangles in sheets:
+    for plane, places, own in sheets:
         on_page.append((plane - plane.min(axis=0)) / texel + (right, 5.7))
         right += np.ptp(plane[:, 0]) / texel + 9.4
         world.append(places)
-        faces.append(triangles + at)
+        faces.append(own + at)
         at += len(places)
-    xy, triangles = np.concatenate(on_page), np.concatenate(faces).astype(np.int32)
+    xy = np.concatenate(on_page)
+    triangles: I32 = np.concatenate(faces).astype(np.int32)
     width, height = int(right) + 1, int(xy[:, 1].max()) + 8
     if turned:
         xy, width, height = np.column_stack([xy[:, 1], width - 1 - xy[:, 0]]), height, width
@@ -97,16 +116,16 @@ def tile(folder, sheets, colour, *, origin=(0.0, 0.0, 0.0), texel=0.03, turned=F
     return folder
 
 
-def texels(mesh, width, height):
+def texels(mesh: Mesh, width: int, height: int) -> tuple[I32, I64, I64, F64]:
     """Owner (H, W) of a page's texels; rows, columns and world places of those in faces."""
-    corners = laid_flat(mesh.uv, width, height)
+    corners = laid_flat(present(mesh.uv), width, height)
     owner = owners(corners, width, height)
     rows, columns = np.nonzero(owner >= 0)
     places = fill.texel_places(owner, corners, mesh.corners, rows, columns)
     return owner, rows, columns, places + np.asarray(mesh.frame.origin)
 
 
-def run(folder: Path, neighbours=(), **params):
+def run(folder: Path, neighbours: Sequence[Path] = (), **params: Any) -> tuple[Path, dict[str, Any]]:
     """The step on a folder; the folder that it writes, and its facts."""
     out = folder.parent / f"level_{folder.name}_{len(list(folder.parent.iterdir()))}"
     out.mkdir()
@@ -115,8 +134,8 @@ def run(folder: Path, neighbours=(), **params):
     return done.files["textured"], done.facts
 
 
-def step(*folders):
-    return colour_step(*(textured.read(folder) for folder in folders))
+def step(*folders: Path) -> tuple[float, float, float]:
+    return colour_step(*(present(textured.read(folder)) for folder in folders))
 
 
 def same_bytes(one: Path, two: Path) -> bool:
@@ -125,22 +144,22 @@ def same_bytes(one: Path, two: Path) -> bool:
     return all((one / name).read_bytes() == (two / name).read_bytes() for name in names)
 
 
-def change(before: Path, after: Path):
+def change(before: Path, after: Path) -> tuple[npt.NDArray[np.int64], F64]:
     """What the levelling added to the texels of faces (N, 3), and their world places (N, 3)."""
-    pages = [image.read_rgb(folder / "page_0.png").astype(int) for folder in (before, after)]
+    pages = [present(image.read_rgb(folder / "page_0.png")).astype(int) for folder in (before, after)]
     _, rows, columns, places = texels(Mesh.load(after / "mesh.npz"), *pages[0].shape[1::-1])
     return (pages[1] - pages[0])[rows, columns], places
 
 
 @pytest.fixture
-def pair(tmp_path: Path):
+def pair(tmp_path: Path) -> tuple[Path, Path]:
     """Two tiles with the same border and all else different."""
     one = tile(tmp_path / "one", half(-1, 20), bright)
     two = tile(tmp_path / "two", half(1, 31), paint, origin=(4.0, -2.0, 1.0), texel=0.037, turned=True)
     return one, two
 
 
-def test_two_tiles_meet(pair) -> None:
+def test_two_tiles_meet(pair: tuple[Path, Path]) -> None:
     one, two = pair
     mean, _, length = step(one, two)
     assert mean > 15 and length == pytest.approx(8.22, abs=0.01)  # 6.2 m of bent ground, 2 m of wall
@@ -152,7 +171,7 @@ def test_two_tiles_meet(pair) -> None:
     assert facts["neighbours"]["two"]["border_m"] == facts["border_m"]
 
 
-def test_what_is_far_from_the_border_stays(pair) -> None:
+def test_what_is_far_from_the_border_stays(pair: tuple[Path, Path]) -> None:
     one, two = pair
     levelled, _ = run(one, [two], reach=1.5)
     added, places = change(one, levelled)
@@ -187,14 +206,14 @@ def test_three_tiles_meet_in_a_corner(tmp_path: Path) -> None:
     for one, two in ("ab", "bc", "ca"):
         assert step(done[one], done[two])[0] < 1
     for name, folder in done.items():  # no step within a tile either, not even around the corner
-        page = image.read_rgb(folder / "page_0.png").astype(int)
+        page = present(image.read_rgb(folder / "page_0.png")).astype(int)
         owner = texels(Mesh.load(folder / "mesh.npz"), *page.shape[1::-1])[0]
         for axis in (0, 1):
             inside = (np.minimum(owner, np.roll(owner, 1, axis)) >= 0)[1:, 1:]
             assert abs(np.diff(page, axis=axis))[-inside.shape[0] :, -inside.shape[1] :][inside].max() <= 2, name
         added, places = change(made[name], folder)
         here = np.linalg.norm(places[:, :2], axis=1).argmin()
-        assert abs(added[here] + image.read_rgb(made[name] / "page_0.png")[8, 8] - [115, 103, 110]).max() <= 2
+        assert abs(added[here] + present(image.read_rgb(made[name] / "page_0.png"))[8, 8] - [115, 103, 110]).max() <= 2
 
 
 def test_shared_vertices_are_enough(tmp_path: Path) -> None:
@@ -237,11 +256,11 @@ def test_carried_inwards_as_the_slow_way_does() -> None:
     assert off.mean() < 0.3 and off.max() < 1.5  # rounding, and far places taken together
 
 
-def test_the_same_again_byte_for_byte(pair) -> None:
+def test_the_same_again_byte_for_byte(pair: tuple[Path, Path]) -> None:
     assert same_bytes(run(pair[0], [pair[1]])[0], run(pair[0], [pair[1]])[0])
 
 
-def test_without_neighbours_nothing_changes(pair, tmp_path: Path) -> None:
+def test_without_neighbours_nothing_changes(pair: tuple[Path, Path], tmp_path: Path) -> None:
     one, _ = pair
     empty, far = tmp_path / "empty", tile(tmp_path / "far", flat(50, 52, 0, 2), paint)
     empty.mkdir()
@@ -253,19 +272,19 @@ def test_without_neighbours_nothing_changes(pair, tmp_path: Path) -> None:
     assert same_bytes(folder, empty) and facts["border_m"] == 0
 
 
-def test_inputs_are_left_alone(pair) -> None:
+def test_inputs_are_left_alone(pair: tuple[Path, Path]) -> None:
     before = {path: path.read_bytes() for folder in pair for path in folder.iterdir()}
     run(pair[0], [pair[1]])
     assert all(path.read_bytes() == content for path, content in before.items())
 
 
-def test_a_neighbours_broken_page_is_named(pair) -> None:
+def test_a_neighbours_broken_page_is_named(pair: tuple[Path, Path]) -> None:
     (pair[1] / "page_0.png").write_bytes(b"broken")
     with pytest.raises(InputError, match=r"two/page_0\.png"):
         run(pair[0], [pair[1]])
 
 
-def test_padding_shows_what_the_charts_show(pair) -> None:
+def test_padding_shows_what_the_charts_show(pair: tuple[Path, Path]) -> None:
     page = cv2.imread(str(run(pair[0], [pair[1]])[0] / "page_0.png"))[..., ::-1]
     seen = cv2.imread(str(pair[0] / "page_0_seen.png"), cv2.IMREAD_GRAYSCALE)
     padded = np.ascontiguousarray(page)

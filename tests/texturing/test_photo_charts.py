@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from scan2sim.pipeline.types import Mesh
+from scan2sim.pipeline.types import I32, Mesh
 from scan2sim.texturing import photo_charts
 from tests.texturing.corner import BOX, GROUND, join
 
 CENTRES = np.array([[-4.0, -2.0, 1.8], [-4.0, 2.0, 1.8]])
 
 
-def both():
+def both() -> tuple[Mesh, I32]:
     """Ground and box as one mesh; its left half belongs to the first camera, its right half to the second."""
     mesh = join((GROUND.vertices, GROUND.faces), (BOX.vertices, BOX.faces))
     middle = mesh.corners.mean(axis=1)

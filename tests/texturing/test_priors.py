@@ -15,7 +15,7 @@ from scan2sim.texturing.exposure import _prior as exposure_prior
 from scan2sim.texturing.photos import GAMMA, Exposures
 
 
-def test_exposures_differ_by_spread_and_tints_by_tint(tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+def test_exposures_differ_by_spread_and_tints_by_tint(tmp_path: Path) -> None:
     view = View("a", Camera("pinhole", 8, 6, 5, 5, 3.5, 2.5), np.eye(4), tmp_path / "a.png")
     params = ExposureParams(spread=0.8, tint=0.2)
     _, precision = exposure_prior([view], np.array([0]), [], Exposures(), params)

@@ -2,9 +2,11 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from scan2sim.flows.recipes.graph import NodeId, Output
@@ -14,8 +16,8 @@ from scan2sim.pipeline.cameras import inside, project
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.render import look_at
-from scan2sim.pipeline.step import silent
-from scan2sim.pipeline.types import Camera, View
+from scan2sim.pipeline.step import Done, silent
+from scan2sim.pipeline.types import F64, U8, Camera, View
 from scan2sim.texturing.refine import RefineParams, lenses, refine
 from tests.texturing.corner import CAMERAS, GROUND, grid, join
 
@@ -32,7 +34,7 @@ WAVES = RNG.normal(0, 1, (60, 3)) * np.geomspace(2, 25, 60)[:, None]
 PHASES = RNG.uniform(0, 6, 60)
 
 
-def marbled(camera, pose):
+def marbled(camera: Camera, pose: F64) -> U8:
     """A photo of the corner with a pattern that nowhere repeats: something to find again."""
     from scan2sim.pipeline.cameras import pixel_rays
     from scan2sim.pipeline.render import Body, Renderer
@@ -44,7 +46,7 @@ def marbled(camera, pose):
     return np.repeat(np.clip(grey, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
 
 
-def turned(pose, turn, shift):
+def turned(pose: F64, turn: npt.ArrayLike, shift: npt.ArrayLike) -> F64:
     """The pose turned by a rotation vector (rad) and shifted (m), both in the camera's axes."""
     out = pose.copy()
     out[:3, :3] = pose[:3, :3] @ cv2.Rodrigues(np.asarray(turn, float))[0]
@@ -52,7 +54,7 @@ def turned(pose, turn, shift):
     return out
 
 
-def made(folder, camera, wrong, held=()):
+def made(folder: Path, camera: Camera, wrong: list[F64], held: tuple[int, ...] = ()) -> dict[str, Path]:
     """Inputs of the step: photos taken at POSES, said to be taken at `wrong`."""
     views = []
     for i, (true, told) in enumerate(zip(POSES, wrong, strict=False)):
@@ -69,14 +71,14 @@ def made(folder, camera, wrong, held=()):
     }
 
 
-def run(folder, inputs, **params):
+def run(folder: Path, inputs: dict[str, Path], **params: Any) -> tuple[tuple[View, ...], Done]:
     out = folder / "out"
     out.mkdir()
     done = refine(inputs, RefineParams(**params), out, silent)
     return views_io.load(done.files["views"]), done
 
 
-def off(camera, pose, true):
+def off(camera: Camera, pose: F64, true: F64) -> float:
     """Pixels, median, by which a pose shows the surface elsewhere than the true one."""
     x = np.concatenate([GROUND.vertices, WALLS.vertices])
     there, a = project(camera, (x - true[:3, 3]) @ true[:3, :3])
@@ -85,7 +87,13 @@ def off(camera, pose, true):
     return float(np.median(np.linalg.norm(here[seen] - there[seen], axis=1)))
 
 
-def disturbed(rng, *, photo=(0.002, 0.03), turn=(0.005, -0.003, 0.004), shift=(0.03, -0.03, 0.02)):
+def disturbed(
+    rng: np.random.Generator,
+    *,
+    photo: tuple[float, float] = (0.002, 0.03),
+    turn: npt.ArrayLike = (0.005, -0.003, 0.004),
+    shift: npt.ArrayLike = (0.03, -0.03, 0.02),
+) -> list[F64]:
     """Poses with an error of the camera's, and one of each photo's (standard deviations: radians, metres)."""
     return [
         turned(turned(pose, turn, shift), rng.normal(0, photo[0] / 3**0.5, 3), rng.normal(0, photo[1] / 3**0.5, 3))
@@ -94,7 +102,7 @@ def disturbed(rng, *, photo=(0.002, 0.03), turn=(0.005, -0.003, 0.004), shift=(0
 
 
 @pytest.mark.parametrize("model", ["pinhole", "opencv", "fisheye", "equirectangular"])
-def test_disturbed_poses_come_back(tmp_path: Path, model) -> None:
+def test_disturbed_poses_come_back(tmp_path: Path, model: str) -> None:
     camera = CAMERAS[model]
     wrong = disturbed(np.random.default_rng(1))
     views, done = run(tmp_path, made(tmp_path, camera, wrong))
@@ -114,7 +122,8 @@ def test_right_poses_stay_to_the_last_bit(tmp_path: Path) -> None:
 def test_a_photo_held_out_moves_nobody_and_goes_with_its_neighbours(tmp_path: Path) -> None:
     camera, rng = CAMERAS["pinhole"], np.random.default_rng(2)
     wrong = disturbed(rng, photo=(0.0, 0.0))
-    (tmp_path / "a").mkdir(), (tmp_path / "b").mkdir()
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
     views, _ = run(tmp_path / "a", made(tmp_path / "a", camera, wrong, held=(4,)))
     assert off(camera, views[4].T_world_cam, POSES[4]) < 0.4 * off(camera, wrong[4], POSES[4])
     blank = made(tmp_path / "b", camera, wrong, held=(4,))
@@ -135,7 +144,7 @@ def test_an_unbelievable_pose_is_left_and_named(tmp_path: Path) -> None:
 
 def test_cameras_of_a_pair_are_two() -> None:
     camera = CAMERAS["pinhole"]
-    view = View("left/0", camera, np.eye(4), None)
+    view = View("left/0", camera, np.eye(4), Path("left/0.png"))
     names, index = lenses([view, replace(view, name="right/0"), replace(view, name="left/1")])
     assert names == ["left", "right"] and index.tolist() == [0, 1, 0]
 

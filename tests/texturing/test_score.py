@@ -1,7 +1,9 @@
 """The step `score` on a made-up street corner: what it tells of held-out photos and of the truth."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,13 +11,13 @@ import pytest
 from scan2sim.pipeline.io import image
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.render import look_at
-from scan2sim.pipeline.step import silent
+from scan2sim.pipeline.step import Done, silent
 from scan2sim.pipeline.types import Frame, PointCloud
 from scan2sim.texturing.score import ScoreParams, score
 from tests.texturing.corner import CAMERAS, POSES, Street, paint, points
 
 
-def inputs_of(street):
+def inputs_of(street: Street) -> dict[str, Path]:
     """Texture the street and give what the step reads."""
     street.texel = 0.04
     folder, _ = street.run()
@@ -23,7 +25,7 @@ def inputs_of(street):
 
 
 @pytest.fixture(scope="module")
-def textured(tmp_path_factory: pytest.TempPathFactory):
+def textured(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """What the step reads of a textured street of which the second of four photos is held out."""
     street = Street(tmp_path_factory.mktemp("street"))
     for pose in POSES:
@@ -34,17 +36,17 @@ def textured(tmp_path_factory: pytest.TempPathFactory):
 
 
 @pytest.fixture(scope="module")
-def scored(textured, tmp_path_factory: pytest.TempPathFactory):
+def scored(textured: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Done:
     """What the step says of it."""
     return score(textured, ScoreParams(), tmp_path_factory.mktemp("score"), silent)
 
 
-def strict(facts):
+def strict(facts: Mapping[str, Any]) -> dict[str, Any]:
     """The facts as JSON keeps them, which knows no NaN."""
     return json.loads(json.dumps(facts, allow_nan=False))
 
 
-def test_a_held_out_photo_is_told_by_class_and_by_distance(scored) -> None:
+def test_a_held_out_photo_is_told_by_class_and_by_distance(scored: Done) -> None:
     facts = strict(scored.facts)
     assert facts["held_out"] == 1 and list(facts["photos"]) == ["photo1"]
     assert facts["psnr_db"] > 28 and facts["ssim"] > 0.85 and 0.7 < facts["sharpness"] < 1.1
@@ -57,7 +59,7 @@ def test_a_held_out_photo_is_told_by_class_and_by_distance(scored) -> None:
     assert not scored.warnings
 
 
-def test_every_held_out_photo_has_its_error_picture(scored) -> None:
+def test_every_held_out_photo_has_its_error_picture(scored: Done) -> None:
     folder = scored.files["error"]
     (entry,) = json.loads((folder / "index.json").read_text())
     assert (entry["role"], entry["title"]) == ("error", "photo1") and "dB" in entry["caption"]
@@ -65,7 +67,7 @@ def test_every_held_out_photo_has_its_error_picture(scored) -> None:
     assert picture is not None and picture.shape[1] <= 1600
 
 
-def test_without_held_out_photos_figures_are_none(street, tmp_path: Path) -> None:
+def test_without_held_out_photos_figures_are_none(street: Street, tmp_path: Path) -> None:
     street.add(CAMERAS["pinhole"], POSES[0])
     done = score(inputs_of(street), ScoreParams(), tmp_path, silent)
     facts = strict(done.facts)
@@ -74,7 +76,7 @@ def test_without_held_out_photos_figures_are_none(street, tmp_path: Path) -> Non
 
 
 def test_held_out_photos_of_what_the_world_lacks_count_and_those_that_cannot_be_read_are_named(
-    street, tmp_path: Path
+    street: Street, tmp_path: Path
 ) -> None:
     away = look_at((-4, 0, 1.8), (-9, 0, 4))  # at the sky
     for pose in (POSES[0], POSES[1], away):
@@ -91,7 +93,7 @@ def test_held_out_photos_of_what_the_world_lacks_count_and_those_that_cannot_be_
     assert "photo1.png" in warning and "can't be read" in warning
 
 
-def test_cameras_beside_a_surface_are_told_and_how_near_they_are(street, tmp_path: Path) -> None:
+def test_cameras_beside_a_surface_are_told_and_how_near_they_are(street: Street, tmp_path: Path) -> None:
     low = POSES[1].copy()
     low[2, 3] = 0.4  # the ground is at 0
     for pose in (POSES[0], low):
@@ -100,7 +102,7 @@ def test_cameras_beside_a_surface_are_told_and_how_near_they_are(street, tmp_pat
     assert cameras == {"count": 2, "near_m": {"photo1": pytest.approx(0.4, abs=0.05)}}
 
 
-def test_what_photos_saw_from_near_is_held_against_the_truth_apart(textured, tmp_path: Path) -> None:
+def test_what_photos_saw_from_near_is_held_against_the_truth_apart(textured: dict[str, Path], tmp_path: Path) -> None:
     """The truth is made wrong beyond 5 m of every photo that was not held out."""
     truth = points()
     eyes = np.array([pose[:3, 3] for i, pose in enumerate(POSES) if i != 1])

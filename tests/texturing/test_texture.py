@@ -2,38 +2,41 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 import pytest
 from PIL import Image
 
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.render import Renderer, look_at, textured
-from scan2sim.pipeline.types import Camera, Frame, Mesh
-from tests.texturing.corner import BOX, CAMERAS, GROUND, POSES, paint, photograph, points
+from scan2sim.pipeline.types import F64, U8, Camera, Frame, Mesh
+from tests.present import present
+from tests.texturing.corner import BOX, CAMERAS, GROUND, POSES, Street, paint, photograph, points
 
 LOW, HIGH = (-5, -5, 0), (5, 5, 3)
 
 
-def from_above(folder, width=200):
+def from_above(folder: Path, width: int = 200) -> tuple[F64, U8, F64, F64, F64]:
     """The ground as textured, where it is, and its true paint: (H, W, 3), seen (H, W), (H, W, 3)."""
     image = Renderer([textured(folder)]).above(LOW, HIGH, width=width)
     x, y = np.meshgrid(-5 + (np.arange(width) + 0.5) * 10 / width, 5 - (np.arange(width) + 0.5) * 10 / width)
     return image.rgb.astype(float), image.seen, np.clip(paint(np.stack([x, y, 0 * x], axis=-1)), 0, 255), x, y
 
 
-def apart_from_the_box(x, y):
+def apart_from_the_box(x: F64, y: F64) -> npt.NDArray[np.bool_]:
     """(H, W) where the box doesn't stand, nor is as near as the depth test's bias."""
     return (abs(x - 0.5) > 0.65) | (abs(y) > 1.15)
 
 
-def psnr(a, b):
-    return 10 * np.log10(255**2 / ((a - b) ** 2).mean())
+def psnr(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> float:
+    return float(10 * np.log10(255**2 / ((a - b) ** 2).mean()))
 
 
 @pytest.mark.parametrize("name", CAMERAS)
-def test_photos_come_back_as_texture(street, name) -> None:
+def test_photos_come_back_as_texture(street: Street, name: str) -> None:
     for pose in POSES:
         street.add(CAMERAS[name], pose)
     street.clouds["terrain"] = points()
@@ -46,7 +49,7 @@ def test_photos_come_back_as_texture(street, name) -> None:
     assert done.facts["seen_m2"] == pytest.approx(100 * done.facts["coverage"], rel=0.02)
 
 
-def test_what_the_box_hides_is_not_painted_with_the_box(street) -> None:
+def test_what_the_box_hides_is_not_painted_with_the_box(street: Street) -> None:
     street.add(CAMERAS["pinhole"], look_at((-4, 0, 1.2), (0, 0, 0.6)))
     street.clouds["terrain"] = points(rgb=(0, 255, 0))
     folder, done = street.run()
@@ -59,7 +62,7 @@ def test_what_the_box_hides_is_not_painted_with_the_box(street) -> None:
     assert 0 < done.facts["coverage"] < 1
 
 
-def test_the_wall_is_painted_from_the_front_only(street) -> None:
+def test_the_wall_is_painted_from_the_front_only(street: Street) -> None:
     street.mesh = BOX
     for pose in POSES:
         street.add(CAMERAS["pinhole"], pose)
@@ -72,7 +75,7 @@ def test_the_wall_is_painted_from_the_front_only(street) -> None:
     assert (back.seen[back.hit] != 255).mean() > 0.9
 
 
-def test_the_nearer_photo_counts_more(street) -> None:
+def test_the_nearer_photo_counts_more(street: Street) -> None:
     camera = CAMERAS["pinhole"]
     white, black = np.full((480, 640, 3), 220, np.uint8), np.full((480, 640, 3), 20, np.uint8)
     street.occluders = (GROUND,)
@@ -85,7 +88,7 @@ def test_the_nearer_photo_counts_more(street) -> None:
     assert 60 < rgb[lit & (abs(x) < 0.1)].mean() < 180
 
 
-def test_more_power_is_sharper(street) -> None:
+def test_more_power_is_sharper(street: Street) -> None:
     camera = CAMERAS["pinhole"]
     street.occluders = (GROUND,)
     street.add(camera, look_at((-4.5, 0, 2), (-2, 0, 0)), np.full((480, 640, 3), 220, np.uint8))
@@ -94,7 +97,7 @@ def test_more_power_is_sharper(street) -> None:
     assert sharp.mean() > soft.mean() + 10
 
 
-def test_unseen_texels_get_the_colours_of_the_points(street) -> None:
+def test_unseen_texels_get_the_colours_of_the_points(street: Street) -> None:
     street.clouds["terrain"] = points()
     folder, done = street.run()
     rgb, seen, truth, _, _ = from_above(folder)
@@ -103,10 +106,10 @@ def test_unseen_texels_get_the_colours_of_the_points(street) -> None:
     assert done.facts["coverage"] == 0 and done.facts["coloured_m2"] == pytest.approx(100, rel=0.02)
 
 
-def test_points_without_a_colour_lend_none(street) -> None:
+def test_points_without_a_colour_lend_none(street: Street) -> None:
     cloud = points()
     grey = cloud.xyz[:, 0] > 0.5
-    cloud.rgb[grey] = 128
+    present(cloud.rgb)[grey] = 128
     street.clouds["terrain"] = cloud
     rgb, seen, truth, x, _ = from_above(street.run()[0])
     assert (seen[x < 0] == 128).all() and (seen[x > 1] == 64).all()
@@ -115,11 +118,11 @@ def test_points_without_a_colour_lend_none(street) -> None:
     assert abs(rgb[far].mean() - truth[x < 0].mean()) < 25
 
 
-def test_the_ground_goes_on_where_no_photo_saw_it(street) -> None:
+def test_the_ground_goes_on_where_no_photo_saw_it(street: Street) -> None:
     for pose in POSES:
         street.add(CAMERAS["pinhole"], pose)
     cloud = points()
-    cloud.rgb[:] = 128
+    present(cloud.rgb)[:] = 128
     street.clouds["terrain"] = cloud
     flat, *_ = from_above(street.run()[0])
     folder, done = street.run(continued=True)
@@ -127,14 +130,14 @@ def test_the_ground_goes_on_where_no_photo_saw_it(street) -> None:
     unseen = (seen == 64) & apart_from_the_box(x, y)
     assert unseen.mean() > 0.01 and done.facts["filled_m2"] > 1
 
-    def apart(image):
-        return np.abs(image - truth)[unseen].mean()
+    def apart(image: F64) -> float:
+        return float(np.abs(image - truth)[unseen].mean())
 
     assert apart(rgb) < 0.8 * apart(flat) and apart(rgb) < 0.6 * np.abs(128 - truth)[unseen].mean()
     assert (flat[seen == 255] == rgb[seen == 255]).all(axis=-1).mean() > 0.97  # but where lookups mix both
 
 
-def test_the_black_below_a_car_that_was_taken_out_is_painted_over(street) -> None:
+def test_the_black_below_a_car_that_was_taken_out_is_painted_over(street: Street) -> None:
     camera, pose = CAMERAS["pinhole"], look_at((-4.5, 0, 3.0), (-1, 0, 0))
     street.occluders = (GROUND,)
     photo = photograph(camera, pose, meshes=(GROUND,))
@@ -143,7 +146,10 @@ def test_the_black_below_a_car_that_was_taken_out_is_painted_over(street) -> Non
     photo[np.abs(below.astype(int) - [200, 214, 230]).sum(axis=-1) > 0] = 5  # the car's shade: 2 x 1 m
     street.add(camera, pose, photo)
     street.clouds["terrain"] = points()
-    black = lambda rgb: (rgb.max(axis=-1) < 30).sum()  # noqa: E731
+
+    def black(rgb: F64) -> int:
+        return int((rgb.max(axis=-1) < 30).sum())
+
     before = black(from_above(street.run(continued=True, exposure={"solve": False})[0])[0])
     ring = [[-2.6, -0.6], [-0.4, -0.6], [-0.4, 0.6], [-2.6, 0.6], [-2.6, -0.6]]
     car = {"kind": "car", "moved": False}
@@ -155,13 +161,13 @@ def test_the_black_below_a_car_that_was_taken_out_is_painted_over(street) -> Non
     assert not (seen[(abs(x + 1.5) < 1.0) & (abs(y) < 0.5)] == 255).any()
 
 
-def test_the_classes_left_out_lend_no_colours(street) -> None:
+def test_the_classes_left_out_lend_no_colours(street: Street) -> None:
     street.clouds["terrain"], street.clouds["rest"] = points(rgb=(10, 200, 10)), points(rgb=(255, 0, 0))
     rgb, *_ = from_above(street.run()[0])
     assert (rgb == [10, 200, 10]).all()
 
 
-def test_points_without_colours_give_their_classes(street) -> None:
+def test_points_without_colours_give_their_classes(street: Street) -> None:
     street.clouds["terrain"] = points(colour=False)
     folder, done = street.run()
     rgb, seen, *_ = from_above(folder)
@@ -172,7 +178,7 @@ def test_points_without_colours_give_their_classes(street) -> None:
     assert done.facts["filled_m2"] == pytest.approx(100, rel=0.02)
 
 
-def test_without_coloured_points_what_is_unseen_takes_after_its_seen_neighbours(street) -> None:
+def test_without_coloured_points_what_is_unseen_takes_after_its_seen_neighbours(street: Street) -> None:
     street.add(CAMERAS["pinhole"], POSES[1], np.full((480, 640, 3), (20, 90, 200), np.uint8))
     street.clouds["terrain"] = points(colour=False)
     rgb, seen, *_ = from_above(street.run()[0])
@@ -180,12 +186,12 @@ def test_without_coloured_points_what_is_unseen_takes_after_its_seen_neighbours(
     assert (rgb[seen == 64] == [20, 90, 200]).all(axis=1).mean() > 0.95
 
 
-def test_nothing_at_all_is_grey(street) -> None:
+def test_nothing_at_all_is_grey(street: Street) -> None:
     rgb, seen, *_ = from_above(street.run()[0])
     assert (rgb == 128).all() and (seen == 64).all()
 
 
-def test_masked_pixels_are_not_used(street) -> None:
+def test_masked_pixels_are_not_used(street: Street) -> None:
     camera, pose = CAMERAS["pinhole"], POSES[1]
     image = photograph(camera, pose)
     image[240:, :320] = (255, 0, 255)  # the recording car
@@ -199,7 +205,7 @@ def test_masked_pixels_are_not_used(street) -> None:
     assert magenta.sum() == 0
 
 
-def test_an_unreadable_photo_is_skipped_and_named(street) -> None:
+def test_an_unreadable_photo_is_skipped_and_named(street: Street) -> None:
     for pose in POSES:
         street.add(CAMERAS["pinhole"], pose)
     street.views[1].photo.write_bytes(b"broken")
@@ -214,7 +220,7 @@ def test_an_unreadable_photo_is_skipped_and_named(street) -> None:
     assert psnr(rgb[near], truth[near]) > 30
 
 
-def test_held_out_photos_are_never_used(street) -> None:
+def test_held_out_photos_are_never_used(street: Street) -> None:
     street.add(CAMERAS["pinhole"], POSES[1])
     street.add(CAMERAS["pinhole"], POSES[2], np.full((480, 640, 3), (255, 0, 255), np.uint8))
     street.held_out = (False, True)
@@ -225,7 +231,7 @@ def test_held_out_photos_are_never_used(street) -> None:
     assert list(done.facts["texels_by_photo"]) == ["photo0"]
 
 
-def test_grey_and_sixteen_bit_photos_are_read(street) -> None:
+def test_grey_and_sixteen_bit_photos_are_read(street: Street) -> None:
     view = street.add(CAMERAS["pinhole"], POSES[1])
     grey = cv2.imread(str(view.photo), cv2.IMREAD_GRAYSCALE)
     cv2.imwrite(str(view.photo), grey.astype(np.uint16) * 257)
@@ -234,7 +240,7 @@ def test_grey_and_sixteen_bit_photos_are_read(street) -> None:
     assert np.ptp(rgb[seen == 255], axis=1).max() <= 1
 
 
-def test_the_same_again_byte_for_byte(street) -> None:
+def test_the_same_again_byte_for_byte(street: Street) -> None:
     for pose in POSES:
         street.add(CAMERAS["pinhole"], pose)
     street.clouds["terrain"] = points()
@@ -243,7 +249,7 @@ def test_the_same_again_byte_for_byte(street) -> None:
         assert (one / name).read_bytes() == (two / name).read_bytes()
 
 
-def test_room_between_charts_carries_their_colours(street) -> None:
+def test_room_between_charts_carries_their_colours(street: Street) -> None:
     street.mesh, street.clouds["terrain"] = BOX, points(rgb=(200, 10, 10))
     folder, _ = street.run()
     page = cv2.imread(str(folder / "page_0.png"))[..., ::-1]
@@ -252,14 +258,14 @@ def test_room_between_charts_carries_their_colours(street) -> None:
     assert (abs(page.astype(int) - [200, 10, 10]) <= 1).all()
 
 
-def test_a_mesh_without_faces_passes(street) -> None:
+def test_a_mesh_without_faces_passes(street: Street) -> None:
     street.mesh = Mesh(Frame(), np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
     folder, done = street.run()
     assert len(Mesh.load(folder / "mesh.npz")) == 0
     assert done.facts["area_m2"] == 0
 
 
-def test_several_pages_meet_without_a_seam(street) -> None:
+def test_several_pages_meet_without_a_seam(street: Street) -> None:
     street.clouds["terrain"] = points()
     street.texel, street.page_size = 0.01, 512
     folder, done = street.run()
@@ -268,7 +274,7 @@ def test_several_pages_meet_without_a_seam(street) -> None:
     assert np.abs(rgb - truth).max() < 12  # grey levels, at the seams, too
 
 
-def test_views_survive_their_json(street, tmp_path: Path) -> None:
+def test_views_survive_their_json(street: Street, tmp_path: Path) -> None:
     view = street.add(CAMERAS["opencv"], POSES[0], mask=np.zeros((480, 640), np.uint8))
     views_io.save(tmp_path / "v.json", [view], [True])
     (read,) = views_io.load(tmp_path / "v.json")
@@ -279,16 +285,16 @@ def test_views_survive_their_json(street, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["16 bit", "grey", "cmyk"])
-def test_photos_of_other_kinds_are_read(street, kind) -> None:
+def test_photos_of_other_kinds_are_read(street: Street, kind: str) -> None:
     for pose in POSES:
         view = street.add(CAMERAS["pinhole"], pose)
-        rgb = photograph(CAMERAS["pinhole"], pose)
+        photo = photograph(CAMERAS["pinhole"], pose)
         if kind == "16 bit":
-            cv2.imwrite(str(view.photo), rgb[..., ::-1].astype(np.uint16) * 257)
+            cv2.imwrite(str(view.photo), photo[..., ::-1].astype(np.uint16) * 257)
         elif kind == "grey":
-            cv2.imwrite(str(view.photo), cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY))
+            cv2.imwrite(str(view.photo), cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY))
         else:
-            Image.fromarray(rgb).convert("CMYK").save(view.photo, "JPEG", quality=95)
+            Image.fromarray(photo).convert("CMYK").save(view.photo, "JPEG", quality=95)
     folder, done = street.run()
     rgb, seen, truth, x, y = from_above(folder)
     near = (seen == 255) & (x < 1) & apart_from_the_box(x, y) & (abs(y) < 4.9)
@@ -298,7 +304,7 @@ def test_photos_of_other_kinds_are_read(street, kind) -> None:
     assert psnr(rgb[near], truth[near]) > 28
 
 
-def test_an_orthophoto_drapes_what_it_sees_and_no_facade(street) -> None:
+def test_an_orthophoto_drapes_what_it_sees_and_no_facade(street: Street) -> None:
     down = np.diag([1.0, -1, -1, 1])
     down[2, 3] = 30.0
     camera = Camera("orthographic", 480, 480, 40.0, 40.0, 239.5, 239.5)  # 12 m, 2.5 cm a pixel

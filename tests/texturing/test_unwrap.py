@@ -2,18 +2,21 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
-from scan2sim.pipeline.step import silent
+from scan2sim.pipeline.step import Done, silent
 from scan2sim.pipeline.types import Frame, Mesh
 from scan2sim.texturing import unwrap as unwrap_module
-from scan2sim.texturing.atlas import manifold
+from scan2sim.texturing.atlas import Backend, manifold
 from scan2sim.texturing.unwrap import UNWRAP, UnwrapParams, unwrap
+from tests.present import present
 
 
-def hills(n=24, cell=0.25, seed=0):
+def hills(n: int = 24, cell: float = 0.25, seed: int = 0) -> Mesh:
     """Uneven ground of n x n cells."""
     rng = np.random.default_rng(seed)
     x, y = np.meshgrid(np.arange(n + 1) * cell, np.arange(n + 1) * cell, indexing="ij")
@@ -24,7 +27,7 @@ def hills(n=24, cell=0.25, seed=0):
     return Mesh(Frame(), np.stack([x, y, z], -1).reshape(-1, 3).astype(np.float32), faces.astype(np.int32))
 
 
-def with_fin(mesh):
+def with_fin(mesh: Mesh) -> Mesh:
     """The mesh with a face standing on an inner edge (three faces there), a repeated face, and an empty one."""
     a, b, c = mesh.faces[len(mesh) // 2]
     top = mesh.vertices[[a, b]].mean(axis=0) + np.array([0, 0, 0.4], np.float32)
@@ -33,17 +36,17 @@ def with_fin(mesh):
     return Mesh(mesh.frame, vertices, faces.astype(np.int32))
 
 
-def run(mesh, tmp_path: Path, **params):
+def run(mesh: Mesh, tmp_path: Path, **params: Any) -> tuple[Mesh, list[dict[str, int]], Done]:
     mesh.save(tmp_path / "in.npz")
     done = unwrap({"mesh": tmp_path / "in.npz"}, UnwrapParams(**params), tmp_path, silent)
     return Mesh.load(done.files["mesh"]), json.loads(done.files["pages"].read_text()), done
 
 
-def owners(mesh, pages, k):
+def owners(mesh: Mesh, pages: list[dict[str, int]], k: int) -> npt.NDArray[np.int64]:
     """How many faces cover every texel centre of page k."""
     size = np.array([pages[k]["width"], pages[k]["height"]])
     count = np.zeros(size[::-1], int)
-    for corner in mesh.uv[mesh.page == k] * size - 0.5:
+    for corner in present(mesh.uv)[mesh.page == k] * size - 0.5:
         low, high = np.ceil(corner.min(0)).astype(int), np.floor(corner.max(0)).astype(int)
         u, v = np.meshgrid(np.arange(low[0], high[0] + 1), np.arange(low[1], high[1] + 1))
         a, b, c = corner
@@ -58,9 +61,9 @@ def owners(mesh, pages, k):
 
 
 @pytest.mark.parametrize("backend", ["uvatlas", "xatlas"])
-def test_charts_do_not_overlap_and_density_is_as_asked(backend, tmp_path: Path) -> None:
+def test_charts_do_not_overlap_and_density_is_as_asked(backend: str, tmp_path: Path) -> None:
     mesh, pages, done = run(hills(), tmp_path, backend=backend, texel=0.02)
-    assert mesh.uv.min() >= 0 and mesh.uv.max() <= 1
+    assert mesh.uv is not None and mesh.uv.min() >= 0 and mesh.uv.max() <= 1
     assert owners(mesh, pages, 0).max() == 1
     assert done.facts["texel_m"] == pytest.approx(0.02, rel=0.1)
     assert done.facts["stretch_median"] < 1.2
@@ -69,9 +72,9 @@ def test_charts_do_not_overlap_and_density_is_as_asked(backend, tmp_path: Path) 
 
 
 @pytest.mark.parametrize("backend", ["uvatlas", "xatlas"])
-def test_pages_stay_within_their_size_and_blocks_are_compact(backend, tmp_path: Path) -> None:
+def test_pages_stay_within_their_size_and_blocks_are_compact(backend: str, tmp_path: Path) -> None:
     mesh, pages, _ = run(hills(), tmp_path, backend=backend, texel=0.02, page_size=256)
-    assert len(pages) > 1 and sorted(set(mesh.page.tolist())) == list(range(len(pages)))
+    assert len(pages) > 1 and sorted(set(present(mesh.page).tolist())) == list(range(len(pages)))
     assert all(max(p.values()) <= 256 for p in pages)
     assert all(owners(mesh, pages, k).max() == 1 for k in range(len(pages)))
     spread = [np.ptp(mesh.corners[mesh.page == k].reshape(-1, 3), axis=0)[:2].max() for k in range(len(pages))]
@@ -81,8 +84,9 @@ def test_pages_stay_within_their_size_and_blocks_are_compact(backend, tmp_path: 
 def test_a_mesh_that_is_no_manifold_is_mended_for_uvatlas(tmp_path: Path) -> None:
     mesh, _, done = run(with_fin(hills()), tmp_path, backend="uvatlas", texel=0.02)
     assert done.facts["fallbacks"] == 0
-    flat = mesh.uv[:-1]
-    area = np.abs(np.cross(*(np.pad(flat[:, k] - flat[:, 0], ((0, 0), (0, 1))) for k in (1, 2))))[:, 2]
+    flat = present(mesh.uv)[:-1]
+    a, b = (np.pad(flat[:, k] - flat[:, 0], ((0, 0), (0, 1))) for k in (1, 2))
+    area = np.abs(np.cross(a, b))[:, 2]
     assert (area > 0).all()
 
 
@@ -98,7 +102,7 @@ def test_cutting_leaves_every_edge_to_two_faces_at_most() -> None:
 def test_the_other_backend_steps_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     real = unwrap_module._in_child
 
-    def refuse(mesh, blocks, backend, params):
+    def refuse(mesh: Mesh, blocks: list[npt.NDArray[np.int64]], backend: Backend, params: UnwrapParams) -> list[Any]:
         return ["refused"] * len(blocks) if backend == "uvatlas" else real(mesh, blocks, backend, params)
 
     monkeypatch.setattr(unwrap_module, "_in_child", refuse)
@@ -109,7 +113,7 @@ def test_the_other_backend_steps_in(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 def test_a_mesh_without_faces_passes(tmp_path: Path) -> None:
     mesh, pages, done = run(hills().keep(np.zeros(1152, bool)), tmp_path)
-    assert len(mesh) == 0 and mesh.uv.shape == (0, 3, 2) and pages == []
+    assert len(mesh) == 0 and present(mesh.uv).shape == (0, 3, 2) and pages == []
     assert done.facts["pages"] == 0
 
 
@@ -139,7 +143,7 @@ def test_what_an_orthophoto_drapes_is_laid_flat_at_half_its_pixels(tmp_path: Pat
     inputs = {"mesh": tmp_path / "in.npz", "views": tmp_path / "views.json", "choice": tmp_path / "choice.npz"}
     done = unwrap(inputs, UnwrapParams(texel=0.01), tmp_path, silent)
     laid, pages = Mesh.load(done.files["mesh"]), json.loads(done.files["pages"].read_text())
-    assert len(pages) == 1 and (laid.page == 0).all()
+    assert len(pages) == 1 and np.all(laid.page == 0)
     size = np.array([pages[0]["width"], pages[0]["height"]])
     a, b, c = np.moveaxis(laid.uv * size, 1, 0)
     area = np.abs(np.cross(np.pad(b - a, ((0, 0), (0, 1))), np.pad(c - a, ((0, 0), (0, 1)))))[:, 2] / 2

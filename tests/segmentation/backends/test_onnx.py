@@ -112,7 +112,8 @@ def test_photos_are_normalised_as_the_file_tells(tmp_path: Path) -> None:
     path = write(tmp_path / "net.onnx", mean="[0, 0.1, -0.2]", std="[1, 2, 0.5]")
     expected = reference(photo(), np.array([0, 0.1, -0.2], np.float32), np.array([1, 2, 0.5], np.float32))
     assert np.abs(load("onnx", path, "cpu").probabilities(photo()) - expected).max() < 1e-4
-    for wrong in ({"std": "[1, 0, 1]"}, {"mean": "[1, 1]"}, {"mean": "grey"}, {"std": "null"}):
+    wrongs: tuple[dict[str, Any], ...] = ({"std": "[1, 0, 1]"}, {"mean": "[1, 1]"}, {"mean": "grey"}, {"std": "null"})
+    for wrong in wrongs:
         assert "to normalise photos with" in told_of(write(path, **wrong)).cause
 
 
@@ -190,13 +191,13 @@ def test_numbers_of_another_kind_are_refused(tmp_path: Path, node: str, takes: i
     from onnx import helper
 
     how: dict[str, Any] = {"Cast": {"to": 1}, "Squeeze": {}}.get(node, {"axis": 1})
-    shape = {"ArgMax": [1, 1, "h", "w"], "Cast": [1, 3, "h", "w"], "Flatten": [1, "n"], "Squeeze": [3, "h"]}[node]
     size = ["h"] if node == "Squeeze" else ["h", "w"]
+    shapes: dict[str, list[Any]] = {"ArgMax": [1, 1, *size], "Flatten": [1, "n"], "Squeeze": [3, "h"]}
     graph = helper.make_graph(
         [helper.make_node(node, ["image"], ["out"], **how)],
         "net",
         [helper.make_tensor_value_info("image", takes, [1, 3, *size])],
-        [helper.make_tensor_value_info("out", gives, shape)],
+        [helper.make_tensor_value_info("out", gives, shapes.get(node, [1, 3, *size]))],
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
     onnx.save(model, tmp_path / "net.onnx")

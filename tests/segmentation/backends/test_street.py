@@ -2,12 +2,15 @@
 
 import json
 import pickle
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from scan2sim.pipeline.errors import DataError, InputError
+from scan2sim.pipeline.types import U8
 
 torch = pytest.importorskip("torch", reason="torch is not installed (pip install 'scan2sim[segmentation]')")
 safetensors = pytest.importorskip("safetensors.torch", reason="safetensors is not installed")
@@ -20,14 +23,14 @@ from tests.conftest import ROOT  # noqa: E402
 
 
 @pytest.fixture(scope="module")
-def weights(tmp_path_factory: pytest.TempPathFactory):
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     torch.manual_seed(0)
     path = tmp_path_factory.mktemp("weights") / "w.onnx"
     save(StreetNet(len(CLASSES)), path, {"iou": {}})
     return path.with_suffix(".safetensors")
 
 
-def photos():
+def photos() -> Iterator[U8]:
     """Of the committed street, without channels and with some, and noise of an odd size."""
     import cv2
 
@@ -45,7 +48,7 @@ def test_the_weights_that_come_along_are_small_and_tell_every_class() -> None:
     assert found.shape == (len(CLASSES), 24, 32) and found.sum(axis=0) == pytest.approx(1, abs=1e-4)
 
 
-def test_the_same_weights_and_photo_give_the_same_classes(weights) -> None:
+def test_the_same_weights_and_photo_give_the_same_classes(weights: Path) -> None:
     photo = np.random.default_rng(0).integers(0, 255, (100, 130, 7), np.uint8)
     for form in (weights, weights.with_suffix(".onnx")):
         a, b = (load("street", form, "cpu").probabilities(photo) for _ in range(2))
@@ -53,7 +56,7 @@ def test_the_same_weights_and_photo_give_the_same_classes(weights) -> None:
 
 
 @pytest.mark.parametrize("own", [True, False], ids=["the project's own", "just trained"])
-def test_onnxruntime_and_torch_tell_the_same_classes(weights, own) -> None:
+def test_onnxruntime_and_torch_tell_the_same_classes(weights: Path, own: bool) -> None:
     form = OWN.with_suffix(".safetensors") if own else weights
     by_torch, by_onnx = load("street", form, "cpu"), load("street", form.with_suffix(".onnx"), "cpu")
     assert by_torch.facts.labels == by_onnx.facts.labels
@@ -75,13 +78,13 @@ def test_classes_do_not_depend_on_the_number_of_cores(monkeypatch: pytest.Monkey
     np.testing.assert_array_equal(told[0], told[2])
 
 
-def test_a_damaged_network_is_named(weights, tmp_path: Path) -> None:
+def test_a_damaged_network_is_named(weights: Path, tmp_path: Path) -> None:
     (tmp_path / "cut.onnx").write_bytes(OWN.read_bytes()[:-1000])
     with pytest.raises(InputError, match=r"cut\.onnx"):
         load("street", tmp_path / "cut.onnx", "cpu")
 
 
-def test_truncated_weights(weights, tmp_path: Path) -> None:
+def test_truncated_weights(weights: Path, tmp_path: Path) -> None:
     (tmp_path / "cut.safetensors").write_bytes(weights.read_bytes()[:-1000])
     with pytest.raises(InputError, match=r"cut\.safetensors"):
         load("street", tmp_path / "cut.safetensors", "cpu")
@@ -99,7 +102,7 @@ def test_weights_of_another_network_are_named(tmp_path: Path) -> None:
 
 def test_a_pickle_is_refused_and_not_run(tmp_path: Path) -> None:
     class Bad:
-        def __reduce__(self):
+        def __reduce__(self) -> tuple[Any, ...]:
             return (open, (str(tmp_path / "harm"), "w"))
 
     (tmp_path / "w.pt").write_bytes(pickle.dumps(Bad()))
@@ -108,7 +111,7 @@ def test_a_pickle_is_refused_and_not_run(tmp_path: Path) -> None:
     assert not (tmp_path / "harm").exists()
 
 
-def colourful(folder, n=6):
+def colourful(folder: Path, n: int = 6) -> Path:
     """Labelled photos: the class is the colour."""
     import cv2
 
@@ -137,7 +140,7 @@ def test_training_learns_and_repeats(tmp_path: Path) -> None:
         assert torch.equal(a, b)
 
 
-def test_training_goes_on_from_weights_that_took_colours_alone(tmp_path: Path, weights) -> None:
+def test_training_goes_on_from_weights_that_took_colours_alone(tmp_path: Path, weights: Path) -> None:
     from scan2sim.segmentation.train import Recipe, train
 
     state = safetensors.load_file(weights)
