@@ -117,6 +117,7 @@ def driven(cloud: PointCloud, path: Trajectory) -> Bools:
 
 
 def main() -> None:
+    """Time it as the command line asks."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--length", type=float, default=40.0)
     parser.add_argument("--points", type=float, default=1.6e6)

@@ -90,8 +90,10 @@ def remains(world: World, parked: Sequence[Box]) -> dict[int, float]:
 
 
 def corridor(world: World, path: F64) -> float:
-    """Square metres of surface where the recording car itself drove: 1 m to each side of the cameras' path, from
-    1.1 m below them to their height. Nothing static can be there."""
+    """Square metres of surface where the recording car itself drove, and nothing static can be.
+
+    That is 1 m to each side of the cameras' path, from 1.1 m below them to their height.
+    """
     places = spread(world)
     out = np.zeros(len(places), bool)
     for a, b in pairwise(path):

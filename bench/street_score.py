@@ -80,7 +80,7 @@ def squared_error(photo: U8, like: npt.NDArray[Any], counts: Bools) -> float:
 
 
 def psnr(mse: float) -> float:
-    """dB of a mean squared error of 8-bit values."""
+    """In dB, of a mean squared error of 8-bit values."""
     return 10 * math.log10(255**2 / max(mse, 1e-3))
 
 

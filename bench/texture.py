@@ -160,7 +160,7 @@ class Bench:
         return Measured(**json.loads(note.read_text()))
 
     def parametrize(self, scene: Scene) -> Measured:
-        """xatlas' plain unwrapping of the whole mesh."""
+        """The plain unwrapping of xatlas, of the whole mesh."""
         return self._run(scene, "parametrize", again=False)
 
     def _child(self, method: str, scene: Scene, out: Path) -> Measured:

@@ -29,7 +29,7 @@ MAX_DISTANCE, MIN_COS = 40.0, 0.08
 
 
 def parametrize(scene: Scene, out: Path) -> None:
-    """xatlas' own way of unwrapping, the whole mesh at once; only its time is of interest."""
+    """Unwrap as xatlas does by itself, the whole mesh at once; only its time is of interest."""
     import xatlas
 
     mesh = Mesh.load(scene.mesh)

@@ -34,8 +34,14 @@ Index = npt.NDArray[Any]
 
 @dataclass(frozen=True)
 class Picture:
-    """What the camera sees: rgb (H, W, 3) uint8; depth (H, W) metres along the ray (infinite: sky, NaN: own car);
-    moving (H, W) bool where another vehicle is; gain: what the exposure multiplied the light by."""
+    """What the camera sees.
+
+    Attributes:
+        rgb: (H, W, 3).
+        depth: (H, W) metres along the ray (infinite: sky, NaN: own car).
+        moving: (H, W) whether another vehicle is there.
+        gain: what the exposure multiplied the light by.
+    """
 
     rgb: U8
     depth: F32

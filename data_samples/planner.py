@@ -41,6 +41,7 @@ class Planner:
         self.things: list[Thing] = []
 
     def plan(self) -> list[Thing]:
+        """All things of the street: along its kerbs, in its rows of buildings, and behind them."""
         for a, b in self.ground.runs():
             for side in (1, -1):
                 self._kerbside(a, b, side)

@@ -219,8 +219,9 @@ def _new_ground(parts: list[F64], xy: F64, run: F64, near: float, step: float) -
 
 
 def _thinned(xy: F64, step: float) -> F64:
-    """The samples of a path (N, 2) that are `step` metres from the one kept before, and the last: what stands still,
-    trembling, makes no way.
+    """The samples of a path (N, 2) that are `step` metres from the one kept before, and the last.
+
+    What stands still, trembling, makes no way.
     """
     kept = [0]
     x, y = xy.T.tolist()

@@ -111,8 +111,9 @@ class Sides:
 
 
 def members(xyz: F32, planes: Planes, thin: F32, which: I32, voxel: float, tolerance: float) -> I32:
-    """(N,) the plane of each of a cloud's points, -1 for none: its voxel's, else of those of the points around it the
-    one that it lies on best.
+    """(N,) the plane of each of a cloud's points, -1 for none.
+
+    That is its voxel's, else of those of the points around it the one that it lies on best.
 
     Args:
         xyz: (N, 3) local metres.

@@ -175,8 +175,9 @@ def _directions(ray: F64) -> tuple[F64, F64, F64]:
 
 
 def ceiling(wall: Wall, rays: Rays, own: Numbers) -> I32:
-    """(C,) the highest row that each column may go on to: any where its scan ends as the scanner's rays do, else up to
-    the ray that would have passed above it.
+    """(C,) the highest row that each column may go on to.
+
+    Any where its scan ends as the scanner's rays do, else up to the ray that would have passed above it.
 
     Args:
         wall: to be raised.
@@ -236,8 +237,10 @@ def _cross(out, origin, end, corner, normal, up, along, deep):  # type: ignore[n
 
 
 def closed(known: Bools, through: Bools, reach: int) -> Bools:
-    """(R, C) cells of gaps in what is `known` of a wall, less than twice `reach` cells wide, but for those that rays
-    went `through`, and beside."""
+    """(R, C) cells of gaps in what is `known` of a wall, less than twice `reach` cells wide.
+
+    Those that rays went `through` are none, and what is beside them.
+    """
     if reach < 1:
         return np.zeros_like(known)
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))

@@ -1,5 +1,7 @@
-"""Planes of a cloud: grown from where it is flat, fitted robustly (Rabbani et al., "Segmentation of point clouds using
-smoothness constraint", ISPRS 2006). Import late: it loads numba."""
+"""Planes of a cloud: grown from where it is flat, fitted robustly. Import late: it loads numba.
+
+Rabbani et al., "Segmentation of point clouds using smoothness constraint", ISPRS 2006.
+"""
 
 from __future__ import annotations
 

@@ -152,8 +152,10 @@ def vertex_normals(mesh: Mesh) -> F64:
 
 
 def meet(places: F64, planes: Planes, which: npt.NDArray[np.integer]) -> tuple[F64, F64]:
-    """The places (N, 3) on all of the planes `which` (N, K), K = 2 or 3, that are nearest to `places`; metres (N,) to
-    them, infinite where planes hardly meet."""
+    """The places (N, 3) on all of the planes `which` (N, K), K = 2 or 3, that are nearest to `places`.
+
+    And metres (N,) to them, infinite where planes hardly meet.
+    """
     if not len(places):
         return places.reshape(-1, 3), np.zeros(0)
     normal = planes.normal[which]
@@ -169,8 +171,11 @@ def meet(places: F64, planes: Planes, which: npt.NDArray[np.integer]) -> tuple[F
 def upright(
     first: F64, last: F64, faces: npt.NDArray[np.integer], was: F64, least: float
 ) -> tuple[F64, npt.NDArray[np.bool_]]:
-    """Vertices at `last` (V, 3), but at `first` where a face would turn against its old normal `was` (F, 3, as long as
-    twice its area); and which stayed. Faces below `least` m2 may: they have no direction to speak of."""
+    """Vertices at `last` (V, 3), but at `first` where a face would turn against its old normal; and which stayed.
+
+    Old normals `was` (F, 3) are as long as twice the area; faces below `least` m2 may turn: they have no direction to
+    speak of.
+    """
     heavy = np.linalg.norm(was, axis=1) > 2 * least
     faces, was = faces[heavy], was[heavy]
     last = last.copy()

@@ -48,7 +48,8 @@ class Params(BaseModel):
 class Report(Protocol):
     """Progress callback: a bar in the command, an artifact in Prefect, nothing in tests."""
 
-    def __call__(self, fraction: float, message: str = "") -> None: ...
+    def __call__(self, fraction: float, message: str = "") -> None:
+        """Say that `fraction` (0 to 1) of the step is done, and what it is at."""
 
 
 def silent(fraction: float, message: str = "") -> None:

@@ -101,6 +101,7 @@ class Digests:
         self._used: dict[str, list[Any]] = {}
 
     def __call__(self, path: Path) -> str:
+        """SHA-256 of a file or folder, in hex; of a file that is as it was, the one that was told before."""
         try:
             stat = path.stat()
         except OSError:

@@ -233,6 +233,7 @@ class Parts:
 
     @property
     def size(self) -> F64:
+        """(P, 3) metres along the axes."""
         return self.high - self.low
 
     def total(self, values: npt.NDArray[Any]) -> F64:

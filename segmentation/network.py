@@ -1,8 +1,8 @@
-"""The project's own small segmentation network: inverted residuals (Sandler et al., "MobileNetV2", CVPR 2018), the
-whole picture's context, and a feature pyramid of depthwise convolutions (Lin et al., CVPR 2017). Import late: loads
-torch.
+"""The project's own small segmentation network. Import late: loads torch.
 
-It looks at photos at one angular resolution, so that a thing of a size at a distance always looks the same size.
+Inverted residuals (Sandler et al., "MobileNetV2", CVPR 2018), the whole picture's context, and a feature pyramid of
+depthwise convolutions (Lin et al., CVPR 2017). It looks at photos at one angular resolution, so that a thing of a size
+at a distance always looks the same size.
 """
 
 from __future__ import annotations
@@ -85,6 +85,10 @@ class StreetNet(nn.Module):
         self.head = nn.Sequential(nn.Dropout2d(0.1), nn.Conv2d(pyramid, classes, 1))
 
     def forward(self, seen: Tensor) -> Tensor:
+        """(B, classes, H / 4, W / 4) logits of (B, 3 + COUNT, H, W) colours and channels.
+
+        Outside of training, the mean of what it says of them and of their mirror image.
+        """
         if self.training:
             return self._look(seen)
         return (self._look(seen) + self._look(seen.flip(3)).flip(3)) / 2

@@ -23,8 +23,11 @@ HIGH, LOW = 2.6, 1.2
 
 
 def without_specks(best: U8, height: F32, xyz: F32, near: I32) -> U8:
-    """Small vegetation that touches no ground is what stands around it, bay windows and balconies; so is ground in
-    the air, as photos take the inside of a car for that is seen through its window: (N,) indices."""
+    """(N,) indices of classes; small vegetation that touches no ground is what stands around it.
+
+    Bay windows and balconies are taken for such. So is ground in the air, as photos take the inside of a car for that
+    is seen through its window.
+    """
     plants = np.isin(best, [CLASSES.index("low_vegetation"), CLASSES.index("high_vegetation")])
     ground = np.isin(best, [CLASSES.index(name) for name in GROUND])
     walls = np.isin(best, [CLASSES.index("building"), CLASSES.index("wall_or_fence")])

@@ -152,7 +152,7 @@ def pose_graph(poses: F64, way: F64, loops: list[tuple[int, int, F64]], rounds: 
 
 
 def _cross(v: F64) -> F64:
-    """(N, 3, 3) so that _cross(v) @ w = v x w."""
+    """(N, 3, 3) matrices that multiply w (3,) to v x w."""
     out = np.zeros((len(v), 3, 3))
     out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
     return out - out.transpose(0, 2, 1)

@@ -138,7 +138,7 @@ def _uvatlas(vertices: F32, faces: I32, texel: float, gutter: int) -> Chartered:
 
 
 def _xatlas(vertices: F32, faces: I32, texel: float, gutter: int) -> Chartered:
-    """xatlas (Young), Thekla's atlas grown on."""
+    """By xatlas (Young), Thekla's atlas grown on."""
     import xatlas
 
     atlas = xatlas.Atlas()

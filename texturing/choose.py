@@ -115,7 +115,6 @@ def choose_views(
     report: Report,
 ) -> tuple[Choice, float]:
     """The choice for all faces, and the share of the edges' length that is a seam."""
-
     from scan2sim.texturing.labels import label
     from scan2sim.texturing.select import Candidates
 

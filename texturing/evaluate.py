@@ -162,7 +162,7 @@ def figures(sums: F64) -> dict[str, Any]:
 
 
 def psnr(squared: float) -> float:
-    """dB of a mean squared error of 8-bit values, at most 78."""
+    """In dB, of a mean squared error of 8-bit values; at most 78."""
     return 10 * math.log10(255**2 / max(squared, 1e-3))
 
 

@@ -76,6 +76,7 @@ class Cell:
 
     @property
     def name(self) -> str:
+        """Of its node: rows, megabits a second and frames a second."""
         return f"h{self.height}_b{self.bitrate:g}_f{self.rate:g}"
 
 

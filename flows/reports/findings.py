@@ -147,7 +147,7 @@ def _disagreeing(facts: Facts) -> Iterator[Finding]:
 
 
 def _of(some: int, count: int, what: str = "photo") -> str:
-    """ "3 of 25 photos are", "1 of 1 photo is"."""
+    """Such as "3 of 25 photos are", "1 of 1 photo is"."""
     return f"{some} of {count} {what}{'s' if count > 1 else ''} {'is' if some == 1 else 'are'}"
 
 

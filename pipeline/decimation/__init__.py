@@ -1,5 +1,7 @@
-"""Decimation: fewer triangles by quadric edge collapse (Garland and Heckbert 1997). A file a library
-(`pipeline.backends`), named in `decimate.backend`."""
+"""Decimation: fewer triangles by quadric edge collapse (Garland and Heckbert 1997).
+
+A file a library (`pipeline.backends`), named in `decimate.backend`.
+"""
 
 from __future__ import annotations
 

@@ -81,6 +81,7 @@ def without_jumps(times: F64, xy: F64, max_speed: float = MAX_SPEED, reach: int 
 
 
 def number(text: str | None) -> float:
+    """The number that a text says; NaN where it says none."""
     try:
         return float(text) if text else math.nan
     except ValueError:

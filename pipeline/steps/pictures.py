@@ -70,10 +70,10 @@ class Album:
 
 
 def pictures(inputs: Inputs, params: PicturesParams, out: Path, report: Report) -> Done:
-    """Render classes, meshes, triangles, the textured world from above and from where it was scanned, its pages,
-    what photos saw, and the world beside photos (held-out ones first).
+    """Render the tile: its classes, meshes, triangles, textures, pages, and the world beside photos.
 
-    Where there is a path, that is a driver's eye, else a bird's that has the whole tile before it.
+    Held-out photos come first. The textured world is shown from above and from where it was scanned: where there is a
+    path, that is a driver's eye, else a bird's that has the whole tile before it.
     """
     from scan2sim.pipeline import render
     from scan2sim.pipeline.io import views as views_io

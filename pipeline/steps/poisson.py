@@ -44,8 +44,9 @@ class PoissonParams(Params):
 
 
 def poisson(inputs: Inputs, params: PoissonParams, out: Path, report: Report) -> Done:
-    """Reconstruct `cloud`, with what was made up of it (`made`, optional), in a child process; on a crash again on one
-    thread, then one level coarser.
+    """Reconstruct `cloud`, with what was made up of it (`made`, optional), in a child process.
+
+    On a crash again on one thread, then one level coarser.
 
     Raises:
         StepError: all three failed.
