@@ -43,7 +43,6 @@ def kitti(out: Path) -> dict[str, Confusion]:
         for view, by_way in _told(name, out / name):
             drawn = _drawn(view)
             rgb = image.read_rgb(view.photo)
-            assert rgb is not None
             rows = [rgb, *(0.5 * rgb + 0.5 * _colours()[codes] for codes in by_way.values())]
             image.write(out / f"{name}_{view.photo.stem}.png", np.concatenate(rows).astype(np.uint8))
             some = drawn != NONE
@@ -74,7 +73,6 @@ def _told(name: str, folder: Path) -> Iterator[tuple[View, dict[str, U8]]]:
         if view.photo.name not in _polygons():
             continue
         rgb = image.read_rgb(view.photo)
-        assert rgb is not None
         size = view.camera.width, view.camera.height
         alone = code_of_index()[labels_of(labeller.probabilities(rgb, view.camera), size[::-1])[0]]
         pixels = cv2.imread(str(folder / "told" / "labels" / f"{Path(view.name).stem}.png"), cv2.IMREAD_GRAYSCALE)

@@ -51,7 +51,7 @@ def open3d(scene: Scene, out: Path) -> None:
     photos, intrinsics, extrinsics = [], [], []
     for view in scene.photos(held_out=False).values():
         camera, photo = view.camera, image.read_rgb(view.photo)
-        if camera.model not in ("pinhole", "opencv") or photo is None:
+        if camera.model not in ("pinhole", "opencv"):
             continue
         k = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
         if camera.distortion:
@@ -102,7 +102,6 @@ def _paint(scene: Scene, out: Path, *, only_nearest: bool) -> None:
         total = np.zeros((len(face), 4), np.float32)
         for i, view in scene.photos(held_out=False).items():
             photo = image.read_rgb(view.photo)
-            assert photo is not None
             depth = load_depth_map(scene.depth / f"{i}.npy", view.camera, view.T_world_cam)
             _add(
                 total, places, normals[faces], face, photo, eye(view.camera, view.T_world_cam), depth.ranges,

@@ -84,7 +84,6 @@ def samples(scene: Scene) -> Samples:
         better = better[np.abs(first - 1) * np.linalg.norm(to, axis=1) < TRUE_REACH]
         uv, _ = pixels(view.camera, view.T_world_cam, truth.xyz[better])
         photo = image.read_rgb(view.photo)
-        assert photo is not None
         for part in np.array_split(np.arange(len(better)), len(better) // 30_000 + 1):  # remap takes 32 767 rows
             looked_up = cv2.remap(photo, uv[part][:, None], None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             colour[better[part]] = np.asarray(looked_up).reshape(-1, 3)
@@ -250,7 +249,6 @@ def _car_pixels(clean: View, hard: View, ev: float) -> Bools:
     from scan2sim.data_samples.scene import srgb
 
     without, photo = image.read_rgb(clean.photo), image.read_rgb(hard.photo)
-    assert without is not None and photo is not None
     expected = srgb(_LINEAR[without] * np.float32(2.0**ev))
     difference = cv2.blur((photo.astype(np.float32) - expected) @ LUMA, (5, 5))
     return np.abs(difference) > CAR

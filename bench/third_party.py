@@ -53,6 +53,8 @@ NOTES = {
     "Simplified Software License), Embree, Assimp, Filament, Qhull and others under permissive licences",
     "opencv-python-headless": "linked in: Intel IPP-ICV (Intel Simplified Software License), and what its "
     "LICENSE-3RD-PARTY.txt tells",
+    "openimageio": "linked in: OpenEXR, OpenColorIO, libtiff, libpng, libjpeg-turbo, libjxl, OpenJPEG, libwebp, "
+    "giflib, FreeType and others under permissive licences",
     "pycolmap": "linked in: SuiteSparse, whose CHOLMOD (Supernodal) and SuiteSparseQR are GPL-2.0-or-later; Ceres, "
     "FAISS, METIS, OpenImageIO, PoseLib under permissive licences",
     "torch": "linked in: what its NOTICE tells; on Linux its default wheel asks for NVIDIA's CUDA packages, too",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.ranges import Device, File, Name, Share, Voxel
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
@@ -68,9 +69,10 @@ def label(inputs: Inputs, params: LabelParams, out: Path, report: Report) -> Don
         report(0.2 + 0.8 * i / len(views), view.name)
         if view.camera.model == "orthographic":  # networks know streets from the street
             continue
-        rgb = image.read_rgb(view.photo)
-        if rgb is None or rgb.shape[:2] != (view.camera.height, view.camera.width):
-            warnings.append(f"{view.photo} can't be read or is not of its camera's size: it tells no classes")
+        try:
+            rgb = image.read_photo(view)
+        except InputError as error:
+            warnings.append(f"{view.photo} {error.cause}: it tells no classes")
             continue
         channels = scan.into(view, labeller.size(view.camera)) if scan else None
         np.save(folder / f"{i}.npy", labeller.probabilities(rgb, view.camera, channels))

@@ -122,7 +122,7 @@ def _found(
     from scan2sim.segmentation.outlines import beside, close_ups, fitted
 
     seen = [views[i] for i in used]
-    photo = lru_cache(maxsize=KEPT)(lambda k: image.read_rgb(seen[k].photo))
+    photo = lru_cache(maxsize=KEPT)(lambda k: image.usable_photo(seen[k]))
     wanted: list[tuple[F64, F64 | None]] = [(plate.centre, plate.normal) for plate in known]
     wanted += [(place, None) for place in hanging(views, labels)]
     found: list[Plate] = []

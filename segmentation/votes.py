@@ -83,7 +83,7 @@ def vote(
 def _mask(view: View) -> np.ndarray:
     from scan2sim.pipeline.io import image
 
-    mask = image.read_mask(view) if view.mask is not None else None
+    mask = image.read_mask(view)
     return np.zeros((0, 0), np.uint8) if mask is None else mask
 
 

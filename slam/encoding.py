@@ -79,10 +79,7 @@ def _plane(plane: Any) -> U8:
 def _of_picture(path: Path, size: tuple[int, int]) -> U8:
     import cv2
 
-    rgb = read_rgb(path)
-    if rgb is None:
-        raise InputError(path, "is no readable picture", "Copy it again, or take it out of the folder")
-    small = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
+    small = cv2.resize(read_rgb(path), size, interpolation=cv2.INTER_AREA)
     return cv2.cvtColor(small, cv2.COLOR_RGB2YUV_I420)
 
 

@@ -12,9 +12,8 @@ import numpy as np
 
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.extras import need
+from scan2sim.pipeline.io.image import SUFFIXES, read_levels
 from scan2sim.pipeline.types import F64, U8
-
-PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 
 
 @dataclass(frozen=True)
@@ -116,13 +115,13 @@ def _natural(path: Path) -> list[Any]:
 
 
 def _files(path: Path) -> list[Path]:
-    return sorted((p for p in path.iterdir() if p.suffix.lower() in PICTURES), key=_natural)
+    return sorted((p for p in path.iterdir() if p.suffix.lower() in SUFFIXES), key=_natural)
 
 
 def _folder(path: Path, fps: float, times: Path | None) -> Video:
     files = _files(path)
     if not files:
-        raise InputError(path, f"holds no pictures ({' '.join(PICTURES)})", "Name a folder of pictures, or a video")
+        raise InputError(path, f"holds no pictures ({' '.join(SUFFIXES)})", "Name a folder of pictures, or a video")
     shown = None
     if times is not None:
         try:
@@ -134,22 +133,13 @@ def _folder(path: Path, fps: float, times: Path | None) -> Video:
                 times, f"has {len(shown)} times for {len(files)} pictures", "Write a time for every picture"
             )
         shown = shown - shown[0]
-    height, width = _read(files[0]).shape
+    height, width = read_levels(files[0]).shape
     return Video(path, width, height, len(files), fps, None, shown)
-
-
-def _read(path: Path) -> U8:
-    from scan2sim.pipeline.io.image import read_levels
-
-    grey = read_levels(path)
-    if grey is None:
-        raise InputError(path, "is no readable picture", "Copy it again, or take it out of the folder")
-    return grey
 
 
 def _of_folder(video: Video) -> Iterator[Frame]:
     for i, path in enumerate(_files(video.path)):
-        yield Frame(i, i / video.fps if video.times is None else float(video.times[i]), _read(path), path.name)
+        yield Frame(i, i / video.fps if video.times is None else float(video.times[i]), read_levels(path), path.name)
 
 
 def _of_file(video: Video, warn: Callable[[str], None]) -> Iterator[Frame]:

@@ -19,7 +19,7 @@ import pytest
 from scan2sim.pipeline import backends, decimation
 from scan2sim.pipeline.errors import SettingError, UnavailableError
 from scan2sim.pipeline.extras import EXTRA_OF
-from scan2sim.pipeline.io import clouds, gps, meshes, models
+from scan2sim.pipeline.io import clouds, decoders, gps, meshes, models
 from scan2sim.segmentation import backends as networks
 from scan2sim.slam import features, matchers, solvers, trackers
 from tests.conftest import ROOT
@@ -34,6 +34,7 @@ PROTOCOLS: dict[ModuleType, tuple[type, ...]] = {
     clouds: (clouds.Format,),
     models: (models.Program,),
     gps: (gps.Format,),
+    decoders: (decoders.Decoder,),
     meshes: (meshes.ModelFormat, meshes.WorldFormat),
     decimation: (decimation.Backend,),
 }
@@ -84,7 +85,7 @@ def test_an_unknown_name_tells_the_known_ones(package: ModuleType) -> None:
     assert all(name in caught.value.remedy for name in backends.names(package.__name__))
 
 
-@pytest.mark.parametrize("package", [clouds, gps])
+@pytest.mark.parametrize("package", [clouds, decoders, gps])
 def test_no_two_formats_read_the_same_files(package: ModuleType) -> None:
     each = [backends.module(package.__name__, name).SUFFIXES for name in backends.names(package.__name__)]
     assert sum(map(len, each)) == len(backends.by_suffix(package.__name__))

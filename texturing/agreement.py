@@ -115,7 +115,7 @@ class Agreement:
         from scan2sim.pipeline.io import image
 
         path = self.folder / f"mask_{i}.png"
-        return image.read_grey(path) if path.is_file() else np.zeros((0, 0), np.uint8)
+        return image.read_levels(path) if path.is_file() else np.zeros((0, 0), np.uint8)
 
     def warp(self, i: int) -> F32:
         """(h, w, 2) float32 pixels to be added to where photo `i` is looked up; (0, 0, 2) for none."""

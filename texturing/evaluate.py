@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.types import F32, F64, U8
 
 if TYPE_CHECKING:
@@ -199,11 +200,9 @@ def held_out(world: Renderer, views: Sequence[View], depths: Sequence[Path] | No
 
     files: list[Path | None] = list(depths) if depths is not None else [None] * len(views)
     for view, depth in zip(views, files, strict=True):
-        photo = image.read_rgb(view.photo)
-        allowed = image.read_mask(view) if view.mask is not None else None
-        if photo is None or photo.shape[:2] != (view.camera.height, view.camera.width):
-            continue
-        if view.mask is not None and allowed is None:
+        try:
+            photo, allowed = image.read_photo(view), image.read_mask(view)
+        except InputError:  # `views` has told
             continue
         render = world.view(view.camera, view.T_world_cam, samples=SAMPLES)
         surface = render.hit if allowed is None else render.hit & (allowed > 0)

@@ -125,24 +125,21 @@ class Photos:
         from scan2sim.pipeline.io import image
 
         view = self._views[i]
-        if view.mask is None:
-            return np.zeros((0, 0), np.uint8)
-        mask = image.read_mask(view)
-        if mask is None:
-            self.skipped[i] = f"{view.mask}, a mask, can't be read or is not of its photo's size"
-        return mask
+        try:
+            mask = image.read_mask(view)
+        except InputError as error:
+            self.skipped[i] = f"{view.mask} {error.cause}"
+            return None
+        return np.zeros((0, 0), np.uint8) if mask is None else mask
 
     def _read(self, i: int) -> Photo | None:
         from scan2sim.pipeline.io import image
 
         view = self._views[i]
-        size = (view.camera.height, view.camera.width)
-        whole = image.read_rgb(view.photo)
-        if whole is None:
-            self.skipped[i] = f"{view.photo} can't be read"
-            return None
-        if whole.shape[:2] != size:
-            self.skipped[i] = f"{view.photo} is {whole.shape[1]} x {whole.shape[0]} pixels, not {size[1]} x {size[0]}"
+        try:
+            whole = image.read_photo(view)
+        except InputError as error:
+            self.skipped[i] = f"{view.photo} {error.cause}"
             return None
         mask = self.mask(i)
         if mask is None:

@@ -169,8 +169,8 @@ def _pictures(photos: Sequence[View], used: Sequence[int]) -> dict[int, Picture]
     masks = Photos(photos)
     out = {}
     for k in used:
-        rgb, mask = image.read_rgb(photos[k].photo), masks.mask(k)
-        if rgb is not None and mask is not None and rgb.shape[:2] == (photos[k].camera.height, photos[k].camera.width):
+        rgb, mask = image.usable_photo(photos[k]), masks.mask(k)
+        if rgb is not None and mask is not None:
             out[k] = picture(rgb, mask, small(photos[k].camera))
     return out
 

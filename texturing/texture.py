@@ -180,7 +180,6 @@ def _go_on(plan: Plan, folder: Path, mesh: Mesh, wanting: npt.NDArray[np.bool_],
             image.read_rgb(path.with_name(f"{path.name}.png")),
             image.read_levels(path.with_name(f"{path.name}_seen.png")),
         )
-        assert rgb is not None and seen is not None  # both have just been written
         flat = texels.corners(mesh.uv[faces], seen.shape[1], seen.shape[0])
         page = fill.Page(rgb, seen, texels.owners(flat, seen.shape[1], seen.shape[0]), flat, mesh.corners[faces])
         if ground is not None:

@@ -21,14 +21,15 @@ if TYPE_CHECKING:
 SLOT = 0.25  # GB; memory is shared out in pieces of it
 LARGEST = 20_000  # GB, of what steps may need together
 PAUSE = 0.2  # seconds between looks for free memory
-PHOTO = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 
 
 def need(item: Planned, store: Store) -> float:
     """GB that a node is expected to need at its peak, from the sizes of what it reads."""
+    from scan2sim.pipeline.io.image import SUFFIXES
+
     least, share = item.node.step.memory
     # photos are read one after the other, and are no matter of the whole
-    sizes = [_size(path) for path in item.inputs(store).values() if path.suffix.lower() not in PHOTO]
+    sizes = [_size(path) for path in item.inputs(store).values() if path.suffix.lower() not in SUFFIXES]
     return least + share * sum(sizes) / 1e9
 
 

@@ -1,99 +1,117 @@
-"""Photos and pictures, through OpenCV: pixels as they lie in the file, RGB."""
+"""Photos and pictures as 8-bit sRGB, pixels as they lie in the file (docs/formats.md, "Photos").
+
+The camera's orientation flag is ignored: poses and sizes are of the pixels. `pipeline.io.decoders` decodes.
+"""
 
 from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from scan2sim.pipeline import backends
 from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.io import files
+from scan2sim.pipeline.extras import need
+from scan2sim.pipeline.io import colour, decoders, files
+from scan2sim.pipeline.io.decoders import Box, Decoder, Header
 from scan2sim.pipeline.types import U8, View
 
 MAX_PIXELS = 2**29
-"""Of a photo: 32,768 x 16,384. What says it has more is taken for a decompression bomb."""
-AGAIN = "Copy it again, or leave it out"
+"""That are decoded at once: 32,768 x 16,384. What says it has more is taken for a decompression bomb."""
+DECODERS = backends.by_suffix(decoders.__name__)
+SUFFIXES = tuple(DECODERS)
+"""Ends of photos' names. OpenCV tries what is called otherwise."""
 
 
-def size_of(path: Path) -> tuple[int, int]:
+def size_of(path: Path, *, parts: bool = False) -> tuple[int, int]:
     """Width and height of a photo, pixels, as its header says.
+
+    Args:
+        parts: only parts of it will be read; where its format allows that, it may be of any size.
 
     Raises:
         InputError: it is missing, no file, no image, or larger than `MAX_PIXELS`.
+        UnavailableError: what decodes it isn't installed.
     """
-    files.check(path)
-    with opened(path) as image:
-        width, height = image.size
-    if width * height > MAX_PIXELS:
-        told = f"is of {width:,} x {height:,} pixels, more than {MAX_PIXELS:,}"
-        raise InputError(path, told, "Give a smaller one")
+    decoder = _decoder(path)
+    width, height, _ = decoder.header(path)
+    if not (parts and decoder.PARTS):
+        _check_size(path, width, height)
     return width, height
 
 
 def check_decodes(path: Path) -> None:
-    """Decode a photo; a JPEG at an eighth, which tells enough.
+    """Look through a photo.
 
     Raises:
-        InputError: it can't be.
+        InputError, UnavailableError: it can't be decoded, as `size_of`.
     """
-    with opened(path) as image:
-        image.draft(None, (image.size[0] // 8, image.size[1] // 8))
-        image.load()
+    _decoder(path).check(path)
 
 
-@contextmanager
-def opened(path: Path) -> Iterator[Any]:
-    """A photo by Pillow, its header read.
+def read_rgb(path: Path, box: Box | None = None) -> U8:
+    """(H, W, 3) RGB of a photo, or of the part of it in a box.
 
     Raises:
-        InputError: it can't be read, here or while it is open.
+        InputError, UnavailableError: it can't be read, as `size_of`.
     """
-    from PIL import Image
-
-    Image.MAX_IMAGE_PIXELS = None  # `MAX_PIXELS` is the limit: Pillow's own is below what 360 cameras make
+    decoder, found = _opened(path, box)
+    levels = colour.to_8_bit(decoder.pixels(path, box=box))
+    rgb = levels if levels.ndim == 3 else np.repeat(levels[..., None], 3, axis=2)
+    if found.profile is None:
+        return rgb
     try:
-        with Image.open(path) as image:
-            yield image
-    except Exception as error:  # its decoders raise whatever the damage leads to
-        raise InputError(path, f"can't be read ({error})", AGAIN) from None
+        return colour.to_srgb(rgb, found.profile)
+    except ValueError as error:
+        raise InputError(path, f"has a colour profile that can't be read ({error})", "Save it as sRGB") from None
 
 
-def read_rgb(path: Path) -> U8 | None:
-    """(H, W, 3) RGB, the camera's orientation flag ignored (poses and sizes are of the pixels); None if unreadable."""
-    image = _decoded(path, "IMREAD_COLOR")
-    return None if image is None else np.ascontiguousarray(image[..., ::-1])
+def read_levels(path: Path) -> U8:
+    """(H, W) grey levels of a photo.
 
-
-def read_levels(path: Path) -> U8 | None:
-    """(H, W) grey levels, orientation ignored likewise; None if unreadable."""
-    return _decoded(path, "IMREAD_GRAYSCALE")
-
-
-def _decoded(path: Path, how: str) -> Any:
+    Raises:
+        InputError, UnavailableError: it can't be read, as `size_of`.
+    """
     import cv2
 
-    try:
-        size_of(path)
-        return cv2.imread(str(path), getattr(cv2, how) | cv2.IMREAD_IGNORE_ORIENTATION)
-    except (InputError, cv2.error):
-        return None
+    decoder, _ = _opened(path, None)
+    levels = colour.to_8_bit(decoder.pixels(path, grey=True))
+    return levels if levels.ndim == 2 else np.asarray(cv2.cvtColor(levels, cv2.COLOR_RGB2GRAY))
 
 
-def read_grey(path: Path) -> U8:
-    """(H, W) grey levels of a picture that an earlier step wrote.
+def read_photo(view: View) -> U8:
+    """(H, W, 3) RGB of a view's photo.
 
     Raises:
-        InputError: it can't be read.
+        InputError: it can't be read, or isn't of its camera's size.
     """
-    image = read_levels(path)
-    if image is None:
-        raise InputError(path, "can't be read as an image", "Delete the folder it is in, and run again")
-    return image
+    return _of_size(view, view.photo, read_rgb(view.photo))
+
+
+def usable_photo(view: View) -> U8 | None:
+    """`read_photo`; None of what can't be used, which `views` and the steps that paint tell."""
+    with suppress(InputError):
+        return read_photo(view)
+    return None
+
+
+def usable_levels(view: View) -> U8 | None:
+    """(H, W) grey levels of a view's photo; None likewise."""
+    with suppress(InputError):
+        return _of_size(view, view.photo, read_levels(view.photo))
+    return None
+
+
+def read_mask(view: View) -> U8 | None:
+    """The view's mask (H, W), 0 where its photo must not be used; None if it has none.
+
+    Raises:
+        InputError: it can't be read, or isn't of its camera's size.
+    """
+    return None if view.mask is None else _of_size(view, view.mask, read_levels(view.mask))
 
 
 def write(path: Path, image: U8, *, quality: int = 90, compression: int = 2) -> None:
@@ -111,19 +129,32 @@ def write(path: Path, image: U8, *, quality: int = 90, compression: int = 2) -> 
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
 
-def copy(source: Path, path: Path, *, quality: int = 90) -> None:
-    """Write a picture of an earlier step in another format, as `write`.
-
-    Raises:
-        InputError: it can't be read.
-    """
-    pixels = read_rgb(source)
-    if pixels is None:
-        raise InputError(source, "can't be read as an image", "Delete the folder it is in, and run again")
-    write(path, pixels, quality=quality)
+def _decoder(path: Path) -> Decoder:
+    files.check(path)
+    decoder: Decoder = backends.module(decoders.__name__, DECODERS.get(path.suffix.lower(), "opencv"))
+    need(str(path), *backends.needs(decoder))
+    return decoder
 
 
-def read_mask(view: View) -> U8 | None:
-    """The view's mask (H, W), 0 where its photo must not be used; None if it can't be read or is of another size."""
-    mask = read_levels(view.mask) if view.mask else None
-    return mask if mask is not None and mask.shape == (view.camera.height, view.camera.width) else None
+def _opened(path: Path, box: Box | None) -> tuple[Decoder, Header]:
+    decoder = _decoder(path)
+    found = decoder.header(path)
+    if box is not None and decoder.PARTS:
+        _check_size(path, box[2] - box[0], box[3] - box[1])
+    else:
+        _check_size(path, found.width, found.height)
+    return decoder, found
+
+
+def _check_size(path: Path, width: int, height: int) -> None:
+    if width * height > MAX_PIXELS:
+        told = f"is of {width:,} x {height:,} pixels, more than {MAX_PIXELS:,}"
+        raise InputError(path, told, "Give a smaller one")
+
+
+def _of_size(view: View, path: Path, pixels: U8) -> U8:
+    wanted, size = (view.camera.width, view.camera.height), pixels.shape[1::-1]
+    if size != wanted:
+        told = f"is {size[0]} x {size[1]} pixels, but its camera {wanted[0]} x {wanted[1]}"
+        raise InputError(path, told, "Mend the camera's `size` (and focal, centre), or resize the photo")
+    return pixels

@@ -25,6 +25,7 @@ from scan2sim.pipeline.errors import InputError, SettingError
 from scan2sim.pipeline.io import crs as crs_io
 from scan2sim.pipeline.io import files
 from scan2sim.pipeline.io.clouds import las
+from scan2sim.pipeline.io.image import SUFFIXES
 from scan2sim.pipeline.io.importing import place, tile_folder
 from scan2sim.pipeline.io.merging import borrow_colours, colour, phase_of, read_bin
 from scan2sim.pipeline.io.tile import tile_name, write_tile
@@ -35,7 +36,6 @@ from scan2sim.pipeline.types import F32, F64, Camera, Frame, PointCloud
 GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
 # the recording car's own returns, scanner axes: (low, high) corner in metres
 OWN_CAR: tuple[tuple[float, float, float], tuple[float, float, float]] = ((-3.2, -1.3, -2.0), (2.8, 1.3, 0.3))
-PHOTOS = (".png", ".jpg", ".jpeg")
 FARTHEST = 1e8
 """Metres that no pose on Earth is from another."""
 SAME_DAY = "Use the synced and rectified photos with the calibration of the same day"
@@ -120,7 +120,7 @@ def import_kitti_raw(
         name or drive.name,
         sweeps,
         {folder: _rig(drive, folder) for folder in cameras},
-        {folder: numbered(drive / folder / "data", PHOTOS) for folder in cameras},
+        {folder: numbered(drive / folder / "data", SUFFIXES) for folder in cameras},
         spans,
         T_velo,
         crs,

@@ -14,8 +14,8 @@ import numpy as np
 
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.io import files
-from scan2sim.pipeline.io.image import size_of
-from scan2sim.pipeline.io.kitti import PHOTOS, Drive, Rig, assemble, entry, numbered, read_poses, rig, within
+from scan2sim.pipeline.io.image import SUFFIXES, size_of
+from scan2sim.pipeline.io.kitti import Drive, Rig, assemble, entry, numbered, read_poses, rig, within
 from scan2sim.pipeline.poses import nearest_rotation
 from scan2sim.pipeline.step import Report, silent
 from scan2sim.pipeline.types import F64
@@ -54,7 +54,7 @@ def import_kitti_odometry(
     """
     sweeps = within(numbered(sequence / "velodyne", ".bin"), frames, sequence)
     numbers = list(sweeps)
-    photos = {folder: numbered(sequence / folder, PHOTOS) for folder in cameras}
+    photos = {folder: numbered(sequence / folder, SUFFIXES) for folder in cameras}
     T_cam0_velo = np.eye(4)
     T_cam0_velo[:3] = entry(sequence, "calib.txt", "Tr", 12).reshape(3, 4)
     T_cam0_velo[:3, :3] = nearest_rotation(T_cam0_velo[:3, :3])

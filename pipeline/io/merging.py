@@ -67,8 +67,6 @@ def colour(
     from scan2sim.pipeline.cameras import inside, project
 
     image = read_rgb(photo)
-    if image is None:
-        raise InputError(photo, "is no readable image", "Copy it again")
     if image.shape[:2] != (camera.height, camera.width):
         size = f"{image.shape[1]}x{image.shape[0]}"
         raise InputError(photo, f"is {size}, but its calibration says {camera.width}x{camera.height}", remedy)

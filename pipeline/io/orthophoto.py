@@ -15,6 +15,7 @@ import numpy as np
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.io import crs as crs_io
 from scan2sim.pipeline.io import files, image
+from scan2sim.pipeline.io.decoders.opencv import opened
 from scan2sim.pipeline.io.importing import place
 from scan2sim.pipeline.types import F64, Camera, Frame, View
 
@@ -75,8 +76,8 @@ def take(path: Path, folder: Path, link: bool = False) -> str:
 
 def _header(path: Path) -> tuple[tuple[int, int], dict[int, Any]]:
     """Width and height, and the tags that a TIFF has."""
-    size = image.size_of(path)
-    with image.opened(path) as picture:
+    size = image.size_of(path, parts=True)
+    with opened(path) as picture:
         return size, dict(getattr(picture, "tag_v2", {}))
 
 

@@ -26,7 +26,7 @@ from scan2sim.pipeline.io import crs as crs_io
 from scan2sim.pipeline.io import files, toml
 from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.io.clouds import las
-from scan2sim.pipeline.io.image import read_rgb
+from scan2sim.pipeline.io.image import SUFFIXES, read_rgb, size_of
 from scan2sim.pipeline.io.importing import place, tile_folder
 from scan2sim.pipeline.io.merging import borrow_colours, colour, phase_of, read_bin, thin
 from scan2sim.pipeline.io.points import sixteen_bits
@@ -40,7 +40,6 @@ Bools = npt.NDArray[np.bool_]
 VERSION = 1
 """Raised whenever the same sweeps come to another tile with the same options."""
 SWEEPS = (".bin", ".pcd", ".ply", ".las", ".laz")
-PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
 GAP = 1.0
 """Seconds between two poses (or three times what is usual) over which there is no pose in between."""
 BESIDE = 2.0
@@ -291,11 +290,8 @@ def camera_of_photos(
     """
     if model not in ("auto", "pinhole", "equirectangular"):
         raise SettingError("camera", f"there is no model {model!r}", "Use auto, pinhole, equirectangular, or a file")
-    first = _files(photos, PHOTOS, "photos")[0]
-    image = read_rgb(first)
-    if image is None:
-        raise InputError(first, "is no readable image", "Copy it again")
-    height, width = image.shape[:2]
+    first = _files(photos, SUFFIXES, "photos")[0]
+    width, height = size_of(first)
     if file is not None:
         return read_camera(file, width, height)
     if model == "equirectangular" or (model == "auto" and focal is None and width == 2 * height):
@@ -466,14 +462,14 @@ def _shots(
     T_camera_scanner: F64,
     warn: Callable[[str], None],
 ) -> _Shots:
-    files = _files(photos.folder, PHOTOS, "photos")
+    files = _files(photos.folder, SUFFIXES, "photos")
     moments = _moments(files, photos.times, path, photos.folder, "photos", offset)
     good = np.flatnonzero(way.judge(moments, 0.0, f"{len(files)} photos", poses, warn))
     mask = None
     if photos.mask is not None:
         picture = read_rgb(photos.mask)
         size = photos.camera.height, photos.camera.width
-        if picture is None or picture.shape[:2] != size:
+        if picture.shape[:2] != size:
             raise InputError(photos.mask, f"is no picture of {size[1]}x{size[0]}", "Give a mask of the photos' size")
         mask = picture[..., 0]
     own = T_camera_scanner if photos.extrinsics is None else photos.extrinsics

@@ -174,7 +174,7 @@ def _write_group(
         if params.pages == "png":
             shutil.copyfile(surface.pages[page], folder / images[page])
         else:
-            image.copy(surface.pages[page], folder / images[page], quality=params.jpeg_quality)
+            image.write(folder / images[page], image.read_rgb(surface.pages[page]), quality=params.jpeg_quality)
     look = Look(group, materials, images, tuple(surface.used_pages))
     counts = {}
     parts = surface.parts(params.max_visual_triangles)

@@ -114,8 +114,8 @@ def looked(inputs: Inputs, whole: PointCloud) -> list[Looked]:
     hides = scene([], whole)
     photos = []
     for i, (view, out) in enumerate(zip(views, held, strict=True)):
-        grey = None if out or view.camera.model == "orthographic" else image.read_levels(view.photo)
-        if grey is None or grey.shape != (view.camera.height, view.camera.width):
+        grey = None if out or view.camera.model == "orthographic" else image.usable_levels(view)
+        if grey is None:
             continue
         levels, camera = [grey], view.camera
         if grey.size > MOST:
@@ -125,7 +125,7 @@ def looked(inputs: Inputs, whole: PointCloud) -> list[Looked]:
             levels.append(cv2.resize(levels[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
         labels = inputs["labels"] / f"{i}.npy"
         sky = np.ascontiguousarray(np.load(labels)[..., SHOWN.index("sky")]) if labels.is_file() else None
-        usable = image.read_mask(view) if view.mask else None
+        usable = image.read_mask(view)
         if usable is not None:
             usable = cv2.resize(usable, (camera.width, camera.height), interpolation=cv2.INTER_NEAREST)
         depth = depth_map(camera, view.T_world_cam, hides, time=view.time, pixels=PIXELS)

@@ -149,7 +149,7 @@ def pictures(inputs: Inputs, params: PicturesParams, out: Path, report: Report) 
     filled = [world.view(view.camera.scaled(GLANCE / view.camera.width), view.T_world_cam).hit.mean() for view in views]
     for i in _compared(held, filled, params.compared):
         report(0.7 + 0.3 * i / max(1, len(views)), views[i].name)
-        photo = image.read_rgb(views[i].photo)
+        photo = image.usable_photo(views[i])
         if photo is None:
             continue
         small = views[i].camera.scaled(min(1.0, params.width / views[i].camera.width))
@@ -270,7 +270,6 @@ def thumbnail(page: Path, width: int) -> U8:
     import cv2
 
     pixels = image.read_rgb(page)
-    assert pixels is not None
     factor = min(1.0, width / max(pixels.shape[:2]))
     return cv2.resize(pixels, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
 

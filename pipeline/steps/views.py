@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 REACH = 100.0  # metres; a photo further than this from every point sees nothing of the tile
 MARGIN = 8  # pixels of an orthophoto around the points
+LEFT_OUT = "left out, its place is textured from other photos where they see it"
 SAMPLE = 500_000  # points that are looked for in the photos
 
 
@@ -66,11 +67,14 @@ def views(inputs: Inputs, params: ViewsParams, out: Path, report: Report) -> Don
         view = replace(views_io.from_json(entry), photo=inputs[f"photo.{i}"], mask=mask)
         problem = _problem(view)
         if problem:
-            warnings.append(f"{problem}: left out, its place is textured from other photos where they see it")
+            warnings.append(f"{problem}: {LEFT_OUT}")
         elif not _sees(view, points):
             sees_nothing.append(view.name)
         elif view.camera.model == "orthographic":
-            kept.append(_cut(view, points, out / "photos", i))
+            try:
+                kept.append(_cut(view, points, out / "photos", i))
+            except InputError as error:
+                warnings.append(f"{view.photo} {error.cause}: {LEFT_OUT}")
         else:
             kept.append(views_io.linked(view, out, i))
     if sees_nothing and not kept:
@@ -107,11 +111,10 @@ def _cut(view: View, points: F32, folder: Path, index: int) -> View:
     size = np.array([camera.width, camera.height])
     low = np.clip(np.floor(uv.min(axis=0)) - MARGIN, 0, size - 1).astype(int)
     high = np.clip(np.ceil(uv.max(axis=0)) + MARGIN, low + 1, size).astype(int)
-    rgb = image.read_rgb(view.photo)
-    assert rgb is not None  # `_problem` has read it
+    rgb = image.read_rgb(view.photo, (*low.tolist(), *high.tolist()))
     folder.mkdir(exist_ok=True)
     file = folder / f"{index:05d}_{view.photo.stem}.png"
-    image.write(file, rgb[low[1] : high[1], low[0] : high[0]])
+    image.write(file, rgb)
     width, height = (high - low).tolist()
     part = replace(camera, width=width, height=height, cx=camera.cx - float(low[0]), cy=camera.cy - float(low[1]))
     return replace(view, camera=part, photo=file.relative_to(folder.parent))
@@ -137,12 +140,13 @@ def _problem(view: View) -> str | None:
     from scan2sim.pipeline.io import image
 
     wanted = view.camera.width, view.camera.height
+    part = view.camera.model == "orthographic"  # what `_cut` reads
     for path in (view.photo, view.mask):
         if path is None:
             continue
         try:
-            size = image.size_of(path)
-            if size == wanted:
+            size = image.size_of(path, parts=part)
+            if size == wanted and not part:
                 image.check_decodes(path)
         except InputError as error:
             return f"{path} {error.cause}"

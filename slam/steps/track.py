@@ -138,15 +138,13 @@ def read_mask(video: Video, path: Path | None) -> U8 | None:
     """(H, W) of the frames' size, 0 where the car itself is seen.
 
     Raises:
-        InputError: it is no picture.
+        InputError: it can't be read.
     """
     if path is None:
         return None
     import cv2
 
-    rgb = image.read_rgb(path) if path.is_file() else None
-    if rgb is None:
-        raise InputError(path, "is no readable picture", "Give a mask: 0 where the car itself is seen")
+    rgb = image.read_rgb(path)
     return cv2.resize(rgb[..., 0], (video.width, video.height), interpolation=cv2.INTER_NEAREST)
 
 

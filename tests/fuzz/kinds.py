@@ -42,6 +42,8 @@ KINDS: dict[str, Kind] = {
     **{n: Kind(clouds.whole(f), clouds.read(f), SPECIAL.get(n)) for n, f in FORMATS.items()},
     "photo jpg": Kind(*models.photo(".jpg")),
     "photo png": Kind(*models.photo(".png")),
+    "photo tif": Kind(*models.photo(".tif")),
+    "photo exr": Kind(*models.photo(".exr")),
     "tile.toml": Kind(tables.tile, read_tile),
     "survey.toml": Kind(tables.survey, tables.read_survey_folder),
     "drive.toml": Kind(tables.written("drive.toml", tables.DRIVE), tables.read_drive_file),

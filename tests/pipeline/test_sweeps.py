@@ -388,7 +388,7 @@ def garbage(drive: Drive, name: str) -> dict[str, Any]:
     [
         (lambda d: garbage(d, "sweeps/000002.bin"), InputError, r"000002\.bin: is no Velodyne sweep"),
         (lambda d: garbage(d, "sweeps/000009.pcd") | {"times": d.folder / "t7.txt"}, InputError, r"000009\.pcd: is no"),
-        (lambda d: garbage(d, "photos/000002.png"), InputError, r"000002\.png: is no readable image"),
+        (lambda d: garbage(d, "photos/000002.png"), InputError, r"000002\.png: can't be read"),
         (lambda d: garbage(d, "camera.csv"), InputError, r"camera\.csv: is no trajectory"),
         (lambda d: d.asked | {"poses": d.folder / "flat.csv"}, InputError, r"flat\.csv: knows positions alone"),
         (lambda d: d.asked | {"sweeps": d.folder / "photos"}, InputError, r"photos: holds no sweeps.*\.bin"),

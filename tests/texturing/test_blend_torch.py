@@ -6,7 +6,6 @@ import pytest
 from scan2sim.pipeline.errors import SettingError
 from scan2sim.pipeline.io import image
 from scan2sim.texturing import blend
-from tests.present import present
 from tests.texturing import scattered
 from tests.texturing.corner import CAMERAS, POSES, Street, photograph, points
 
@@ -25,8 +24,8 @@ def test_torch_paints_the_same(street: Street, name: str, band: int) -> None:
     mine, done = street.run(band=band, device="numba")
     theirs, told = street.run(band=band, device="cpu")
     for page in range(done.facts["pages"]):
-        a, b = (present(image.read_rgb(folder / f"page_{page}.png")).astype(int) for folder in (mine, theirs))
-        seen = [image.read_grey(folder / f"page_{page}_seen.png") for folder in (mine, theirs)]
+        a, b = (image.read_rgb(folder / f"page_{page}.png").astype(int) for folder in (mine, theirs))
+        seen = [image.read_levels(folder / f"page_{page}_seen.png") for folder in (mine, theirs)]
         assert (seen[0] == seen[1]).mean() > 0.99999
         assert (abs(a - b).max(axis=2) <= 1).mean() > 0.99999
     assert told.facts["coverage"] == pytest.approx(done.facts["coverage"], abs=1e-4)

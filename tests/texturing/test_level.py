@@ -146,7 +146,7 @@ def same_bytes(one: Path, two: Path) -> bool:
 
 def change(before: Path, after: Path) -> tuple[npt.NDArray[np.int64], F64]:
     """What the levelling added to the texels of faces (N, 3), and their world places (N, 3)."""
-    pages = [present(image.read_rgb(folder / "page_0.png")).astype(int) for folder in (before, after)]
+    pages = [image.read_rgb(folder / "page_0.png").astype(int) for folder in (before, after)]
     _, rows, columns, places = texels(Mesh.load(after / "mesh.npz"), *pages[0].shape[1::-1])
     return (pages[1] - pages[0])[rows, columns], places
 
@@ -206,14 +206,14 @@ def test_three_tiles_meet_in_a_corner(tmp_path: Path) -> None:
     for one, two in ("ab", "bc", "ca"):
         assert step(done[one], done[two])[0] < 1
     for name, folder in done.items():  # no step within a tile either, not even around the corner
-        page = present(image.read_rgb(folder / "page_0.png")).astype(int)
+        page = image.read_rgb(folder / "page_0.png").astype(int)
         owner = texels(Mesh.load(folder / "mesh.npz"), *page.shape[1::-1])[0]
         for axis in (0, 1):
             inside = (np.minimum(owner, np.roll(owner, 1, axis)) >= 0)[1:, 1:]
             assert abs(np.diff(page, axis=axis))[-inside.shape[0] :, -inside.shape[1] :][inside].max() <= 2, name
         added, places = change(made[name], folder)
         here = np.linalg.norm(places[:, :2], axis=1).argmin()
-        assert abs(added[here] + present(image.read_rgb(made[name] / "page_0.png"))[8, 8] - [115, 103, 110]).max() <= 2
+        assert abs(added[here] + image.read_rgb(made[name] / "page_0.png")[8, 8] - [115, 103, 110]).max() <= 2
 
 
 def test_shared_vertices_are_enough(tmp_path: Path) -> None:

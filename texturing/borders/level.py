@@ -98,7 +98,7 @@ def _level_pages(
         report(i / len(pages), f"page {i + 1} of {len(pages)}")
         faces = np.flatnonzero(mesh.page == k)
         here = looks.page == k
-        before = showing.read_page(own.pages[k])
+        before = image.read_rgb(own.pages[k])
         page, (height, width) = before.copy(), before.shape[:2]
         flat = texels.corners(mesh.uv[faces], width, height)
         owner = texels.owners(flat, width, height)

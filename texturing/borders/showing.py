@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.io import image
 from scan2sim.pipeline.types import F32, F64, U8
 from scan2sim.texturing.borders.meeting import SOFT, Index, Looks
@@ -30,7 +29,7 @@ def colours(looks: Looks, pages: Sequence[Path], places: int) -> F32:
     shown = np.empty((len(looks.place), 3), np.float32)
     for k in np.unique(looks.page).tolist():
         here = looks.page == k
-        shown[here] = looked_up(read_page(pages[k]), looks.uv[here])
+        shown[here] = looked_up(image.read_rgb(pages[k]), looks.uv[here])
     return by_place(looks.place, shown, places)
 
 
@@ -39,18 +38,6 @@ def by_place(place: Index, shown: F32, places: int) -> F32:
     total = np.stack([np.bincount(place, shown[:, k], places) for k in range(3)], axis=1)
     count = np.bincount(place, minlength=places)[:, None]
     return np.divide(total, count, out=np.full((places, 3), np.nan), where=count > 0).astype(np.float32)
-
-
-def read_page(path: Path) -> U8:
-    """(H, W, 3) of a texture page.
-
-    Raises:
-        InputError: it can't be read.
-    """
-    page = image.read_rgb(path)
-    if page is None:
-        raise InputError(path, "can't be read as an image", "Texture the mesh again")
-    return page
 
 
 def looked_up(page: U8, uv: F32) -> F32:

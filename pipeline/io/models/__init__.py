@@ -17,12 +17,10 @@ import numpy as np
 
 from scan2sim.pipeline import backends
 from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.io.image import size_of
+from scan2sim.pipeline.io.image import SUFFIXES, size_of
 from scan2sim.pipeline.io.importing import without_parents
 from scan2sim.pipeline.similarity import Similarity
 from scan2sim.pipeline.types import F64, U8, Camera
-
-PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
 
 
 @dataclass(frozen=True)
@@ -108,7 +106,7 @@ class Photos:
     def _known(self) -> dict[str, list[Path]]:
         if self._names is None:
             self._names = defaultdict(list)
-            for path in sorted(p for p in self.folder.rglob("*") if p.suffix.lower() in PHOTOS and p.is_file()):
+            for path in sorted(p for p in self.folder.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file()):
                 self._names[path.name.lower()].append(path)
                 self._names[path.stem.lower()].append(path)
         return self._names

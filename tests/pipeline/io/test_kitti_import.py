@@ -189,7 +189,7 @@ def test_borrowed_colours_come_from_the_nearest_within_reach() -> None:
     ("harm", "message"),
     [
         ("velodyne_points/data/0000000001.bin", r"0000000001\.bin: is no Velodyne sweep.*Copy it again"),
-        ("image_02/data/0000000002.png", r"0000000002\.png: is no readable image.*Copy it again"),
+        ("image_02/data/0000000002.png", r"0000000002\.png: can't be read.*Copy it again"),
         ("oxts/data/0000000003.txt", r"0000000003\.txt: is no OXTS record.*or give poses"),
         ("velodyne_points/timestamps.txt", r"timestamps\.txt: line 1 is no time stamp.*leave that frame out"),
         ("../calib_velo_to_cam.txt", r"calib_velo_to_cam\.txt: has no `R` of 9 numbers.*calibration again"),

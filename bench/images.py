@@ -1,0 +1,359 @@
+"""OpenCV and OpenImageIO side by side: what photos and pages they read, how true, how fast, in how much memory.
+
+`python -m bench.images [--width 5760] [--panorama 16384] [--repeats 5] [--parts reading panorama colours writing]`:
+all files are made in a temporary folder, from a photo of the committed tile scaled up, with grain.
+
+- reading: seconds, and the largest error (of 255 levels; JPEG: against OpenCV's pixels).
+- panorama: a region of 2048 x 2048 and an eighth of the size; seconds and growth of the peak memory, a process each.
+- colours: levels (mean, largest) that a photo with a profile is away from the truth in sRGB, which matrices tell. As
+  decoded; by OpenImageIO, told the colour space's name; by Pillow (LittleCMS), from the profile that the file has.
+- writing: seconds, megabytes, and the mean error of a page.
+
+Seconds are of processors, all cores together, of the fastest of `--repeats`: others' work doesn't count. null: the
+library can't. Ends with `RESULT {json}`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+import multiprocessing
+import re
+import struct
+import tempfile
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import OpenImageIO as oiio
+from PIL import Image, ImageCms
+
+from scan2sim.pipeline.io.decoders import openimageio
+from scan2sim.pipeline.types import F64, U8
+
+Pixels = npt.NDArray[Any]
+PHOTO = Path(__file__).resolve().parent.parent / "data_samples" / "tile" / "photos" / "0000_front.jpg"
+REGION, REDUCED, TILE = 2048, 8, 256
+LIBRARIES = ("opencv", "openimageio")
+SRGB, P3, ADOBE = (
+    ((0.640, 0.330), (0.300, 0.600), (0.150, 0.060)),
+    ((0.680, 0.320), (0.265, 0.690), (0.150, 0.060)),
+    ((0.640, 0.330), (0.210, 0.710), (0.150, 0.060)),
+)
+"""Chromaticities of primaries (IEC 61966-2-1, SMPTE EG 432-1, Adobe RGB 1998); the white of all is D65."""
+D65, D50 = (0.3127, 0.3290), (0.3457, 0.3585)
+BRADFORD = np.array([(0.8951, 0.2664, -0.1614), (-0.7502, 1.7135, 0.0367), (0.0389, -0.0685, 1.0296)])
+
+
+def photo(width: int) -> U8:
+    """(width / 2, width, 3) RGB: a photo of the committed tile, scaled up, with grain as cameras have."""
+    small = cv2.imread(str(PHOTO))[..., ::-1]
+    large = cv2.resize(small, (width, width // 2), interpolation=cv2.INTER_CUBIC).astype(np.int16)
+    large += np.random.default_rng(0).integers(-3, 4, large.shape, dtype=np.int16)
+    return large.clip(0, 255).astype(np.uint8)
+
+
+def decoded(rgb: Pixels) -> F64:
+    """Linear light of sRGB values in 0 to 1 (IEC 61966-2-1)."""
+    x = np.asarray(rgb, np.float64)
+    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
+
+
+def encoded(light: Pixels) -> F64:
+    """SRGB values of linear light, what is beyond 0 to 1 clipped."""
+    x = np.clip(np.asarray(light, np.float64), 0, 1)
+    return np.where(x <= 0.0031308, x * 12.92, 1.055 * x ** (1 / 2.4) - 0.055)
+
+
+def to_xyz(primaries: tuple[tuple[float, float], ...], white: tuple[float, float] = D65) -> F64:
+    """(3, 3) from linear RGB to CIE XYZ."""
+    corners = np.array([(x / y, 1.0, (1 - x - y) / y) for x, y in primaries]).T
+    return np.asarray(corners * np.linalg.solve(corners, _xyz(white)))
+
+
+def _xyz(white: tuple[float, float]) -> F64:
+    return np.array([white[0] / white[1], 1.0, (1 - white[0] - white[1]) / white[1]])
+
+
+def profile(primaries: tuple[tuple[float, float], ...], gamma: float | None) -> bytes:
+    """An ICC profile (version 2, matrix and curves): a power, or sRGB's curve where that is None."""
+    cones = BRADFORD @ np.stack([_xyz(D50), _xyz(D65)], axis=1)
+    adapted = np.linalg.inv(BRADFORD) @ np.diag(cones[:, 0] / cones[:, 1]) @ BRADFORD @ to_xyz(primaries)
+    table = decoded(np.arange(1024) / 1023) if gamma is None else None
+    counts = [round(gamma * 256)] if gamma else np.rint(np.asarray(table) * 65535).astype(int).tolist()
+    curve = b"curv" + struct.pack(f">4xI{len(counts)}H", len(counts), *counts)
+    tags = {b"desc": b"desc" + struct.pack(">4xI", 5) + b"made\0" + bytes(78), b"cprt": b"text" + bytes(4) + b"none\0"}
+    for name, xyz in zip((b"wtpt", b"rXYZ", b"gXYZ", b"bXYZ"), (_xyz(D50), *adapted.T), strict=True):
+        tags[name] = b"XYZ " + struct.pack(">4x3i", *np.rint(xyz * 65536).astype(int))
+    tags |= dict.fromkeys((b"rTRC", b"gTRC", b"bTRC"), curve)
+    index, body, start = struct.pack(">I", len(tags)), b"", 128 + 4 + 12 * len(tags)
+    for name, tag in tags.items():
+        index += name + struct.pack(">II", start + len(body), len(tag))
+        body += tag + bytes(-len(tag) % 4)
+    white = np.rint(_xyz(D50) * 65536).astype(int)
+    head = struct.pack(
+        ">I4xI4s4s4s12x4s28x3i", start + len(body), 0x02400000, b"mntr", b"RGB ", b"XYZ ", b"acsp", *white
+    )
+    return head.ljust(128, b"\0") + index + body
+
+
+def write(path: Path, pixels: Pixels, kind: str, tile: int = 0, **attributes: str | int) -> None:
+    """A file by OpenImageIO; attributes as "png__compressionLevel"."""
+    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], kind)
+    spec.tile_width = spec.tile_height = tile
+    if "channelnames" in attributes:
+        spec.channelnames = tuple(str(attributes.pop("channelnames")).split())
+    for name, value in attributes.items():
+        spec.attribute(name.replace("__", ":"), value)
+    out: Any = oiio.ImageOutput.create(str(path))
+    if not out.open(str(path), spec) or not out.write_image(pixels):
+        raise SystemExit(f"{path}: {out.geterror()}")
+    out.close()
+
+
+def by_opencv(path: Path) -> Pixels | None:
+    """A file's pixels as they lie in it."""
+    try:
+        found = cv2.imread(str(path), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error:
+        return None
+    return None if found is None else found[..., ::-1]
+
+
+def by_openimageio(path: Path) -> Pixels:
+    """The same."""
+    source = opened(path)
+    found: Pixels = source.read_image(0, 0, 0, source.spec().nchannels, str(source.spec().format))
+    return found
+
+
+def opened(path: Path) -> Any:
+    """A file by OpenImageIO, its header read."""
+    source = oiio.ImageInput.open(str(path))
+    if source is None:
+        raise SystemExit(f"{path}: {oiio.geterror()}")
+    return source
+
+
+READ: dict[str, Callable[[Path], Pixels | None]] = {"opencv": by_opencv, "openimageio": by_openimageio}
+
+
+def fastest(task: Callable[[], Any], repeats: int) -> tuple[float, Any]:
+    """Seconds of all cores, of the fastest, and what it gave."""
+    took = []
+    for _ in range(repeats):
+        start = time.process_time()
+        result = task()
+        took.append(time.process_time() - start)
+    return round(min(took), 3), result
+
+
+def files(folder: Path, rgb: U8) -> dict[Path, Pixels | None]:
+    """All kinds of photos, and what is in them, 0 to 1; None: what OpenCV decodes."""
+    share = rgb / np.float32(255)
+    fine = (share * 65535 + np.random.default_rng(1).integers(0, 257, rgb.shape)).clip(0, 65535).astype(np.uint16)
+    light = decoded(share).astype(np.float32)
+    turned, picture = Image.Exif(), Image.fromarray(rgb)
+    turned[0x112] = 6
+    quality: dict[str, Any] = {"quality": 92}
+    picture.save(folder / "baseline.jpg", **quality)
+    picture.save(folder / "turned.jpg", **quality, exif=turned)
+    picture.save(folder / "progressive.jpg", **quality, progressive=True)
+    picture.convert("CMYK").save(folder / "cmyk.jpg", **quality)
+    found: dict[Path, Pixels | None] = dict.fromkeys(sorted(folder.glob("*.jpg")))
+    deflate: dict[str, Any] = {"compression": "zip"}
+    for name, kind, tile, pixels, more in (
+        ("8.png", "uint8", 0, rgb, {}),
+        ("16.png", "uint16", 0, fine, {}),
+        ("8.tif", "uint8", 0, rgb, deflate),
+        ("8_tiled.tif", "uint8", TILE, rgb, deflate),
+        ("16.tif", "uint16", 0, fine, deflate),
+        ("16_tiled.tif", "uint16", TILE, fine, deflate),
+        ("float_tiled.tif", "float", TILE, light, deflate),
+        ("half.exr", "half", 0, light.astype(np.float16), deflate),
+        ("half_tiled.exr", "half", TILE, light.astype(np.float16), deflate),
+        ("float.exr", "float", 0, light, deflate),
+    ):
+        write(folder / name, pixels, kind, tile, **more)
+        found[folder / name] = of_one(pixels)
+    return found
+
+
+def of_one(pixels: Pixels) -> Pixels:
+    """Pixels as shares of the largest value."""
+    return pixels / np.float32(np.iinfo(pixels.dtype).max) if pixels.dtype.kind == "u" else pixels.astype(np.float32)
+
+
+def reading(folder: Path, width: int, repeats: int) -> dict[str, Any]:
+    """Of every kind of photo."""
+    found: dict[str, Any] = {}
+    for path, truth in files(folder, photo(width)).items():
+        known = of_one(np.asarray(by_opencv(path))) if truth is None else truth
+        one: dict[str, Any] = {"mb": round(path.stat().st_size / 1e6, 2)}
+        for library, read in READ.items():
+            seconds, pixels = fastest(partial(read, path), repeats)
+            error = None if pixels is None else round(float(np.abs(of_one(pixels) - known).max() * 255), 3)
+            one[library] = None if pixels is None else {"seconds": seconds, "error": error}
+        found[path.name] = one
+        print(f"{path.name:20s}", json.dumps(one), flush=True)
+    return found
+
+
+def panorama(folder: Path, width: int) -> dict[str, Any]:
+    """Parts of a large one, each in a process of its own."""
+    rgb = photo(width)
+    cv2.imwrite(str(folder / "p.jpg"), rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])
+    write(folder / "p_tiled.tif", rgb, "uint8", TILE, compression="zip")
+    write(folder / "p_rows.tif", rgb, "uint8", 0, compression="zip")
+    whole = oiio.ImageBuf(rgb)
+    if not oiio.ImageBufAlgo.make_texture(oiio.MakeTxTexture, whole, str(folder / "p_levels.tif")):
+        raise SystemExit(whole.geterror())
+    found: dict[str, Any] = {}
+    for name in ("p.jpg", "p_rows.tif", "p_tiled.tif", "p_levels.tif"):
+        for task in ("region", "eighth"):
+            one = {library: alone(globals()[f"{task}_{library}"], folder / name) for library in LIBRARIES}
+            found[f"{name} {task}"] = one
+            print(f"{name:14s}{task:8s}", json.dumps(one), flush=True)
+    return found
+
+
+def alone(task: Callable[[Path], Pixels], path: Path) -> dict[str, float]:
+    """Seconds, and megabytes by which the peak memory grew, in a fresh process."""
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        return pool.apply(_alone, (task, path))
+
+
+def _alone(task: Callable[[Path], Pixels], path: Path) -> dict[str, float]:
+    before, start = _peak(), time.process_time()
+    task(path)
+    return {"seconds": round(time.process_time() - start, 3), "mb": round(_peak() - before)}
+
+
+def _peak() -> float:
+    return int(re.findall(r"VmHWM:\s+(\d+)", Path("/proc/self/status").read_text())[0]) / 1e3
+
+
+def region_opencv(path: Path) -> Pixels:
+    """A square in the middle."""
+    whole = cv2.imread(str(path))
+    x, y = whole.shape[1] // 2, whole.shape[0] // 2
+    return whole[y - REGION // 2 : y + REGION // 2, x - REGION // 2 : x + REGION // 2]
+
+
+def region_openimageio(path: Path) -> Pixels:
+    """The same."""
+    width, height, _ = openimageio.header(path)
+    x, y = (width - REGION) // 2, (height - REGION) // 2
+    return openimageio.pixels(path, box=(x, y, x + REGION, y + REGION))
+
+
+def eighth_opencv(path: Path) -> Pixels:
+    """The photo at an eighth; its decoder of JPEG makes it so."""
+    return cv2.imread(str(path), cv2.IMREAD_REDUCED_COLOR_8)
+
+
+def eighth_openimageio(path: Path) -> Pixels:
+    """The same; the level that the file holds, where it does."""
+    source, level = opened(path), REDUCED.bit_length() - 1
+    found: Pixels
+    if source.seek_subimage(0, level):
+        found = source.read_image(0, level, 0, 3, "uint8")
+    else:
+        whole = source.read_image(0, 0, 0, 3, "uint8")
+        found = cv2.resize(whole, None, fx=1 / REDUCED, fy=1 / REDUCED, interpolation=cv2.INTER_AREA)
+    return found
+
+
+SPACES = {
+    "Display P3": (P3, None, "srgb_p3d65_scene"),
+    "Adobe RGB": (ADOBE, 563 / 256, "g22_adobergb_scene"),
+}
+
+
+def colours(folder: Path, width: int, repeats: int) -> dict[str, Any]:
+    """Of photos with a profile, lossless, so that nothing else is wrong; and of linear light."""
+    rgb, found = photo(width), {}
+    for name, (primaries, gamma, space) in SPACES.items():
+        icc, path = profile(primaries, gamma), folder / f"{name}.png"
+        Image.fromarray(rgb).save(path, icc_profile=icc)
+        light = decoded(rgb[::4] / 255) if gamma is None else (rgb[::4] / 255) ** gamma
+        truth = encoded(light @ (np.linalg.inv(to_xyz(SRGB)) @ to_xyz(primaries)).T) * 255
+
+        def named(space: str = space) -> Pixels:
+            made: Any = oiio.ImageBufAlgo.colorconvert(oiio.ImageBuf(rgb), space, "srgb_rec709_scene")
+            return np.asarray(made.get_pixels("uint8"))
+
+        def by_profile(icc: bytes = icc) -> Pixels:
+            own, srgb = ImageCms.getOpenProfile(io.BytesIO(icc)), ImageCms.createProfile("sRGB")
+            return np.asarray(ImageCms.profileToProfile(Image.fromarray(rgb), own, srgb))
+
+        told = opened(path).spec().get_string_attribute("oiio:ColorSpace")
+        one: dict[str, Any] = {"openimageio_tells": told}
+        for way, task in (("as decoded", lambda: rgb), ("openimageio, named", named), ("pillow", by_profile)):
+            seconds, pixels = fastest(task, repeats)
+            away = np.abs(pixels[::4] - truth)
+            one[way] = {
+                "seconds": seconds,
+                "mean": round(float(away.mean()), 2),
+                "largest": round(float(away.max()), 1),
+            }
+        found[name] = one
+        print(f"{name:12s}", json.dumps(one), flush=True)
+    return found
+
+
+def writing(folder: Path, width: int, repeats: int) -> dict[str, Any]:
+    """Of a page of 4096 x 4096, or what `width` allows."""
+    page = photo(2 * min(width, 4096))[:, : min(width, 4096)]
+    bgr, found = np.ascontiguousarray(page[..., ::-1]), {}
+    rgb = np.ascontiguousarray(page)
+    ways: dict[str, tuple[list[int], dict[str, Any]]] = {
+        "png": ([cv2.IMWRITE_PNG_COMPRESSION, 2], {"png__compressionLevel": 2}),
+        "jpg": ([cv2.IMWRITE_JPEG_QUALITY, 90], {"compression": "jpeg:90"}),
+        "webp": ([cv2.IMWRITE_WEBP_QUALITY, 90], {"compression": "webp:90"}),
+    }
+    for suffix, (options, attributes) in ways.items():
+        path, one = folder / f"page.{suffix}", {}
+        tasks: dict[str, Callable[[], Any]] = {
+            "opencv": partial(cv2.imwrite, str(path), bgr, options),
+            "openimageio": partial(write, path, rgb, "uint8", **attributes),
+        }
+        for library, task in tasks.items():
+            seconds, _ = fastest(task, repeats)
+            away = np.abs(cv2.imread(str(path))[..., ::-1].astype(np.int16) - rgb).mean()
+            size = round(path.stat().st_size / 1e6, 2)
+            one[library] = {"seconds": seconds, "mb": size, "error": round(float(away), 3)}
+        found[suffix] = one
+        print(f"{suffix:6s}", json.dumps(one), flush=True)
+    return found
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--width", type=int, default=5760)
+    parser.add_argument("--panorama", type=int, default=16384)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--parts", nargs="*", default=["reading", "panorama", "colours", "writing"])
+    given = parser.parse_args()
+    parts: dict[str, Callable[[Path], dict[str, Any]]] = {
+        "reading": lambda folder: reading(folder, given.width, given.repeats),
+        "panorama": lambda folder: panorama(folder, given.panorama),
+        "colours": lambda folder: colours(folder, given.width, given.repeats),
+        "writing": lambda folder: writing(folder, given.width, given.repeats),
+    }
+    result: dict[str, Any] = {"openimageio": oiio.VERSION_STRING, "opencv": cv2.__version__}
+    for name in given.parts:
+        with tempfile.TemporaryDirectory() as folder:
+            result[name] = parts[name](Path(folder))
+    print("RESULT", json.dumps(result))
+
+
+if __name__ == "__main__":
+    main()
