@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numba import njit, prange
@@ -155,6 +154,3 @@ def _add(  # type: ignore[no-untyped-def]
         for k in range(3):
             total[i, k] += w * rgb[k]
         total[i, 3] += w
-
-
-BASELINES: dict[str, Any] = {"open3d": open3d, "nearest": nearest, "inverse_square": inverse_square}

@@ -9,7 +9,7 @@ in their middles is the *local median error 400*.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -193,17 +193,6 @@ def evaluate(
         local_at=local_at,
         local_errors=local_errors,
     )
-
-
-def z_up(trajectory: Trajectory) -> Trajectory:
-    """A trajectory in its first camera's axes (x right, y down, z forward), as KITTI's are, turned z-up, x forward."""
-    turn = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-    rotations = None if trajectory.rotations is None else turn @ trajectory.rotations
-    covariance = trajectory.covariance
-    if covariance is not None:
-        both = np.kron(np.eye(2), turn)
-        covariance = both @ covariance @ both.T
-    return replace(trajectory, positions=trajectory.positions @ turn.T, rotations=rotations, covariance=covariance)
 
 
 def way(ground: F64, stride: float = STRIDE) -> F64:

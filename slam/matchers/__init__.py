@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -11,6 +12,7 @@ import numpy.typing as npt
 from scan2sim.pipeline import backends
 from scan2sim.pipeline.errors import SettingError
 from scan2sim.slam.features import Features, Found
+from scan2sim.slam.weights import Weights
 
 I64 = npt.NDArray[np.int64]
 Sizes = tuple[tuple[int, int], tuple[int, int]]
@@ -39,6 +41,36 @@ class Matcher(Protocol):
 
     def describe(self) -> str:
         """What this is, for logs: with the hash and licence of weights."""
+
+
+class ByNetwork(ABC):
+    """What matchers by networks share: pairs are each other's most probable, and probable enough.
+
+    Attributes:
+        least: probability of a match, as published.
+    """
+
+    least: float
+
+    def __init__(self, weights: Weights) -> None:
+        self.weights = weights
+
+    @abstractmethod
+    def shares(self, a: Found, b: Found, sizes: Sizes) -> Any:
+        """(N, M) probabilities of matches, a tensor."""
+
+    def match(self, a: Found, b: Found, sizes: Sizes) -> I64:
+        """See `Matcher`."""
+        import torch
+
+        if not len(a.uv) or not len(b.uv):
+            return np.zeros((0, 2), np.int64)
+        with torch.inference_mode():
+            return mutual(self.shares(a, b, sizes), self.least)
+
+    def describe(self) -> str:
+        """See `Matcher`."""
+        return self.weights.describe()
 
 
 class Backend(Protocol):

@@ -13,7 +13,7 @@ import numpy as np
 
 from scan2sim.slam import weights as files
 from scan2sim.slam.features import Found
-from scan2sim.slam.matchers import I64, Sizes, mutual
+from scan2sim.slam.matchers import ByNetwork, Sizes
 
 LAYERS, HEADS, DIM = 9, 4, 256
 THRESHOLD = 0.1
@@ -72,30 +72,17 @@ def load(weights: Path | None, device: str) -> LightGlue:
     return LightGlue(files.load(weights, [_SUPERPOINT, _ALIKED], hint=HINT, device=device))
 
 
-class LightGlue:
+class LightGlue(ByNetwork):
     """See `slam.matchers.Matcher`."""
 
-    name = "lightglue"
+    name, least = "lightglue", THRESHOLD
 
     def __init__(self, weights: files.Weights) -> None:
-        self.weights = weights
+        super().__init__(weights)
         self.takes, self.dimension = ("aliked", 128) if "input_proj.weight" in weights.tensors else ("superpoint", DIM)
 
-    def match(self, a: Found, b: Found, sizes: Sizes) -> I64:
-        """See `slam.matchers.Matcher`."""
-        import torch
-
-        if not len(a.uv) or not len(b.uv):
-            return np.zeros((0, 2), np.int64)
-        with torch.inference_mode():
-            return mutual(self._shares(a, b, sizes), THRESHOLD)
-
-    def describe(self) -> str:
-        """See `slam.matchers.Matcher`."""
-        return self.weights.describe()
-
-    def _shares(self, a: Found, b: Found, sizes: Sizes) -> Any:
-        """(N, M) probabilities of matches."""
+    def shares(self, a: Found, b: Found, sizes: Sizes) -> Any:
+        """See `slam.matchers.ByNetwork`."""
         from torch.nn.functional import logsigmoid
 
         (xa, turn_a), (xb, turn_b) = self._encoded(a, sizes[0]), self._encoded(b, sizes[1])

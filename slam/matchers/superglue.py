@@ -14,7 +14,7 @@ import numpy as np
 
 from scan2sim.slam import weights as files
 from scan2sim.slam.features import Found
-from scan2sim.slam.matchers import I64, Sizes, mutual
+from scan2sim.slam.matchers import ByNetwork, Sizes
 
 LAYERS, HEADS, DIM = 18, 4, 256
 """Layers look in turn within a picture and across."""
@@ -63,29 +63,13 @@ def load(weights: Path | None, device: str) -> SuperGlue:
     return SuperGlue(files.load(weights, [MODEL], hint=HINT, device=device))
 
 
-class SuperGlue:
+class SuperGlue(ByNetwork):
     """See `slam.matchers.Matcher`."""
 
-    name, takes, dimension = "superglue", "superpoint", DIM
+    name, takes, dimension, least = "superglue", "superpoint", DIM, THRESHOLD
 
-    def __init__(self, weights: files.Weights) -> None:
-        self.weights = weights
-
-    def match(self, a: Found, b: Found, sizes: Sizes) -> I64:
-        """See `slam.matchers.Matcher`."""
-        import torch
-
-        if not len(a.uv) or not len(b.uv):
-            return np.zeros((0, 2), np.int64)
-        with torch.inference_mode():
-            return mutual(self._shares(a, b, sizes), THRESHOLD)
-
-    def describe(self) -> str:
-        """See `slam.matchers.Matcher`."""
-        return self.weights.describe()
-
-    def _shares(self, a: Found, b: Found, sizes: Sizes) -> Any:
-        """(N, M) probabilities of matches."""
+    def shares(self, a: Found, b: Found, sizes: Sizes) -> Any:
+        """See `slam.matchers.ByNetwork`."""
         xa, xb = self._encoded(a, sizes[0]), self._encoded(b, sizes[1])
         for i in range(LAYERS):
             seen = (xb, xa) if i % 2 else (xa, xb)

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from scan2sim.pipeline.errors import DataError
 from scan2sim.pipeline.similarity import umeyama
 from scan2sim.pipeline.types import F64, GpsTrack, Trajectory
-from scan2sim.slam.evaluate import evaluate, local, plot, way, z_up
+from scan2sim.slam.evaluate import evaluate, local, plot, way
 
 
 def yaw(degrees: float | F64) -> F64:
@@ -206,17 +206,6 @@ def test_kitti_errors_are_those_of_its_tool() -> None:
     percent, degrees = kitti_reference(truth.poses, found.poses)
     assert result.translation == pytest.approx(percent, rel=2e-3)
     assert result.rotation_deg_per_m == pytest.approx(degrees, rel=2e-3)
-
-
-def test_camera_axes_are_turned_z_up() -> None:
-    t = Trajectory(
-        np.zeros(1), np.array([[1.0, 2.0, 3.0]]), np.eye(3)[None], covariance=np.diag([1.0, 4, 9, 1, 4, 9])[None]
-    )
-    up = z_up(t)  # right 1, down 2, forward 3
-    assert up.positions.tolist() == [[3, -1, -2]]
-    assert up.rotations is not None and up.covariance is not None
-    assert up.rotations[0].tolist() == [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
-    assert np.diag(up.covariance[0]).tolist() == [9, 1, 4, 9, 1, 4]
 
 
 def test_a_picture(tmp_path: Path) -> None:

@@ -225,7 +225,7 @@ def agree(ours: Any, a: Found, b: Found, theirs: Any, share: Any) -> None:
     import torch
 
     with torch.inference_mode():
-        shares = ours._shares(a, b, ((640, 480), (640, 480)))
+        shares = ours.shares(a, b, ((640, 480), (640, 480)))
     pairs = matchers.mutual(shares, 0.0)
     mine = np.full(len(a.uv), -1)
     mine[pairs[:, 0]] = pairs[:, 1]
