@@ -39,8 +39,12 @@ def street(length: float, points: float, seed: int) -> tuple[PointCloud, Traject
     drive = plan_drive(scene.layout, points)
     cloud = scan(scene, drive, points)
     _, across = scene.layout.axis.locate(cloud.xyz[:, :2].astype(np.float64))
-    assert cloud.label is not None
-    return cloud, drive.trajectory(), (cloud.label == CODE["vehicle"]) & (np.abs(across) < scene.layout.lane - 0.3)
+    assert cloud.classification is not None
+    return (
+        cloud,
+        drive.trajectory(),
+        (cloud.classification == CODE["vehicle"]) & (np.abs(across) < scene.layout.lane - 0.3),
+    )
 
 
 def carved(cloud: PointCloud, path: Trajectory) -> tuple[Bools, float, dict[str, Any]]:
@@ -81,10 +85,10 @@ def dufomap(cloud: PointCloud, path: Trajectory) -> tuple[Bools, float]:
 
 def figures(cloud: PointCloud, moves: Bools, gone: Bools, seconds: float) -> dict[str, Any]:
     """Shares lost and found."""
-    assert cloud.label is not None
+    assert cloud.classification is not None
     lost = {
-        name_of(int(code)): round(float(gone[(cloud.label == code) & ~moves].mean()), 5)
-        for code in np.unique(cloud.label[~moves])
+        name_of(int(code)): round(float(gone[(cloud.classification == code) & ~moves].mean()), 5)
+        for code in np.unique(cloud.classification[~moves])
     }
     return {
         "static_lost": round(float(gone[~moves].mean()), 5),

@@ -79,8 +79,8 @@ def figures(street: Path, mesh: Mesh, cloud: PointCloud) -> dict[str, Any]:
     truth_file = read_tile(street).truth_mesh
     assert truth_file is not None
     truth = Mesh.load(truth_file).moved_to(mesh.frame)
-    assert truth.label is not None
-    places = true_edges(truth.keep(truth.label == BUILDING), cloud.xyz)
+    assert truth.classification is not None
+    places = true_edges(truth.keep(truth.classification == BUILDING), cloud.xyz)
     folds = fold_places(mesh)
     distance, _ = cKDTree(folds).query(places.xyz, workers=-1)
     off = distances(places.xyz.astype(np.float32), mesh)
@@ -207,8 +207,8 @@ def _beside(truth: Mesh, edges: F64, xyz: F32) -> F32:
     """Places of the true surface within `NEAR` of edges that were scanned, too."""
     from scan2sim.pipeline.steps.geometry import spread
 
-    assert truth.label is not None
-    points = spread(truth.keep(truth.label == BUILDING), 20 * SAMPLES)
+    assert truth.classification is not None
+    points = spread(truth.keep(truth.classification == BUILDING), 20 * SAMPLES)
     close, _ = cKDTree(edges).query(points, distance_upper_bound=NEAR, workers=-1)
     points = points[np.isfinite(close)]
     seen, _ = cKDTree(xyz).query(points, distance_upper_bound=SCANNED, workers=-1)

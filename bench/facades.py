@@ -55,7 +55,7 @@ def measured(folder: Path, seed: int, degrees: float) -> dict[str, float]:
     frame: dict[str, Any] = {"crs": tile.frame.crs, "origin": tile.frame.origin, "unit": tile.frame.unit}
     clouds = {f"cloud.{i:04d}": path for i, path in enumerate(tile.clouds)}
     whole = PointCloud.load(go(INGEST, clouds, **frame).files["cloud"])
-    assert whole.time is not None and whole.label is not None
+    assert whole.time is not None and whole.classification is not None
     ray = whole.xyz - tile.trajectory.at(whole.time)
     low = np.arctan2(ray[:, 2], np.hypot(ray[:, 0], ray[:, 1])) <= np.radians(degrees)
     whole.take(low).save(folder / "cut.npz")
@@ -74,7 +74,9 @@ def measured(folder: Path, seed: int, degrees: float) -> dict[str, float]:
     seconds = time.process_time() - begin
     made, truth = PointCloud.load(done.files["made"]), Mesh.load(tile.truth_mesh)
     off = distances(made.xyz, truth.moved_to(made.frame))
-    walls = oriented_normals(sample(whole.take(~low & (whole.label == CODE["building"])), 0.1), 16, tile.trajectory)
+    walls = oriented_normals(
+        sample(whole.take(~low & (whole.classification == CODE["building"])), 0.1), 16, tile.trajectory
+    )
     assert walls.normal is not None
     walls = walls.take(np.abs(walls.normal[:, 2]) < 0.5)
     met = np.isfinite(cKDTree(made.xyz).query(walls.xyz, distance_upper_bound=NEAR)[0]).mean()

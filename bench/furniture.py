@@ -105,9 +105,9 @@ def _street(street: Path, seed: int, length: float) -> dict[str, list[Any]]:
         return np.linalg.norm(a[:, None] - b[None], axis=2).min(axis=1, initial=np.inf)
 
     truth = Mesh.load(tile.truth_mesh).moved_to(mesh.frame)
-    assert truth.label is not None
-    plates = spread(truth.keep(truth.label == CODE["road_sign"]), 20_000)
-    shafts = spread(truth.keep(truth.label == CODE["pole"]), 20_000)
+    assert truth.classification is not None
+    plates = spread(truth.keep(truth.classification == CODE["road_sign"]), 20_000)
+    shafts = spread(truth.keep(truth.classification == CODE["pole"]), 20_000)
     ground = layout.height(*layout.axis.locate(shafts[:, :2] - shift))
     above = shafts[:, 2] - ground
     shafts = shafts[(above > 0.3) & (above < 2.0)]

@@ -81,8 +81,8 @@ def told(tile: Path, out: Path, *settings: str) -> tuple[Confusion, float]:
     shutil.rmtree(out, ignore_errors=True)
     seconds = scan2sim("segment", tile, "--out", out, "--overwrite", *(x for s in settings for x in ("--set", s)))
     read = read_tile(tile)
-    known = las.read(read.clouds[0], read.frame).label
-    found = las.read(out / "classified" / f"{read.clouds[0].stem}.laz", read.frame).label
+    known = las.read(read.clouds[0], read.frame).classification
+    found = las.read(out / "classified" / f"{read.clouds[0].stem}.laz", read.frame).classification
     assert known is not None and found is not None
     return confusion(known, found), seconds
 
@@ -171,11 +171,11 @@ def semkitti() -> Confusion:
 
     folder = DATA / "semkitti"
     xyz = np.fromfile(folder / "00_000000.bin", np.float32).reshape(-1, 4)[:, :3]
-    label = np.fromfile(folder / "00_000000.label", np.uint32) & 0xFFFF
+    classification = np.fromfile(folder / "00_000000.label", np.uint32) & 0xFFFF
     table = np.zeros(65536, np.uint8)
     for code, name in SEMKITTI.items():
         table[code] = CODE[name]
-    found = confusion(table[label], classify(PointCloud(Frame(), np.ascontiguousarray(xyz))))
+    found = confusion(table[classification], classify(PointCloud(Frame(), np.ascontiguousarray(xyz))))
     print(f"\nsemkitti, shape alone: mIoU {found.mean():.3f}\n{found.table()}", flush=True)
     return found
 

@@ -67,7 +67,7 @@ def _told(name: str, folder: Path) -> Iterator[tuple[View, dict[str, U8]]]:
     tile = read_tile(path / "tile.toml")
     standing = next((folder / "told" / "steps" / "things").rglob("cloud.npz"))  # without what moved, which is elsewhere
     cloud = sample(PointCloud.load(standing), VOXEL)
-    assert cloud.label is not None
+    assert cloud.classification is not None
     scan, labeller = Drawn(cloud, VOXEL), Labeller(load("street", None), "street")
     for view in tile.views:
         if view.photo.name not in _polygons():
@@ -77,7 +77,7 @@ def _told(name: str, folder: Path) -> Iterator[tuple[View, dict[str, U8]]]:
         alone = code_of_index()[labels_of(labeller.probabilities(rgb, view.camera), size[::-1])[0]]
         pixels = cv2.imread(str(folder / "told" / "labels" / f"{Path(view.name).stem}.png"), cv2.IMREAD_GRAYSCALE)
         nearest, _ = scan.nearest(view, size)
-        points = np.where(nearest >= 0, cloud.label[nearest], NONE).astype(np.uint8)
+        points = np.where(nearest >= 0, cloud.classification[nearest], NONE).astype(np.uint8)
         points = cv2.resize(points, size, interpolation=cv2.INTER_NEAREST)
         there = index_of_code()[points] != NONE
         yield view, {"photo": alone, "scan": np.asarray(pixels), "carried": np.where(there, points, pixels)}

@@ -37,10 +37,10 @@ def static_lost(out: Path) -> float:
     from scan2sim.pipeline.classes import CODE
     from scan2sim.pipeline.types import PointCloud
 
-    label = PointCloud.load(next((out / "steps" / "ingest").glob("*/cloud.npz"))).label
+    classification = PointCloud.load(next((out / "steps" / "ingest").glob("*/cloud.npz"))).classification
     dropped = np.load(next((out / "steps" / "carve").glob("*/dropped.npy")))
-    assert label is not None
-    still = ~np.isin(label, (CODE["vehicle"], CODE["person"]))
+    assert classification is not None
+    still = ~np.isin(classification, (CODE["vehicle"], CODE["person"]))
     return float((dropped[still] > 0).mean()) if len(dropped) else 0.0
 
 
@@ -56,8 +56,8 @@ def pole_recall(tile: Path, world: World) -> float:
         cloud = laspy.read(tile / file)
         return np.stack([cloud.x, cloud.y, cloud.z], axis=1) - world.origin, np.asarray(cloud.classification)
 
-    (truth, label), (cloud, _) = read("truth/points.laz"), read("cloud.laz")
-    pole = truth[label == CODE["pole"]]
+    (truth, classification), (cloud, _) = read("truth/points.laz"), read("cloud.laz")
+    pole = truth[classification == CODE["pole"]]
     pole = pole[cKDTree(cloud).query(pole)[0] < REACH]
     pairs = cKDTree(pole[:, :2]).sparse_distance_matrix(cKDTree(pole[:, :2]), APART)
     count, which = connected_components(pairs, directed=False)

@@ -163,9 +163,9 @@ def _thinned(tile: Tile, steps: Path) -> dict[str, Path]:
     frame = {"crs": tile.frame.crs, "origin": tile.frame.origin, "unit": tile.frame.unit}
     whole = run(INGEST, {f"cloud.{i:04d}": path for i, path in enumerate(tile.clouds)}, steps / "ingest", **frame)
     scanner = run(PATH, {}, steps / "path", **scanner_path(tile))
-    label = PointCloud.load(whole["cloud"]).label
+    classification = PointCloud.load(whole["cloud"]).classification
     parts = {"surface": whole["cloud"]}
-    if label is not None and label.max() > 1:
+    if classification is not None and classification.max() > 1:
         split = run(SPLIT, whole, steps / "split")
         joined = PointCloud.join([PointCloud.load(split[group]) for group in GROUPS])
         joined.save(steps / "surface.npz")

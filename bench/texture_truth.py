@@ -231,9 +231,9 @@ def _road_faces(mesh: Mesh, truth: PointCloud) -> Bools:
     """(F,) whether a face's nearest true sample is of the road, and near."""
     from scipy.spatial import cKDTree
 
-    assert truth.label is not None
+    assert truth.classification is not None
     distance, index = cKDTree(truth.xyz).query(mesh.corners.mean(axis=1), workers=-1)
-    return (truth.label[index] == CODE["road"]) & (distance < 2 * REACH)
+    return (truth.classification[index] == CODE["road"]) & (distance < 2 * REACH)
 
 
 def _exposures(scene: Scene) -> dict[str, float]:

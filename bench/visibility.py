@@ -218,7 +218,7 @@ class Truth:
         origins = np.broadcast_to((view.centre + self._shift).astype(np.float32), to.shape)
         hits = self.scene.cast(origins, (to / distance[:, None]).astype(np.float32), car)
         hidden = hits.distance < distance - RELIEF
-        return np.where(hidden, self.scene.surface.label[hits.face], 0).astype(np.uint8)
+        return np.where(hidden, self.scene.surface.classification[hits.face], 0).astype(np.uint8)
 
 
 def methods_of(made: Made) -> dict[str, Method]:

@@ -41,7 +41,7 @@ def person(seed: int, *, rides: bool = False) -> Part:
 def bicycle(seed: int) -> Part:
     """A bicycle: two wheels, a frame, saddle and handlebar."""
     rng = np.random.default_rng([seed, 62])
-    tyre, frame = Paint(Material.PLAIN, (0.015, 0.015, 0.015), paints.VEHICLE), _any(rng, label=paints.VEHICLE)
+    tyre, frame = Paint(Material.PLAIN, (0.015, 0.015, 0.015), paints.VEHICLE), _any(rng, classification=paints.VEHICLE)
     angle = np.linspace(0, 2 * np.pi, 21)
     circle = np.column_stack([np.cos(angle), 0 * angle, np.sin(angle)]) * 0.33
     parts = [tube(circle + (x, 0, 0.34), np.full(21, 0.022), tyre, sides=5) for x in (-0.52, 0.52)]
@@ -61,7 +61,7 @@ def cyclist(seed: int) -> Part:
     return join([bicycle(seed), person(seed, rides=True)])
 
 
-def _any(rng: np.random.Generator, material: Material = Material.PLAIN, label: int = paints.PERSON) -> Paint:
+def _any(rng: np.random.Generator, material: Material = Material.PLAIN, classification: int = paints.PERSON) -> Paint:
     """A colour, dark ones rather than light ones."""
     r, g, b = np.clip(np.exp(rng.uniform(-4, -0.4)) * np.exp(rng.normal(0, 0.5, 3)), 0.01, 0.9).tolist()
-    return Paint(material, (r, g, b), label, int(rng.integers(1 << 20)))
+    return Paint(material, (r, g, b), classification, int(rng.integers(1 << 20)))

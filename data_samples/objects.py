@@ -234,13 +234,13 @@ def _foliage(
     middle: F64,
     spread: F64,
     plan: Tree,
-    label: int,
+    classification: int,
     rng: np.random.Generator,
     leaf: float,
     per_m2: float,
 ) -> list[Part]:
     """Dark blobs, and leaves on their skin where no other blob covers it."""
-    inner = Paint(Material.FOLIAGE, tuple(0.75 * np.array(plan.colour)), label, plan.seed)
+    inner = Paint(Material.FOLIAGE, tuple(0.75 * np.array(plan.colour)), classification, plan.seed)
     parts, points, outward = [], [], []
     for i, (centre, radius) in enumerate(zip(centres, radii, strict=True)):
         parts.append(
@@ -271,7 +271,7 @@ def _foliage(
     away = away + from_middle / np.maximum(reach, 1e-6)[:, None]
     away /= np.linalg.norm(away, axis=1, keepdims=True)
     sky = np.clip(0.22 + 0.5 * reach**2, 0, 0.95) * (0.78 + 0.22 * away[:, 2])
-    parts.append(leaves(at, away, sky, rng, Paint(Material.FOLIAGE, plan.colour, label, plan.seed), leaf))
+    parts.append(leaves(at, away, sky, rng, Paint(Material.FOLIAGE, plan.colour, classification, plan.seed), leaf))
     return parts
 
 

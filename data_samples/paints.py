@@ -43,7 +43,7 @@ class Paint(NamedTuple):
 
     material: Material
     colour: RGB
-    label: int
+    classification: int
     seed: int = 0
 
 

@@ -52,7 +52,7 @@ class Rendering:
     """What a camera sees: linear light (H, W, 3) float32, LAS codes (H, W), 0 for the sky, distance (H, W) metres."""
 
     light: F32
-    label: U8
+    classification: U8
     distance: F32
 
 
@@ -158,14 +158,14 @@ def render(scene: Scene, drive: Drive, camera: Camera, T_world_cam: F64, time: f
     v, u = np.mgrid[:h, :w]
     pixels = np.stack([u, v], axis=-1).reshape(-1, 2).astype(np.float64)
     light = np.empty((h * w, 3), np.float32)
-    label, distance = np.empty(h * w, np.uint8), np.empty(h * w, np.float32)
+    classification, distance = np.empty(h * w, np.uint8), np.empty(h * w, np.float32)
     for part in _blocks(h * w):
-        light[part], label[part], distance[part] = _see(scene, drive, camera, T_world_cam, time, pixels[part])
+        light[part], classification[part], distance[part] = _see(scene, drive, camera, T_world_cam, time, pixels[part])
     rough = np.flatnonzero(_edges(light.reshape(h, w, 3)))
     for part in _blocks(len(rough)):
         at = rough[part]
         light[at] = np.mean([_see(scene, drive, camera, T_world_cam, time, pixels[at] + d)[0] for d in MORE], axis=0)
-    return Rendering(light.reshape(h, w, 3), label.reshape(h, w), distance.reshape(h, w))
+    return Rendering(light.reshape(h, w, 3), classification.reshape(h, w), distance.reshape(h, w))
 
 
 def _blocks(n: int, size: int = 1 << 20) -> Iterator[slice]:
@@ -188,7 +188,7 @@ def _edges(light: F32) -> npt.NDArray[np.bool_]:
 def _see(
     scene: Scene, drive: Drive, camera: Camera, T_world_cam: F64, time: float | None, pixels: F64
 ) -> tuple[F32, U8, F32]:
-    """Linear light (N, 3), label (N,) and distance (N,) through pixels (N, 2)."""
+    """Linear light (N, 3), classification (N,) and distance (N,) through pixels (N, 2)."""
     from scan2sim.data_samples import sky
 
     rays = (directions(camera, pixels) @ T_world_cam[:3, :3].T).astype(np.float32)
@@ -202,8 +202,8 @@ def _see(
     axis = np.array([layout.axis.heading, layout.axis.curvature, layout.lane])
     ends = layout.height(np.array([0.0, layout.axis.length]), 0.0)
     light[out] = sky.beyond(origins[out], rays[out], layout.sun, layout.cloudiness, axis, ends, layout.seed % 1000)
-    label = np.where(hits.hit, scene.surface.label[hits.face], 0).astype(np.uint8)
-    return light, label, hits.distance
+    classification = np.where(hits.hit, scene.surface.classification[hits.face], 0).astype(np.uint8)
+    return light, classification, hits.distance
 
 
 def develop(rendering: Rendering, ev: float, effects: Effects, rng: np.random.Generator) -> U8:

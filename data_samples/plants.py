@@ -32,7 +32,7 @@ def clump(
         unit,
         vertices=(unit.vertices * (radius, radius, radius * flat) + np.asarray(centre)).astype(np.float32),
         colour=np.tile(np.array(paint.colour, np.float32), (len(unit.faces), 1)),
-        label=np.full(len(unit.faces), paint.label, np.uint8),
+        classification=np.full(len(unit.faces), paint.classification, np.uint8),
         seed=np.full(len(unit.faces), paint.seed, np.int32),
     )
 

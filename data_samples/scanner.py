@@ -172,13 +172,13 @@ def _returns(
                 FRAME,
                 (o + d * ranged[:, None]).astype(np.float32),
                 rgb=np.clip(rgb + 0.5, 0, 255).astype(np.uint8),
-                label=scene.surface.label[face],
+                classification=scene.surface.classification[face],
                 time=t,
                 intensity=_intensity(scene, face, d, distance),
             )
         )
         report(min(1.0, (i + 1) * BLOCK / total), "scanning")
-    names = ("xyz", "rgb", "label", "time", "intensity")
+    names = ("xyz", "rgb", "classification", "time", "intensity")
     return PointCloud(FRAME, **{name: np.concatenate([getattr(p, name) for p in parts]) for name in names})
 
 

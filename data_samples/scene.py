@@ -72,7 +72,9 @@ def _upright(layout: Layout, mesh: Part, x: float, side: int, xy: F64, heading: 
 
 
 def _slice(mesh: Part, keep: npt.NDArray[np.bool_]) -> Part:
-    per_face = {name: getattr(mesh, name)[keep] for name in ("faces", "material", "label", "colour", "seed", "size")}
+    per_face = {
+        name: getattr(mesh, name)[keep] for name in ("faces", "material", "classification", "colour", "seed", "size")
+    }
     return replace(mesh, **per_face)
 
 
@@ -113,7 +115,7 @@ def _ground(layout: Layout) -> list[Part]:
         face = np.stack([foot, top] if side == 1 else [top, foot])
         uv = np.stack([np.column_stack([s, v + 0 * s]) for v in ((0, step) if side == 1 else (step, 0))])
         parts.append(sheet(face[::-1], uv[::-1], stone))
-    return [_slice(p, ~_inside_houses(layout, p)) if p.label[0] == paints.TERRAIN else p for p in parts]
+    return [_slice(p, ~_inside_houses(layout, p)) if p.classification[0] == paints.TERRAIN else p for p in parts]
 
 
 def _inside_houses(layout: Layout, mesh: Part) -> npt.NDArray[np.bool_]:
@@ -174,7 +176,7 @@ class Scene:
     def truth_mesh(self) -> Mesh:
         """The static street, labelled; vehicles are left out."""
         part = self.surface
-        mesh = Mesh(FRAME, part.vertices, part.faces, label=part.label)
+        mesh = Mesh(FRAME, part.vertices, part.faces, classification=part.classification)
         return mesh.keep(np.arange(len(part.faces)) < self.static)
 
     def car_at(self, time: npt.ArrayLike, centre: Any = 0.0, way: Any = 1.0) -> tuple[F64, F64, npt.NDArray[np.bool_]]:

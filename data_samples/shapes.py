@@ -25,7 +25,7 @@ class Part:
         uv: (V, 2) float32, as the material wants it.
         sky: (V,) float32, openness to the sky in [0, 1]; NaN where it is still to be traced.
         faces: (F, 3) int32, counter-clockwise seen from outside.
-        material, label: (F,) uint8.
+        material, classification: (F,) uint8.
         colour: (F, 3) float32 linear RGB.
         seed: (F,) int32.
         size: (F, 2) float32, metres; extents of the uv of openings.
@@ -37,7 +37,7 @@ class Part:
     sky: F32
     faces: I32
     material: U8
-    label: U8
+    classification: U8
     colour: F32
     seed: I32
     size: F32
@@ -84,7 +84,7 @@ def part(
         sky=np.full(len(xyz), np.nan, np.float32) if sky is None else np.asarray(sky, np.float32),
         faces=tri,
         material=np.full(n, paint.material, np.uint8),
-        label=np.full(n, paint.label, np.uint8),
+        classification=np.full(n, paint.classification, np.uint8),
         colour=np.tile(np.array(paint.colour, np.float32), (n, 1)),
         seed=np.full(n, paint.seed, np.int32) if seeds is None else np.asarray(seeds, np.int32),
         size=np.tile(np.array(size, np.float32), (n, 1)),
@@ -96,7 +96,7 @@ def join(parts: Sequence[Part]) -> Part:
     starts = np.cumsum([0] + [len(p.vertices) for p in parts])
     columns = {
         name: np.concatenate([getattr(p, name) for p in parts])
-        for name in ("vertices", "normals", "uv", "sky", "material", "label", "colour", "seed", "size")
+        for name in ("vertices", "normals", "uv", "sky", "material", "classification", "colour", "seed", "size")
     }
     return Part(faces=np.concatenate([p.faces + np.int32(s) for p, s in zip(parts, starts, strict=False)]), **columns)
 

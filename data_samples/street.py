@@ -117,7 +117,7 @@ def _take_photos(
     for i, shot in enumerate(shots):
         report(i / len(shots), f"photo {i + 1} of {len(shots)}")
         seen = render(scene, drive, kinds[shot.camera], shot.T_world_cam, shot.time)
-        if np.isin(seen.label, (0, CODE["vehicle"])).all():
+        if np.isin(seen.classification, (0, CODE["vehicle"])).all():
             continue
         taken.append(shot)
         image = develop(seen, shot.ev, effects, np.random.default_rng([scene.layout.seed, 5, i]))
@@ -126,7 +126,7 @@ def _take_photos(
         (out / file).write_bytes(jpeg.tobytes())
         if labels:
             (out / "truth" / "labels").mkdir(exist_ok=True)
-            _, png = cv2.imencode(".png", seen.label)
+            _, png = cv2.imencode(".png", seen.classification)
             (out / "truth" / "labels" / f"{shot.name}.png").write_bytes(png.tobytes())
         entries.append(
             {
@@ -146,10 +146,10 @@ def _write_truth(folder: Path, scene: Scene, density: float, scale: float) -> No
     from scan2sim.pipeline.io.clouds import las
 
     mesh = scene.truth_mesh()
-    assert mesh.label is not None
+    assert mesh.classification is not None
     frame = np.array([mesh.frame.crs, repr(mesh.frame.origin), repr(mesh.frame.unit)])
     with open(folder / "mesh.npz", "wb") as file:  # as Mesh.save does, but compressed
-        np.savez_compressed(file, frame=frame, vertices=mesh.vertices, faces=mesh.faces, label=mesh.label)
+        np.savez_compressed(file, frame=frame, vertices=mesh.vertices, faces=mesh.faces, label=mesh.classification)
     las.write(folder / "points.laz", sample_truth(scene, mesh, density), scale)
 
 
@@ -172,7 +172,7 @@ def sample_truth(scene: Scene, mesh: Mesh, density: float) -> PointCloud:
         at = slice(i, i + (1 << 20))
         still = np.zeros(len(face[at]), np.float32)
         colour[at] = srgb(scene.lit(xyz[at], face[at], bary[at], still, still + FINE))
-    return PointCloud(FRAME, xyz.astype(np.float32), rgb=colour, label=scene.surface.label[face])
+    return PointCloud(FRAME, xyz.astype(np.float32), rgb=colour, classification=scene.surface.classification[face])
 
 
 def _buried(layout: Layout, xyz: F64) -> np.ndarray:

@@ -153,7 +153,7 @@ def in_weather(seen: Rendering, rng: np.random.Generator) -> Rendering:
     if rng.random() > 0.3:
         return seen
     weather = Weather(float(np.exp(rng.uniform(np.log(25), np.log(250)))), (0.55, 0.58, 0.62))
-    distance = np.where(seen.label == 0, 150.0, np.where(np.isfinite(seen.distance), seen.distance, 150.0))
+    distance = np.where(seen.classification == 0, 150.0, np.where(np.isfinite(seen.distance), seen.distance, 150.0))
     clear = np.exp(-distance / weather.reach)[..., None]
     light = seen.light * clear + np.array(weather.colour) * rng.uniform(0.5, 1.1) * (1 - clear)
     return replace(seen, light=light.astype(np.float32))
@@ -196,7 +196,7 @@ def _blocked(scene: Scene, camera: Camera, pose: F64) -> bool:
 def _ground(scene: Scene) -> Level:
     """The level of the street's ground."""
     part = scene.surface
-    on = np.isin(part.label, (paints.ROAD, paints.SIDEWALK, paints.TERRAIN))
+    on = np.isin(part.classification, (paints.ROAD, paints.SIDEWALK, paints.TERRAIN))
     return level(part.vertices[np.unique(part.faces[on])])
 
 
@@ -222,7 +222,7 @@ def told(seen: Rendering, camera: Camera, pose: F64) -> U8:
     """Labels (H, W) to learn from: 255, not to be learnt, where a ray leaves the street below the hills."""
     v, u = np.mgrid[: camera.height, : camera.width]
     up = directions(camera, np.stack([u, v], axis=-1)) @ pose[2, :3]
-    return np.where((seen.label == 0) & (up < HILLS), 255, seen.label).astype(np.uint8)
+    return np.where((seen.classification == 0) & (up < HILLS), 255, seen.classification).astype(np.uint8)
 
 
 def write(out: Path, images: int, seed: int = FIRST_SEED, processes: int | None = None) -> Iterator[float]:

@@ -220,9 +220,9 @@ def _assign(corridor: Corridor, places: F64, options: CutParams, spool: Spool, r
         for part in clouds.chunks(cloud, tile.frame, CHUNK):
             report(READING * done / total, f"reading {cloud.name}")
             done += len(part)
-            if part.label is not None:
-                count += np.bincount(part.label, minlength=256)
-                part = replace(part, label=table[part.label])
+            if part.classification is not None:
+                count += np.bincount(part.classification, minlength=256)
+                part = replace(part, classification=table[part.classification])
             rows = spool.rows(part)
             xy = spool.world(rows)[:, :2]
             if path is not None:

@@ -115,8 +115,8 @@ def find(cloud: PointCloud, columns: Columns, height: F32, path: Trajectory) -> 
         path: the scanner's.
     """
     xyz = cloud.xyz
-    assert cloud.label is not None
-    leafy = group_of()[cloud.label] == 2
+    assert cloud.classification is not None
+    leafy = group_of()[cloud.classification] == 2
     things = []
     for stem in stems(columns, height, LEAST):
         n = columns.near(stem.middle, CROWN)

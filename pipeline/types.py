@@ -212,6 +212,10 @@ class GpsTrack:
         return np.linalg.norm(self.at(end, max_gap) - self.at(start, max_gap), axis=-1)
 
 
+STORED = {"classification": "label"}
+"""What attributes are called in a .npz, where that differs: files that were written before keep their meaning."""
+
+
 def _save(value: Any, path: Path) -> None:
     """Write a dataclass of arrays and a frame as an uncompressed .npz."""
     arrays: dict[str, Any] = {}
@@ -220,14 +224,15 @@ def _save(value: Any, path: Path) -> None:
         if isinstance(part, Frame):
             arrays["frame"] = np.array([part.crs, repr(part.origin), repr(part.unit)])
         elif part is not None:
-            arrays[f.name] = part
+            arrays[STORED.get(f.name, f.name)] = part
     with open(path, "wb") as file:
         np.savez(file, **arrays)
 
 
 def _load(cls: Any, path: Path) -> Any:
     with np.load(path) as data:
-        arrays = {name: data[name] for name in data.files}
+        attribute = {stored: name for name, stored in STORED.items()}
+        arrays = {attribute.get(name, name): data[name] for name in data.files}
     if "frame" in arrays:
         crs, origin, unit = arrays.pop("frame").tolist()
         x, y, z = (float(part) for part in origin.strip("()").split(","))
@@ -248,7 +253,7 @@ class PointCloud:
         xyz: (N, 3) float32, local metres.
         rgb: (N, 3) uint8; `UNCOLOURED` where it isn't known.
         normal: (N, 3) float32, unit.
-        label: (N,) uint8, LAS class codes (`pipeline.classes`).
+        classification: (N,) uint8, LAS class codes (`pipeline.classes`).
         time: (N,) float64, GPS time in seconds.
         intensity: (N,) uint16.
     """
@@ -257,7 +262,7 @@ class PointCloud:
     xyz: F32
     rgb: U8 | None = None
     normal: F32 | None = None
-    label: U8 | None = None
+    classification: U8 | None = None
     time: F64 | None = None
     intensity: npt.NDArray[np.uint16] | None = None
 
@@ -300,7 +305,7 @@ class PointCloud:
             column("xyz"),
             column("rgb", (UNCOLOURED, np.uint8)),
             column("normal"),
-            column("label", (1, np.uint8)),
+            column("classification", (1, np.uint8)),
             column("time"),
             column("intensity"),
         )
@@ -326,7 +331,7 @@ class Mesh:
         density: (V,) float32, Poisson's octree depth of the samples near the vertex, or None.
         uv: (F, 3, 2) float32, per corner in [0, 1], origin at the lower left (as in OBJ), or None.
         page: (F,) int16, index of the face's texture page, or None.
-        label: (F,) uint8, LAS class codes, or None.
+        classification: (F,) uint8, LAS class codes, or None.
     """
 
     frame: Frame
@@ -335,7 +340,7 @@ class Mesh:
     density: F32 | None = None
     uv: F32 | None = None
     page: npt.NDArray[np.int16] | None = None
-    label: U8 | None = None
+    classification: U8 | None = None
 
     def __len__(self) -> int:
         return len(self.faces)
@@ -379,7 +384,7 @@ class Mesh:
             density=None if self.density is None else self.density[used],
             uv=None if self.uv is None else self.uv[mask],
             page=None if self.page is None else self.page[mask],
-            label=None if self.label is None else self.label[mask],
+            classification=None if self.classification is None else self.classification[mask],
         )
 
     def save(self, path: Path) -> None:
@@ -406,7 +411,7 @@ class Tile:
         classes: codes of the clouds and what they are here, where the user says so (`pipeline.classes`).
         cell: what of the survey that it was cut from is the tile's own, or None: all of it.
         footprints: polygons of buildings (GeoJSON, GeoPackage), or None.
-        truth_mesh: ground-truth surface (.npz `Mesh` with `label`), for generated tiles, or None.
+        truth_mesh: ground-truth surface (.npz `Mesh` with its classes), for generated tiles, or None.
         truth_points: ground-truth coloured surface samples (LAZ), for generated tiles, or None.
     """
 

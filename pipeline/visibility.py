@@ -164,7 +164,7 @@ def _with(still: Scene, moving: PointCloud | None, radius: float) -> Scene:
 
 def _of_class(cloud: PointCloud, codes: tuple[int, ...]) -> npt.NDArray[np.bool_]:
     """(N,) which points are of these classes; none where the classes aren't known."""
-    return np.zeros(len(cloud), bool) if cloud.label is None else np.isin(cloud.label, codes)
+    return np.zeros(len(cloud), bool) if cloud.classification is None else np.isin(cloud.classification, codes)
 
 
 def _borne_out(meshes: Iterable[Mesh], cloud: PointCloud) -> list[Mesh]:
@@ -182,7 +182,7 @@ def _borne_out(meshes: Iterable[Mesh], cloud: PointCloud) -> list[Mesh]:
     for mesh in meshes:
         distance, _ = tree.query(mesh.vertices, distance_upper_bound=reach, workers=-1)
         near = np.isfinite(distance)[mesh.faces].all(axis=1)
-        kept.append(mesh.keep(near if mesh.label is None else near | (mesh.label > 0)))
+        kept.append(mesh.keep(near if mesh.classification is None else near | (mesh.classification > 0)))
     return kept
 
 

@@ -22,11 +22,11 @@ WITHOUT = 0.25
 """Share of the crops without any channels: photos that come alone."""
 
 
-def seen_anew(rgb: U8, label: U8, channels: U8, crop: tuple[int, int], rng: Rng) -> tuple[F32, Ints]:
+def augmented(rgb: U8, classes: U8, channels: U8, crop: tuple[int, int], rng: Rng) -> tuple[F32, Ints]:
     """A part of a photo as another camera might have taken it on another day: (h, w, 7) in [0, 1], (h, w).
 
     Args:
-        rgb, label, channels: (H, W, 3), (H, W) indices of classes, (H / 4, W / 4, 4) as `pipeline.channels`.
+        rgb, classes, channels: (H, W, 3), (H, W) indices of classes, (H / 4, W / 4, 4) as `pipeline.channels`.
         crop: (h, w).
     """
     import cv2
@@ -38,20 +38,20 @@ def seen_anew(rgb: U8, label: U8, channels: U8, crop: tuple[int, int], rng: Rng)
     small = np.s_[top : top + need[0], left : left + need[1]]
     full = tuple(slice(FRACTION * s.start, FRACTION * s.stop) for s in small)
     image = cv2.resize(rgb[full], (w, h), interpolation=cv2.INTER_LINEAR if scale > 1 else cv2.INTER_AREA)
-    truth = cv2.resize(label[full], (w, h), interpolation=cv2.INTER_NEAREST)
-    coarse = np.ascontiguousarray(label[full][FRACTION // 2 :: FRACTION, FRACTION // 2 :: FRACTION])
-    told = cv2.resize(worn(channels[small], coarse, rng), (w, h), interpolation=cv2.INTER_NEAREST)
+    truth = cv2.resize(classes[full], (w, h), interpolation=cv2.INTER_NEAREST)
+    coarse = np.ascontiguousarray(classes[full][FRACTION // 2 :: FRACTION, FRACTION // 2 :: FRACTION])
+    scan = cv2.resize(degraded(channels[small], coarse, rng), (w, h), interpolation=cv2.INTER_NEAREST)
     if rng.random() < 0.5:
-        image, truth, told = image[:, ::-1], truth[:, ::-1], told[:, ::-1]
-    seen = np.concatenate([looks(image, truth, rng), told.astype(np.float32) / 255], axis=2)
+        image, truth, scan = image[:, ::-1], truth[:, ::-1], scan[:, ::-1]
+    seen = np.concatenate([photometric(image, truth, rng), scan.astype(np.float32) / 255], axis=2)
     return np.ascontiguousarray(seen), np.ascontiguousarray(truth, np.int64)
 
 
-def worn(channels: U8, label: U8, rng: Rng) -> U8:
+def degraded(channels: U8, classes: U8, rng: Rng) -> U8:
     """What a real scan would have of (h, w, 4): less high, less far, with holes, noise and without what moved."""
     if rng.random() < WITHOUT:
         return np.zeros_like(channels)
-    shape = label.shape
+    shape = classes.shape
     down, right = rng.integers(-1, 2, 2)  # poses are a little off
     x = np.pad(channels.astype(np.float32), ((1, 1), (1, 1), (0, 0)))[1 - down :, 1 - right :][: shape[0], : shape[1]]
     there = x[..., 3] > 0
@@ -63,7 +63,7 @@ def worn(channels: U8, label: U8, rng: Rng) -> U8:
     there &= _blotches(shape, 10, rng) > rng.uniform(-3.0, -1.2)
     for name, share in (("person", 0.7), ("vehicle", 0.15)):
         if rng.random() < share:
-            there &= label != CLASSES.index(name)
+            there &= classes != CLASSES.index(name)
     x[..., 0] += rng.normal(0, rng.uniform(0, 4), shape) + rng.uniform(0, 5) * _blotches(shape, 40, rng)
     x[..., 1] += rng.normal(0, 1, shape)
     x[..., 2] = np.abs(x[..., 2] + rng.normal(0, rng.uniform(0, 50), shape))
@@ -80,7 +80,7 @@ def _blotches(shape: tuple[int, ...], size: float, rng: Rng) -> F32:
     return np.asarray(whole[top : top + shape[0], left : left + shape[1]], np.float32)
 
 
-def looks(image: U8, truth: U8, rng: Rng) -> F32:
+def photometric(image: U8, truth: U8, rng: Rng) -> F32:
     """Other paint, light and another camera: (h, w, 3) in [0, 1]."""
     x: F32 = np.power(image.astype(np.float32) / 255, np.float32(2.2))
     if rng.random() < 0.4:

@@ -81,8 +81,8 @@ def classify(cloud: PointCloud, report: Report = silent, *, voxel: float = 0.2) 
         return np.full(len(xyz), CODE["unclassified"], np.uint8)
     report(0.0, "ground")
     height, ground = split_ground(xyz)
-    label = np.full(len(xyz), CODE["unclassified"], np.uint8)
-    label[ground] = CODE["terrain"]
+    classification = np.full(len(xyz), CODE["unclassified"], np.uint8)
+    classification[ground] = CODE["terrain"]
     above = np.flatnonzero(~ground & (height > 0))
     del ground
     if len(above) >= FEW:
@@ -91,9 +91,9 @@ def classify(cloud: PointCloud, report: Report = silent, *, voxel: float = 0.2) 
         count = np.bincount(of)
         tall = (np.bincount(of, height[above]) / count).astype(np.float32)
         if len(centre) >= FEW:
-            label[above] = _above_ground(centre, tall, count.astype(np.float64), report)[of]
+            classification[above] = _above_ground(centre, tall, count.astype(np.float64), report)[of]
     report(1.0, "done")
-    return label
+    return classification
 
 
 def split_ground(xyz: F32) -> tuple[F32, Bools]:
@@ -168,21 +168,21 @@ def _above_ground(xyz: F32, height: F32, weight: F64, report: Report) -> U8:
     report(0.2, "neighbourhoods")
     shape = describe(xyz, weight, NEIGHBOURS)
     report(0.6, "surfaces")
-    label = np.zeros(len(xyz), np.uint8)
-    _buildings(label, xyz, height, shape)
+    classification = np.zeros(len(xyz), np.uint8)
+    _buildings(classification, xyz, height, shape)
     report(0.8, "things")
     rough = _mean(shape.variation, shape)
-    _poles(label, xyz, shape)
-    _vehicles(label, xyz, height, shape, rough)
-    rest = label == 0
-    label[rest & (rough > ROUGH)] = CODE["high_vegetation"]
+    _poles(classification, xyz, shape)
+    _vehicles(classification, xyz, height, shape, rough)
+    rest = classification == 0
+    classification[rest & (rough > ROUGH)] = CODE["high_vegetation"]
     report(0.9, "votes")
-    _vote(label, shape)
-    plant = label == CODE["high_vegetation"]
-    label[plant & (height < 2.0)] = CODE["mid_vegetation"]
-    label[plant & (height < 0.5)] = CODE["low_vegetation"]
-    label[label == 0] = CODE["unclassified"]
-    return label
+    _vote(classification, shape)
+    plant = classification == CODE["high_vegetation"]
+    classification[plant & (height < 2.0)] = CODE["mid_vegetation"]
+    classification[plant & (height < 0.5)] = CODE["low_vegetation"]
+    classification[classification == 0] = CODE["unclassified"]
+    return classification
 
 
 def describe(xyz: F32, weight: F64, k: int) -> Shape:
@@ -279,7 +279,7 @@ def _edges(shape: Shape, member: Bools, k: int, reach: float) -> tuple[Ints, Int
     return rows[np.nonzero(close)[0]], near[close].astype(np.int64)
 
 
-def _buildings(label: U8, xyz: F32, height: F32, shape: Shape) -> None:
+def _buildings(classification: U8, xyz: F32, height: F32, shape: Shape) -> None:
     """Large smooth surfaces: high ones are buildings, long low upright ones walls."""
     smooth = shape.variation < SMOOTH
     a, b = _edges(shape, smooth, 8, 0.3)
@@ -293,23 +293,23 @@ def _buildings(label: U8, xyz: F32, height: F32, shape: Shape) -> None:
     even = (parts.count >= FEW) & (parts.mean(shape.variation) < EVEN)
     building = even & (area > BUILDING_AREA) & (top > BUILDING_HEIGHT)
     wall = even & (tilt < 0.3) & (length > WALL_LENGTH) & (top > WALL_HEIGHT) & ~building
-    _paint(label, parts, building, CODE["building"])
-    _paint(label, parts, wall, CODE["wall_or_fence"])
+    _paint(classification, parts, building, CODE["building"])
+    _paint(classification, parts, wall, CODE["wall_or_fence"])
     # what hangs on a building and on little else: edges, balconies, sparsely seen walls
-    hangs = (label[shape.near] == CODE["building"]).any(axis=1)
-    parts = _parts(xyz, label == 0, *_edges(shape, label == 0, 8, 0.3))
-    _paint(label, parts, parts.mean(hangs) > 0.5, CODE["building"])
+    hangs = (classification[shape.near] == CODE["building"]).any(axis=1)
+    parts = _parts(xyz, classification == 0, *_edges(shape, classification == 0, 8, 0.3))
+    _paint(classification, parts, parts.mean(hangs) > 0.5, CODE["building"])
 
 
-def _poles(label: U8, xyz: F32, shape: Shape) -> None:
+def _poles(classification: U8, xyz: F32, shape: Shape) -> None:
     """Thin upright lines, trunks of trees among them."""
-    line = (label == 0) & (shape.linearity > 0.6) & (shape.upright > 0.9)
+    line = (classification == 0) & (shape.linearity > 0.6) & (shape.upright > 0.9)
     parts = _parts(xyz, line, *_edges(shape, line, NEIGHBOURS, 0.4))
     thin = (np.hypot(parts.size[:, 0], parts.size[:, 1]) < POLE_WIDTH) & (parts.size[:, 2] > POLE_HEIGHT)
-    _paint(label, parts, thin, CODE["pole"])
+    _paint(classification, parts, thin, CODE["pole"])
 
 
-def _vehicles(label: U8, xyz: F32, height: F32, shape: Shape, rough: F32) -> None:
+def _vehicles(classification: U8, xyz: F32, height: F32, shape: Shape, rough: F32) -> None:
     """Compact things of a car's size, smoother than bushes.
 
     Parked cars touch what is beside them near the ground and crowns overhang them, so they are told
@@ -317,11 +317,11 @@ def _vehicles(label: U8, xyz: F32, height: F32, shape: Shape, rough: F32) -> Non
     """
     from scipy.spatial import cKDTree
 
-    free = (label == 0) & ~((shape.linearity > 0.5) & (shape.upright > 0.9))
+    free = (classification == 0) & ~((shape.linearity > 0.5) & (shape.upright > 0.9))
     band = np.flatnonzero(free & (height > DOORS[0]) & (height < DOORS[1]))
     if len(band) == 0:
         return
-    inside = np.zeros(len(label), bool)
+    inside = np.zeros(len(classification), bool)
     inside[band] = True
     of = _parts(xyz, inside, *_edges(shape, inside, NEIGHBOURS, 0.3)).of
     rest = np.flatnonzero(free & ~inside & (height < VEHICLE_HEIGHT[1]))
@@ -333,7 +333,7 @@ def _vehicles(label: U8, xyz: F32, height: F32, shape: Shape, rough: F32) -> Non
     top = _top(parts, height)
     car = (length > VEHICLE_LENGTH[0]) & (length < VEHICLE_LENGTH[1]) & (top > VEHICLE_HEIGHT[0])
     car &= (width > VEHICLE_WIDTH[0]) & (width < VEHICLE_WIDTH[1]) & (parts.mean(rough) < VEHICLE_VARIATION)
-    _paint(label, parts, car, CODE["vehicle"])
+    _paint(classification, parts, car, CODE["vehicle"])
 
 
 def _top(parts: Parts, height: F32) -> F64:
@@ -358,19 +358,19 @@ def _footprints(parts: Parts, xyz: F32) -> tuple[F64, F64]:
     return length, width
 
 
-def _paint(label: U8, parts: Parts, chosen: Bools, code: int) -> None:
+def _paint(classification: U8, parts: Parts, chosen: Bools, code: int) -> None:
     inside = np.flatnonzero(parts.of >= 0)
-    label[inside[chosen[parts.of[inside]]]] = code
+    classification[inside[chosen[parts.of[inside]]]] = code
 
 
-def _vote(label: U8, shape: Shape) -> None:
+def _vote(classification: U8, shape: Shape) -> None:
     """Points take the class of most of their neighbours; poles and vehicles stay as they are."""
-    fixed = np.isin(label, (CODE["pole"], CODE["vehicle"]))
-    codes = np.unique(label)
+    fixed = np.isin(classification, (CODE["pole"], CODE["vehicle"]))
+    codes = np.unique(classification)
     for _ in range(VOTES):
-        best, most = label.copy(), np.zeros(len(label), np.int16)
+        best, most = classification.copy(), np.zeros(len(classification), np.int16)
         for code in codes:
-            votes = (label == code)[shape.near].sum(axis=1, dtype=np.int16) - (1 if code == 0 else 0)
+            votes = (classification == code)[shape.near].sum(axis=1, dtype=np.int16) - (1 if code == 0 else 0)
             wins = votes > most
             best[wins], most[wins] = code, votes[wins]
-        label[~fixed] = best[~fixed]
+        classification[~fixed] = best[~fixed]

@@ -38,9 +38,9 @@ def without(mesh: Mesh, plates: Sequence[Plate]) -> Mesh:
 
 def pieces(mesh: Mesh, code: int) -> list[npt.NDArray[np.int64]]:
     """Faces of a class in connected pieces."""
-    if mesh.label is None:
+    if mesh.classification is None:
         return []
-    faces = np.flatnonzero(mesh.label == code)
+    faces = np.flatnonzero(mesh.classification == code)
     piece = _connected(mesh, faces)
     return [faces[piece == k] for k in np.unique(piece)]
 
@@ -75,7 +75,7 @@ def cleared(mesh: Mesh, plates: Sequence[Plate]) -> Mesh:
 
     What lies before the plate goes, and so do scraps beside it that hang on nothing else.
     """
-    free = np.ones(len(mesh), bool) if mesh.label is None else mesh.label == 0
+    free = np.ones(len(mesh), bool) if mesh.classification is None else mesh.classification == 0
     gone = np.zeros(len(mesh), bool)
     corners = mesh.corners
     for plate in plates:
@@ -91,7 +91,7 @@ def cleared(mesh: Mesh, plates: Sequence[Plate]) -> Mesh:
 
 def _scraps(mesh: Mesh, plates: Sequence[Plate]) -> Bools:
     """(F,) connected pieces without a class of which all lies within reach of a plate."""
-    free = np.arange(len(mesh)) if mesh.label is None else np.flatnonzero(mesh.label == 0)
+    free = np.arange(len(mesh)) if mesh.classification is None else np.flatnonzero(mesh.classification == 0)
     piece, out = _connected(mesh, free), np.zeros(len(mesh), bool)
     for plate in plates:
         reach = np.hypot(plate.width, plate.height) / 2 + BEFORE
@@ -103,6 +103,6 @@ def _scraps(mesh: Mesh, plates: Sequence[Plate]) -> Bools:
 def with_plates(mesh: Mesh, plates: Sequence[Plate]) -> Mesh:
     """The mesh with the sheets of plates."""
     vertices, faces = primitives.join([(mesh.vertices.astype(np.float64), mesh.faces), *map(sheet, plates)])
-    label = np.full(len(faces), CODE["road_sign"], np.uint8)
-    label[: len(mesh)] = 0 if mesh.label is None else mesh.label
-    return Mesh(mesh.frame, vertices.astype(np.float32), faces, label=label)
+    classification = np.full(len(faces), CODE["road_sign"], np.uint8)
+    classification[: len(mesh)] = 0 if mesh.classification is None else mesh.classification
+    return Mesh(mesh.frame, vertices.astype(np.float32), faces, classification=classification)

@@ -153,7 +153,7 @@ class Scan:
         xyz: local metres.
         height: metres above ground.
         ground: which are of the ground.
-        label: LAS codes told.
+        classification: LAS codes told.
         odds: logarithm of the odds that photos, or shape alone, give to vehicle.
         weight: what that counts.
         moved: near points that moved.
@@ -164,7 +164,7 @@ class Scan:
     xyz: F32
     height: F32
     ground: Bools
-    label: U8
+    classification: U8
     odds: F32
     weight: F32
     moved: Bools
@@ -176,7 +176,7 @@ def vehicles(scan: Scan) -> list[Thing]:
     """All vehicles, the surest first; no point is of two."""
     tree = cKDTree(scan.xyz[:, :2])
     above = ~scan.ground & (scan.height > FEET) & (scan.height < TALLEST)
-    told = above & (scan.label == CODE["vehicle"])
+    told = above & (scan.classification == CODE["vehicle"])
     offered = [
         thing
         for member in (told & _between(scan.height, BAND), above & _between(scan.height, DOORS))
@@ -199,7 +199,7 @@ def no_vehicles(scan: Scan, found: Sequence[Thing]) -> Ints:
 
     What is told so below the vehicles that were `found` is theirs: wheels and sills.
     """
-    told = scan.label == CODE["vehicle"]
+    told = scan.classification == CODE["vehicle"]
     if found:
         tree = cKDTree(scan.xyz[:, :2])
         for thing in found:
@@ -219,7 +219,7 @@ def remains(scan: Scan) -> Ints:
     These are clusters above the ground, no wider than a lane, that touch what was carved, and were there for a moment
     only. A garden that is seen through a gate is there for a moment, too, but wider.
     """
-    above = ~scan.ground & _between(scan.height, (FEET, TALLEST)) & ~np.isin(scan.label, FIXED)
+    above = ~scan.ground & _between(scan.height, (FEET, TALLEST)) & ~np.isin(scan.classification, FIXED)
     near = [
         c
         for c in clusters(scan.xyz, above & scan.brief)
@@ -236,7 +236,7 @@ def people(scan: Scan) -> list[Thing]:
 
 def no_people(scan: Scan) -> Ints:
     """Indices of points that are told to be persons', in things of their size that most votes take for another."""
-    told = np.flatnonzero(scan.label == CODE["person"])
+    told = np.flatnonzero(scan.classification == CODE["person"])
     wrong = np.zeros(len(told), bool)
     for thing in _of_a_persons_size(scan):
         if not _is_person(scan, thing):
@@ -245,14 +245,14 @@ def no_people(scan: Scan) -> Ints:
 
 
 def _is_person(scan: Scan, thing: Thing) -> bool:
-    return thing.moved or float((scan.label[thing.index] == CODE["person"]).mean()) > MOSTLY
+    return thing.moved or float((scan.classification[thing.index] == CODE["person"]).mean()) > MOSTLY
 
 
 def _of_a_persons_size(scan: Scan) -> list[Thing]:
     """All of that size of which some points are told to be a person's."""
     tree = cKDTree(scan.xyz[:, :2])
     found = []
-    for cluster in clusters(scan.xyz, ~scan.ground & (scan.label == CODE["person"]) & (scan.height < 2.3)):
+    for cluster in clusters(scan.xyz, ~scan.ground & (scan.classification == CODE["person"]) & (scan.height < 2.3)):
         box = rectangle(scan.xyz[cluster, :2])
         top = float(scan.height[cluster].max())
         if not (box.length < 1.5 and 0.9 < top < 2.2):
@@ -288,7 +288,7 @@ def _vehicle(scan: Scan, tree: cKDTree, above: Bools, cluster: Ints) -> Thing | 
     odds += PRIOR + WITNESSES * word + _freedom(scan, near, box, top)
     if odds <= 0:
         return None
-    told = near[(scan.label[near] == CODE["vehicle"]) & box.inside(scan.xyz[near, :2], MIRROR)]
+    told = near[(scan.classification[near] == CODE["vehicle"]) & box.inside(scan.xyz[near, :2], MIRROR)]
     own = np.union1d(inside, told[scan.height[told] < top + GAP])
     moved = float(scan.moved[own].mean()) > CARVED
     centre = np.array([box.x, box.y, _floor(scan, own)])

@@ -58,7 +58,7 @@ def label(inputs: Inputs, params: LabelParams, out: Path, report: Report) -> Don
     folder.mkdir()
     views = views_io.load(inputs["views"])
     cloud = PointCloud.load(inputs["cloud"])
-    kept = not params.overwrite and classified(cloud.label) >= params.min_classified
+    kept = not params.overwrite and classified(cloud.classification) >= params.min_classified
     if kept or not views or not params.photos:
         return Done({"labels": folder}, {"photos": 0, "why": "the cloud has classes" if kept else "none is asked"})
     network = load(params.network, params.weights, params.device)
@@ -96,13 +96,13 @@ def scanned(cloud: PointCloud, size: float, report: Report) -> Drawn | None:
     return Drawn(thin, size) if len(thin) >= FEW else None
 
 
-def classified(label: U8 | None) -> float:
+def classified(classification: U8 | None) -> float:
     """Share of points whose class says what they are: not "unclassified", nor a code that has no meaning."""
     from scan2sim.pipeline.classes import known
 
-    if label is None or not len(label):
+    if classification is None or not len(classification):
         return 0.0
-    return float(known()[label].mean())
+    return float(known()[classification].mean())
 
 
 def can_label(params: LabelParams) -> None:

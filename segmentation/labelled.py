@@ -18,15 +18,15 @@ from scan2sim.segmentation.labels import index_of_code
 
 
 def pairs(folder: Path) -> list[tuple[Path, Path]]:
-    """Images and their labels, by name.
+    """Images and their ground truth (LAS codes a pixel), by name.
 
     Raises:
         DataError: there are none.
     """
     found = [
-        (image, label)
+        (image, truth)
         for image in sorted((folder / "images").glob("*"))
-        if (label := folder / "labels" / f"{image.stem}.png").is_file()
+        if (truth := folder / "labels" / f"{image.stem}.png").is_file()
     ]
     if not found:
         raise DataError(
@@ -43,7 +43,7 @@ def split(found: Sequence[tuple[Path, Path]], share: float) -> tuple[list[tuple[
     return (learn, [pair for pair in found if pair[0].stem.split("_")[0] in last]) if learn else (list(found), [])
 
 
-def read(image: Path, label: Path) -> tuple[U8, U8]:
+def read(image: Path, truth: Path) -> tuple[U8, U8]:
     """(H, W, 3) colours and (H, W) indices of classes, `IGNORED` where there is none.
 
     Raises:
@@ -51,9 +51,9 @@ def read(image: Path, label: Path) -> tuple[U8, U8]:
     """
     import cv2
 
-    bgr, codes = cv2.imread(str(image)), cv2.imread(str(label), cv2.IMREAD_GRAYSCALE)
+    bgr, codes = cv2.imread(str(image)), cv2.imread(str(truth), cv2.IMREAD_GRAYSCALE)
     if bgr is None or codes is None or bgr.shape[:2] != codes.shape:
-        raise DataError(label, "and its image can't be read, or differ in size", "Make them again")
+        raise DataError(truth, "and its image can't be read, or differ in size", "Make them again")
     return np.asarray(bgr[..., ::-1], np.uint8), index_of_code()[codes]
 
 

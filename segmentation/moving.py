@@ -36,7 +36,7 @@ def moving(cloud: PointCloud, height: F32, ground: npt.NDArray[np.bool_]) -> npt
     some = np.flatnonzero(~ground & (height > HEIGHTS[0]) & (height < HEIGHTS[1]))
     if cloud.time is None or len(some) < NEIGHBOURS or np.ptp(cloud.time) < LASTING:
         return out
-    part = replace(cloud.take(some), label=np.full(len(some), CODE["vehicle"], np.uint8))
+    part = replace(cloud.take(some), classification=np.full(len(some), CODE["vehicle"], np.uint8))
     moved = ~np.isnan(times_of_moving(part))
     k = min(NEIGHBOURS, len(some))
     distance, near = cKDTree(part.xyz).query(part.xyz, k=k, distance_upper_bound=AROUND, workers=-1)

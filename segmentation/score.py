@@ -69,5 +69,5 @@ def confusion(known: U8, told: U8) -> Confusion:
     return Confusion(tuple(int(c) for c in codes), count)
 
 
-def _merged(label: U8) -> U8:
-    return np.where(label == CODE["mid_vegetation"], CODE["low_vegetation"], label).astype(np.uint8)
+def _merged(classification: U8) -> U8:
+    return np.where(classification == CODE["mid_vegetation"], CODE["low_vegetation"], classification).astype(np.uint8)

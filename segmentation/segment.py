@@ -54,19 +54,19 @@ def segment(inputs: Inputs, params: SegmentParams, out: Path, report: Report) ->
     report(0.0, "reading")
     cloud = PointCloud.load(inputs["cloud"])
     file, beside = out / "cloud.npz", out / "confidence.npz"
-    own = classified(cloud.label)
+    own = classified(cloud.classification)
     told: dict[str, Any] = {}
-    if cloud.label is not None and own >= params.min_classified and not params.overwrite:
+    if cloud.classification is not None and own >= params.min_classified and not params.overwrite:
         pass_on(inputs["cloud"], file)
-        label, source = cloud.label, "cloud"
+        classification, source = cloud.classification, "cloud"
         kinds, sure = np.full(len(cloud), OWN, np.uint8), np.full(len(cloud), 255, np.uint8)
     else:
-        label, sure, kinds, told = tell(cloud, inputs, params, report)
+        classification, sure, kinds, told = tell(cloud, inputs, params, report)
         report(0.95, "writing")
-        replace(cloud, label=label).save(file)
+        replace(cloud, classification=classification).save(file)
         source = "photos and shape" if told else "shape"
     np.savez(beside, confidence=sure, source=kinds)
-    count = np.bincount(label, minlength=256)
+    count = np.bincount(classification, minlength=256)
     facts = {
         "source": source,
         "own_classes": round(own, 4),
@@ -105,8 +105,8 @@ def tell(cloud: PointCloud, inputs: Inputs, params: SegmentParams, report: Repor
     views = views_io.load(inputs["views"]) if "views" in inputs else ()
     asked = params.photos and "labels" in inputs and any(inputs["labels"].glob("*.npy"))
     if not asked:
-        label = classify(cloud, lambda f, m="": report(0.05 + 0.85 * f, m), voxel=params.voxel)
-        return label, np.full(n, 128, np.uint8), np.full(n, SHAPE, np.uint8), {}
+        classification = classify(cloud, lambda f, m="": report(0.05 + 0.85 * f, m), voxel=params.voxel)
+        return classification, np.full(n, 128, np.uint8), np.full(n, SHAPE, np.uint8), {}
     report(0.05, "thinning")
     order, starts = voxel_groups(cloud.xyz, params.size)
     voxel = np.empty(n, np.int64)

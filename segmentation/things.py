@@ -56,17 +56,22 @@ def things(inputs: Inputs, params: ThingsParams, out: Path, report: Report) -> D
     report(0.0, "reading")
     found: list[tuple[Thing, int]] = []
     cloud = PointCloud.load(inputs["cloud"]) if "path" in inputs else None
-    label = None if cloud is None else cloud.label
-    if cloud is not None and label is not None:
-        found, label = decide(cloud, inputs, params, report)
-    if cloud is None or cloud.label is None or label is None or np.array_equal(label, cloud.label):
+    classification = None if cloud is None else cloud.classification
+    if cloud is not None and classification is not None:
+        found, classification = decide(cloud, inputs, params, report)
+    if (
+        cloud is None
+        or cloud.classification is None
+        or classification is None
+        or np.array_equal(classification, cloud.classification)
+    ):
         pass_on(inputs["cloud"], file)
         added = back = 0
     else:
         report(0.9, "writing")
-        movable = np.isin(cloud.label, _movable()), np.isin(label, _movable())
+        movable = np.isin(cloud.classification, _movable()), np.isin(classification, _movable())
         added, back = int((movable[1] & ~movable[0]).sum()), int((movable[0] & ~movable[1]).sum())
-        replace(cloud, label=label).save(file)
+        replace(cloud, classification=classification).save(file)
     _write_list(listed, found, cloud.frame if cloud is not None else None)
     cars = [thing for thing, _ in found if thing.kind != "person"]
     facts = {
@@ -91,12 +96,12 @@ def decide(
     from scan2sim.segmentation import instances
     from scan2sim.segmentation.segment import OWN
 
-    assert cloud.label is not None
+    assert cloud.classification is not None
     with np.load(inputs["confidence"]) as told:
         sure, source = told["confidence"], told["source"]
     own = bool(len(source)) and bool((source == OWN).all())
-    if own and not np.isin(cloud.label, _movable()).any():
-        return [], cloud.label
+    if own and not np.isin(cloud.classification, _movable()).any():
+        return [], cloud.classification
     order, starts = voxel_groups(cloud.xyz, params.size)
     first, count = order[starts], np.diff(np.append(starts, len(order)))
     moving = PointCloud.load(inputs["moving"]).xyz if "moving" in inputs else np.zeros((0, 3), np.float32)
@@ -111,18 +116,18 @@ def decide(
     found = instances.vehicles(scan) + instances.people(scan)
     numbered = [(thing, int(count[thing.index].sum())) for thing in found]
     if own:
-        return numbered, cloud.label
-    thin = scan.label.copy()
+        return numbered, cloud.classification
+    thin = scan.classification.copy()
     back = np.union1d(instances.no_vehicles(scan, found), instances.no_people(scan))
     thin[back] = other_class(scan, back)
     for thing in found:
         thin[thing.index] = CODE["person" if thing.kind == "person" else "vehicle"]
     thin[instances.remains(scan)] = CODE["vehicle"]
-    changed = np.flatnonzero(thin != scan.label)
-    label = cloud.label.copy()
+    changed = np.flatnonzero(thin != scan.classification)
+    classification = cloud.classification.copy()
     at = np.concatenate([order[starts[i] : starts[i] + count[i]] for i in changed] or [np.zeros(0, np.int64)])
-    label[at] = np.repeat(thin[changed], count[changed])
-    return numbered, label
+    classification[at] = np.repeat(thin[changed], count[changed])
+    return numbered, classification
 
 
 def look(thin: PointCloud, sure: U8, source: U8, moving: F32, moments: tuple[F64, F64] | None, path: F64) -> Scan:
@@ -143,10 +148,10 @@ def look(thin: PointCloud, sure: U8, source: U8, moving: F32, moments: tuple[F64
     from scan2sim.segmentation.instances import Scan
     from scan2sim.segmentation.segment import SHAPE
 
-    assert thin.label is not None
+    assert thin.classification is not None
     height, ground = split_ground(thin.xyz)
     p = np.clip(sure / 255.0, LEAST_SURE, MOST_SURE)
-    odds = np.log(p / (1 - p)) * np.where(thin.label == CODE["vehicle"], 1.0, -1.0)
+    odds = np.log(p / (1 - p)) * np.where(thin.classification == CODE["vehicle"], 1.0, -1.0)
     odds = np.where(source == SHAPE, SHAPES_WORD * odds, odds)
     weight = np.where(source == SHAPE, SHAPES_WORD, 1.0).astype(np.float32)
     moved = np.zeros(len(thin), bool)
@@ -162,7 +167,7 @@ def look(thin: PointCloud, sure: U8, source: U8, moving: F32, moments: tuple[F64
             distance.reshape(len(above), -1) < AROUND, near.reshape(len(above), -1), np.arange(len(above))[:, None]
         )
         brief[above] = moments[1][above][near].max(axis=1) - moments[0][above][near].min(axis=1) < PASSING
-    return Scan(thin.xyz, height, ground, thin.label, odds.astype(np.float32), weight, moved, brief, path)
+    return Scan(thin.xyz, height, ground, thin.classification, odds.astype(np.float32), weight, moved, brief, path)
 
 
 def other_class(scan: Scan, index: Ints) -> U8:
@@ -172,15 +177,15 @@ def other_class(scan: Scan, index: Ints) -> U8:
 
     from scan2sim.pipeline.classes import CODE, group_of
 
-    terrain = group_of()[scan.label] == 0
-    out = scan.label[index].copy()
+    terrain = group_of()[scan.classification] == 0
+    out = scan.classification[index].copy()
     for low in (True, False):
         chosen = np.flatnonzero((scan.ground[index] | (scan.height[index] < 0.1)) == low)
-        given = np.flatnonzero(terrain if low else ~terrain & ~np.isin(scan.label, _movable()))
+        given = np.flatnonzero(terrain if low else ~terrain & ~np.isin(scan.classification, _movable()))
         if len(chosen) and len(given):
             distance, near = cKDTree(scan.xyz[given]).query(scan.xyz[index[chosen]], workers=-1)
             alone = np.full(len(chosen), CODE["wall_or_fence"], np.uint8)
-            out[chosen] = np.where((distance < 2.0) | low, scan.label[given[near]], alone)
+            out[chosen] = np.where((distance < 2.0) | low, scan.classification[given[near]], alone)
     return out
 
 

@@ -20,7 +20,7 @@ import torch.nn.functional as F
 from scan2sim.pipeline.channels import COUNT
 from scan2sim.pipeline.step import Report, silent
 from scan2sim.pipeline.types import F32
-from scan2sim.segmentation.augment import seen_anew
+from scan2sim.segmentation.augment import augmented
 from scan2sim.segmentation.labelled import pairs, read, read_channels, split
 from scan2sim.segmentation.labels import CLASSES, IGNORED, index_of_code
 from scan2sim.segmentation.network import StreetNet
@@ -72,7 +72,7 @@ def train(folder: Path, recipe: Recipe, report: Report = silent) -> Trained:
     if recipe.start is not None:
         network.load_state_dict(_widened(recipe.start), strict=False)
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    weight = class_weights([label for _, label in learn])
+    weight = class_weights([file for _, file in learn])
     optimiser = torch.optim.AdamW(network.parameters(), recipe.rate, weight_decay=1e-2)
     smooth = torch.optim.swa_utils.AveragedModel(network, avg_fn=_averaged, use_buffers=True)
     network.train()
@@ -86,7 +86,7 @@ def train(folder: Path, recipe: Recipe, report: Report = silent) -> Trained:
         some = [learn[i] for i in rng.integers(0, len(learn), recipe.batch)]
         views = [_seen(pair, recipe.crop, rng) for pair in some]
         seen = torch.from_numpy(np.stack([image for image, _ in views])).permute(0, 3, 1, 2)
-        truth = torch.from_numpy(np.stack([label for _, label in views]))
+        truth = torch.from_numpy(np.stack([classes for _, classes in views]))
         logits = network(seen.contiguous(memory_format=torch.channels_last))
         loss = F.cross_entropy(
             F.interpolate(logits, scale_factor=2, mode="bilinear"), truth[:, 1::2, 1::2], weight, ignore_index=IGNORED
@@ -105,8 +105,8 @@ def train(folder: Path, recipe: Recipe, report: Report = silent) -> Trained:
 
 
 def _seen(pair: tuple[Path, Path], crop: tuple[int, int], rng: np.random.Generator) -> tuple[F32, Ints]:
-    rgb, label = read(*pair)
-    return seen_anew(rgb, label, read_channels(pair[0], label.shape), crop, rng)
+    rgb, classes = read(*pair)
+    return augmented(rgb, classes, read_channels(pair[0], classes.shape), crop, rng)
 
 
 def _widened(path: Path) -> dict[str, torch.Tensor]:
@@ -130,13 +130,13 @@ def _one_cycle(done: float) -> float:
     return min(1.0, done / 0.05 + 0.02) * 0.5 * (1 + math.cos(math.pi * min(1.0, done)))
 
 
-def class_weights(labels: Sequence[Path]) -> torch.Tensor:
+def class_weights(truth: Sequence[Path]) -> torch.Tensor:
     """(C,) what an error costs by class: rare ones more, by the root of their share."""
     import cv2
 
     count = np.zeros(256)
-    for label in labels[:: max(1, len(labels) // 100)]:
-        count += np.bincount(index_of_code()[cv2.imread(str(label), cv2.IMREAD_GRAYSCALE)].ravel(), minlength=256)
+    for file in truth[:: max(1, len(truth) // 100)]:
+        count += np.bincount(index_of_code()[cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)].ravel(), minlength=256)
     share = count[: len(CLASSES)] / count[: len(CLASSES)].sum()
     weight = np.where(share > 0, 1 / np.sqrt(np.maximum(share, 4e-3)), 0)
     return torch.tensor(weight / weight[weight > 0].mean(), dtype=torch.float32)

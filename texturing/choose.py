@@ -148,10 +148,10 @@ def with_whole_signs(choice: Choice, mesh: Mesh, pixel: Sequence[float]) -> Choi
     from scan2sim.pipeline.classes import CODE
     from scan2sim.texturing.labels import adjacent
 
-    if mesh.label is None or not (mesh.label == CODE["road_sign"]).any():
+    if mesh.classification is None or not (mesh.classification == CODE["road_sign"]).any():
         return choice
     view, quality, label = choice.view.copy(), choice.quality.copy(), choice.label.copy()
-    faces = np.flatnonzero(mesh.label == CODE["road_sign"])
+    faces = np.flatnonzero(mesh.classification == CODE["road_sign"])
     for side in _sides(mesh, faces, adjacent(mesh.faces[faces])[0]):
         shown, good = view[side], quality[side]
         area = mesh.face_area[side][:, None]

@@ -211,11 +211,11 @@ def texel_places(owner, flat, corners, rows, columns):  # type: ignore[no-untype
     return out
 
 
-def shaded(label: U8, normal: npt.NDArray[np.floating] | None) -> U8:
+def shaded(classification: U8, normal: npt.NDArray[np.floating] | None) -> U8:
     """(N, 3) display colours of classes (N,), a little darker where normals (N, 3) turn from above."""
     from scan2sim.pipeline.classes import colour_of
 
-    rgb = colour_of()[label].astype(np.float32)
+    rgb = colour_of()[classification].astype(np.float32)
     if normal is not None:
         rgb *= (0.75 + 0.25 * np.clip(normal @ np.array([0.3, 0.2, 0.93]), 0, 1))[:, None]
     return rgb.astype(np.uint8)

@@ -46,4 +46,4 @@ def made_colours(inputs: Inputs) -> tuple[F32, U8]:
 
 def classes_of(cloud: PointCloud) -> U8:
     """(N,) codes of the points' classes; 1, unclassified, where they aren't known."""
-    return np.ones(len(cloud), np.uint8) if cloud.label is None else cloud.label
+    return np.ones(len(cloud), np.uint8) if cloud.classification is None else cloud.classification

@@ -71,8 +71,8 @@ class Painter:
         self._choice, self._depth_file, self._exposures = choice, depth_file, exposures
         self._mask, self._warp = agreement.mask, agreement.warp
         self._share = shares(mesh.faces, choice.label, len(mesh.vertices), len(views))
-        label = mesh.label
-        self._sign = np.zeros(len(mesh), bool) if label is None else label == CODE["road_sign"]
+        classification = mesh.classification
+        self._sign = np.zeros(len(mesh), bool) if classification is None else classification == CODE["road_sign"]
         self._backwards = True
         self._hides = lru_cache(maxsize=KEPT)(self._read_hides)
         self.photos = Photos(views, max(1, weighing.band))

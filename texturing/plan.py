@@ -36,14 +36,14 @@ class Plan:
     Args:
         mesh: the ground's.
         texel: metres.
-        xyz, label: places (N, 3) and classes (N,) of its points: road isn't continued by grass.
+        xyz, classification: places (N, 3) and classes (N,) of its points: road isn't continued by grass.
         stood: outlines (K, 2) of what stood there and was taken out: photos know but the black below.
     """
 
-    def __init__(self, mesh: Mesh, texel: float, xyz: F32, label: U8, stood: Sequence[F64] = ()) -> None:
+    def __init__(self, mesh: Mesh, texel: float, xyz: F32, classification: U8, stood: Sequence[F64] = ()) -> None:
         low, high = mesh.vertices[:, :2].min(axis=0), mesh.vertices[:, :2].max(axis=0)
         self.cell = max(CELL, texel, float(np.sqrt(np.prod(high - low + 1) / MOST)))
-        self.low, self._xyz, self._label = low.astype(np.float64), xyz, label
+        self.low, self._xyz, self._classification = low.astype(np.float64), xyz, classification
         columns, rows = (np.ceil((high - low) / self.cell).astype(int) + 1).tolist()
         self._sum, self._count = np.zeros((rows, columns, 3), np.float32), np.zeros((rows, columns), np.float32)
         self._wanted, self._from_points = np.zeros((rows, columns), bool), np.zeros((rows, columns), bool)
@@ -86,7 +86,7 @@ class Plan:
         if not len(self._xyz):
             return kind
         y, x = self.at(self._xyz)
-        kind[y // FACTOR, x // FACTOR] = self._label
+        kind[y // FACTOR, x // FACTOR] = self._classification
         nearest = ndimage.distance_transform_edt(kind < 0, return_distances=False, return_indices=True)
         return kind[tuple(nearest)]
 

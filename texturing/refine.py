@@ -185,8 +185,8 @@ def _surface(inputs: Inputs) -> tuple[Scene, Scene]:
     meshes = [Mesh.load(path) for name, path in inputs.items() if name.startswith("mesh.")]
     clouds = [PointCloud.load(path) for name, path in inputs.items() if name.startswith("cloud.")]
     cloud = PointCloud.join(clouds) if clouds else None
-    if cloud is not None and cloud.label is not None:
-        cloud = cloud.take(np.isin(cloud.label, kernel.MOVABLE))
+    if cloud is not None and cloud.classification is not None:
+        cloud = cloud.take(np.isin(cloud.classification, kernel.MOVABLE))
     moving = PointCloud.load(inputs["moving"]) if "moving" in inputs else None
     return kernel.scene(meshes), kernel.scene([], cloud, moving=moving)
 

@@ -91,7 +91,9 @@ def unwrap(inputs: Inputs, params: UnwrapParams, out: Path, report: Report) -> D
             coarse = params.model_copy(update={"texel": params.texel * params.unseen})
             draped = params.model_copy(update={"texel": max(params.texel, PER_PIXEL * float(own.max()))})
             finer = params.model_copy(update={"texel": params.texel / params.signs})
-            sign = np.zeros(len(mesh), bool) if mesh.label is None else mesh.label == CODE["road_sign"]
+            sign = (
+                np.zeros(len(mesh), bool) if mesh.classification is None else mesh.classification == CODE["road_sign"]
+            )
             by_distance = (label >= 0) & (own == 0)
             parts = [(by_distance & ~sign, params), ((label >= 0) & (own > 0), draped)]
             parts += [(by_distance & sign, finer)] if sign.any() else []
@@ -106,7 +108,7 @@ def unwrap(inputs: Inputs, params: UnwrapParams, out: Path, report: Report) -> D
             laid = lay(mesh, laid, np.arange(len(mesh)), params, report)
     uv, page, pages, charts, fallbacks = laid.uv, laid.page, laid.pages, laid.charts, laid.fallbacks
     (out / "pages.json").write_text(json.dumps(pages), encoding="utf-8")
-    done = Mesh(mesh.frame, mesh.vertices, mesh.faces, mesh.density, uv, page, mesh.label)
+    done = Mesh(mesh.frame, mesh.vertices, mesh.faces, mesh.density, uv, page, mesh.classification)
     done.save(out / "mesh.npz")
     warnings = []
     if fallbacks:

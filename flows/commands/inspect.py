@@ -96,9 +96,9 @@ def _cloud(path: Path) -> tuple[str, Facts]:
     ]
     if cloud.time is not None and len(cloud):
         facts.append(("GPS time", f"{cloud.time.min():.3f} to {cloud.time.max():.3f} s"))
-    if cloud.label is not None:
+    if cloud.classification is not None:
         table = clouds.meanings(path, {})
-        codes, counts = np.unique(cloud.label, return_counts=True)
+        codes, counts = np.unique(cloud.classification, return_counts=True)
         facts += [
             (
                 "classes" if i == 0 else "",

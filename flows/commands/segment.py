@@ -107,14 +107,17 @@ def segment_tile(path: Path, out: Path, settings: Settings) -> None:
             for label, manifest in done.items()
             for name, file in manifest.files.items()
         }
-        told, own = PointCloud.load(files[last, "cloud"]).label, PointCloud.load(files["carve", "cloud"]).label
+        told, own = (
+            PointCloud.load(files[last, "cloud"]).classification,
+            PointCloud.load(files["carve", "cloud"]).classification,
+        )
         assert told is not None
         with np.load(files["segment", "confidence"]) as beside:
             columns = told, beside["confidence"], beside["source"]
             dropped = np.load(files["carve", "dropped"])
             if len(dropped):
                 kept = done["segment"].facts["source"] == "cloud"
-                whole = PointCloud.load(files["ingest", "cloud"]).label if kept else None
+                whole = PointCloud.load(files["ingest", "cloud"]).classification if kept else None
                 columns = _of_all(dropped, whole, *columns)
             _write_clouds(tile, out / "classified", *columns)
         if ("label", "labels") in files:

@@ -29,14 +29,14 @@ class Points:
     Attributes:
         xyz: (N, 3) float64, CRS coordinates.
         rgb: (N, 3) numbers, in 0 to 1, to 255, or to 65535, or None.
-        label: (N,) LAS codes, or None.
+        classification: (N,) LAS codes, or None.
         time: (N,) seconds, or None.
         intensity: (N,) numbers, in 0 to 1, to 255, or to 65535, or None.
     """
 
     xyz: F64
     rgb: npt.NDArray[Any] | None = None
-    label: npt.NDArray[Any] | None = None
+    classification: npt.NDArray[Any] | None = None
     time: npt.NDArray[Any] | None = None
     intensity: npt.NDArray[Any] | None = None
 
@@ -98,7 +98,7 @@ def whole(path: Path, parts: Iterable[Points], frame: Frame) -> PointCloud:
         frame,
         column("xyz"),
         _eight_bits(column("rgb"), rgb),
-        label=_codes(path, column("label")),
+        classification=_codes(path, column("classification")),
         time=_times(column("time")),
         intensity=sixteen_bits(column("intensity"), intensity),
     )
@@ -115,7 +115,7 @@ def local(path: Path, parts: Iterable[Points], found: Summary, frame: Frame, siz
                 near,
                 near.to_local(some.xyz).astype(np.float32),
                 _eight_bits(some.rgb, found.rgb),
-                label=_codes(path, some.label),
+                classification=_codes(path, some.classification),
                 time=_times(some.time),
                 intensity=sixteen_bits(some.intensity, found.intensity),
             )
@@ -137,10 +137,10 @@ def _eight_bits(rgb: npt.NDArray[Any] | None, top: float) -> Any:
     return np.clip(np.rint(values) if fraction else np.floor(values), 0, 255).astype(np.uint8)
 
 
-def _codes(path: Path, label: npt.NDArray[Any] | None) -> Any:
-    if label is None:
+def _codes(path: Path, classification: npt.NDArray[Any] | None) -> Any:
+    if classification is None:
         return None
-    codes = np.nan_to_num(label, nan=-1)
+    codes = np.nan_to_num(classification, nan=-1)
     wrong = (codes < 0) | (codes > 255) | (codes != np.rint(codes))
     if wrong.any():
         raise InputError(path, f"has the class {codes[wrong][0]:g}, which is no LAS code (0 to 255)", "Map it to one")

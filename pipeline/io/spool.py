@@ -16,7 +16,14 @@ QUANTUM = 0.001
 """CRS units, of coordinates; a whole number of them makes a unit, so that tiles with whole offsets agree on them."""
 UNCLASSIFIED = 1
 POINT = np.dtype(
-    [("place", "<i4", 3), ("rgb", "u1", 3), ("label", "u1"), ("time", "<f8"), ("intensity", "<u2"), ("own", "?")]
+    [
+        ("place", "<i4", 3),
+        ("rgb", "u1", 3),
+        ("classification", "u1"),
+        ("time", "<f8"),
+        ("intensity", "<u2"),
+        ("own", "?"),
+    ]
 )
 CHUNK = 500_000
 
@@ -62,7 +69,7 @@ class Spool:
         rows = np.zeros(len(cloud), POINT)
         rows["place"] = places
         rows["rgb"] = UNCOLOURED if cloud.rgb is None else cloud.rgb
-        rows["label"] = UNCLASSIFIED if cloud.label is None else cloud.label
+        rows["classification"] = UNCLASSIFIED if cloud.classification is None else cloud.classification
         for name in ("time", "intensity"):
             if (values := getattr(cloud, name)) is not None:
                 rows[name] = values
@@ -79,7 +86,7 @@ class Spool:
         held.own += int(np.count_nonzero(rows["own"]))
         held.low = np.minimum(held.low, rows["place"].min(axis=0))
         held.high = np.maximum(held.high, rows["place"].max(axis=0))
-        for name in ("rgb", "label", "time", "intensity"):
+        for name in ("rgb", "classification", "time", "intensity"):
             (held.lacking if getattr(source, name) is None else held.some).add(name)
         with open(self._file(tile), "ab") as file:
             rows.tofile(file)
@@ -106,7 +113,7 @@ class Spool:
         middle = np.floor(self.base + (held.low.astype(np.float64) + held.high) / 2 * QUANTUM)
         x, y, z = (middle * self.unit).tolist()
         frame = Frame(crs, (x, y, z), self.unit)
-        kept = (held.some & {"rgb", "label"}) | (held.some - held.lacking)
+        kept = (held.some & {"rgb", "classification"}) | (held.some - held.lacking)
         with open(self._file(tile), "rb") as file:
             while len(rows := np.fromfile(file, POINT, CHUNK)):
                 local = (rows["place"] * QUANTUM - (middle - self.base)) * self.unit

@@ -64,7 +64,7 @@ def collision(inputs: Inputs, params: CollisionParams, out: Path, report: Report
     elif not border_kept:
         warnings.append(f"collision: the borders alone need {len(small):,} triangles, so they were thinned too")
         small = simplify(small, budget, keep_border=False)
-    small = replace(with_things(small, things), label=None) if len(things) else small
+    small = replace(with_things(small, things), classification=None) if len(things) else small
     allowed = MOST if params.keep_border else params.triangles
     if len(small) > allowed:
         raise StepError(
@@ -104,7 +104,9 @@ def _joined(inputs: Inputs, groups: tuple[str, ...]) -> Mesh:
         meshes[0].frame,
         np.concatenate([mesh.vertices for mesh in meshes]),
         np.concatenate([mesh.faces + start for mesh, start in zip(meshes, first[:-1], strict=True)]).astype(np.int32),
-        label=np.concatenate([np.zeros(len(m), np.uint8) if m.label is None else m.label for m in meshes]),
+        classification=np.concatenate(
+            [np.zeros(len(m), np.uint8) if m.classification is None else m.classification for m in meshes]
+        ),
     )
 
 
@@ -112,7 +114,7 @@ def _parted(mesh: Mesh, budget: int) -> tuple[Mesh, Mesh]:
     """The surface, and the street furniture that stays as it is: none where it would take over half the budget."""
     import numpy as np
 
-    own = np.zeros(len(mesh), bool) if mesh.label is None else mesh.label > 0
+    own = np.zeros(len(mesh), bool) if mesh.classification is None else mesh.classification > 0
     if own.sum() > budget / 2:
         own[:] = False
     return mesh.keep(~own), mesh.keep(own)

@@ -68,12 +68,12 @@ def with_things(mesh: Mesh, things: Mesh) -> Mesh:
 
     from scan2sim.pipeline.types import Mesh
 
-    assert things.label is not None
+    assert things.classification is not None
     return Mesh(
         mesh.frame,
         np.concatenate([mesh.vertices, things.vertices]),
         np.concatenate([mesh.faces, things.faces + len(mesh.vertices)]).astype(np.int32),
-        label=np.concatenate([np.zeros(len(mesh), np.uint8), things.label]),
+        classification=np.concatenate([np.zeros(len(mesh), np.uint8), things.classification]),
     )
 
 

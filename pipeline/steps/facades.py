@@ -90,8 +90,8 @@ def facades(inputs: Inputs, params: FacadesParams, out: Path, report: Report) ->
     if parts:
         xyz, normal = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
         rgb = None if cloud.rgb is None else np.full((len(xyz), 3), UNCOLOURED, np.uint8)
-        label = np.full(len(xyz), CODE["building"], np.uint8)
-        made = PointCloud(cloud.frame, on_grid(xyz).astype(np.float32), rgb, normal.astype(np.float32), label)
+        classification = np.full(len(xyz), CODE["building"], np.uint8)
+        made = PointCloud(cloud.frame, on_grid(xyz).astype(np.float32), rgb, normal.astype(np.float32), classification)
     made.save(out / "made.npz")
     told = {name: round(value, 1) if isinstance(value, float) else value for name, value in facts.items()}
     return Done({"made": out / "made.npz"}, told | {"points": len(made)})

@@ -60,9 +60,9 @@ def furniture(inputs: Inputs, params: FurnitureParams, out: Path, report: Report
     from scan2sim.pipeline.types import PointCloud, Trajectory
 
     cloud, path = PointCloud.load(inputs["cloud"]), Trajectory.load(inputs["path"])
-    assert cloud.label is not None
-    ground = group_of()[cloud.label] == 0
-    out_of_it = np.isin(cloud.label, [*NOISE, CODE["vehicle"], CODE["person"]])
+    assert cloud.classification is not None
+    ground = group_of()[cloud.classification] == 0
+    out_of_it = np.isin(cloud.classification, [*NOISE, CODE["vehicle"], CODE["person"]])
     some = np.flatnonzero(~ground & ~out_of_it)
     things: list[Thing] = []
     taken = np.zeros(0, np.int64)
@@ -147,7 +147,9 @@ def _mesh(frame: Frame, things: list[Thing]) -> Mesh:
     parts = [part for thing in things for part in thing.meshes()]
     vertices, faces = primitives.join([triangles for triangles, _ in parts])
     codes = [np.full(len(triangles[1]), code, np.uint8) for triangles, code in parts]
-    return Mesh(frame, vertices.astype(np.float32), faces, label=np.concatenate([np.zeros(0, np.uint8), *codes]))
+    return Mesh(
+        frame, vertices.astype(np.float32), faces, classification=np.concatenate([np.zeros(0, np.uint8), *codes])
+    )
 
 
 def _row(thing: Thing, frame: Frame) -> dict[str, Any]:

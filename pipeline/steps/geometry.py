@@ -80,7 +80,7 @@ def geometry(inputs: Inputs, params: GeometryParams, out: Path, report: Report) 
         if f"made.{group}" in inputs:
             made = PointCloud.load(inputs[f"made.{group}"])
             figures["made_up"] = made_up(mesh, PointCloud.load(inputs[f"cloud.{group}"]), made, params.samples)
-        if truth is not None and truth.label is not None:
+        if truth is not None and truth.classification is not None:
             error = truth_error(mesh, truth, group, params.samples)
             figures |= {} if error is None else {"truth_mean_m": error}
         facts[group] = {name: round(value, 4) for name, value in figures.items()}
@@ -113,10 +113,10 @@ def truth_error(mesh: Mesh, truth: Mesh, group: str, samples: int, *, whatever: 
     """
     import numpy as np
 
-    assert truth.label is not None
+    assert truth.classification is not None
     if group not in GROUPS:
         return None  # no truth has what is parked
-    same = truth.keep(group_of()[truth.label] == GROUPS.index(group)).moved_to(mesh.frame)
+    same = truth.keep(group_of()[truth.classification] == GROUPS.index(group)).moved_to(mesh.frame)
     if not len(same):
         return None
     points = spread(mesh, samples)

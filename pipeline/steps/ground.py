@@ -103,8 +103,8 @@ def ground(inputs: Inputs, params: GroundParams, out: Path, report: Report) -> D
         rgb = None if terrain.rgb is None else np.rint(field[new][:, 1:]).clip(0, 255).astype(np.uint8)
         if rgb is not None and street:
             rgb[:] = UNCOLOURED
-        label = np.full(len(xyz), CODE["terrain"], np.uint8)
-        made = PointCloud(terrain.frame, xyz, rgb, normal.astype(np.float32), label)
+        classification = np.full(len(xyz), CODE["terrain"], np.uint8)
+        made = PointCloud(terrain.frame, xyz, rgb, normal.astype(np.float32), classification)
         area = len(xyz) * raster.cell**2
     made.save(out / "made.npz")
     return Done({"made": out / "made.npz"}, {"from_above": asked, "points": len(made), "made_up_m2": round(area, 1)})

@@ -48,11 +48,11 @@ def ingest(inputs: Inputs, params: IngestParams, out: Path, report: Report) -> D
         report(i / len(inputs), f"reading {inputs[name].name}")
         warnings += [f"{inputs[name].name}: {note}" for note in clouds.read_header(inputs[name]).notes]
         cloud = clouds.read(inputs[name], frame)
-        if cloud.label is not None and len(cloud):
+        if cloud.classification is not None and len(cloud):
             table = clouds.meanings(inputs[name], params.classes)
-            strange = classes.strangers(np.bincount(cloud.label, minlength=256), table)
+            strange = classes.strangers(np.bincount(cloud.classification, minlength=256), table)
             warnings += [f"{inputs[name].name}: {strange}"] if strange else []
-            cloud = replace(cloud, label=table[cloud.label])
+            cloud = replace(cloud, classification=table[cloud.classification])
         finite = np.atleast_1d(np.isfinite(cloud.xyz).all(axis=1))
         if not finite.all():
             warnings.append(f"{inputs[name].name}: {np.count_nonzero(~finite):,} points with NaN coordinates left out")
@@ -77,7 +77,7 @@ def ingest(inputs: Inputs, params: IngestParams, out: Path, report: Report) -> D
         "points": len(cloud),
         "extent_m": (high - low).round(2).tolist(),
         "coloured": cloud.rgb is not None,
-        "classified": bool(cloud.label is not None and classes.known()[cloud.label].any()),
+        "classified": bool(cloud.classification is not None and classes.known()[cloud.classification].any()),
         "timed": cloud.time is not None,
     }
     return Done({"cloud": out / "cloud.npz"}, facts, warnings)

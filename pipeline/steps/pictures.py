@@ -113,7 +113,7 @@ def pictures(inputs: Inputs, params: PicturesParams, out: Path, report: Report) 
     )
 
     report(0.4, "classes")
-    assert cloud.label is not None
+    assert cloud.classification is not None
     album.add(
         "classes",
         points_from_above(cloud, low, high, params.width),
@@ -238,16 +238,16 @@ def bird_pose(low: F64, high: F64) -> F64:
 
 def points_from_above(cloud: PointCloud, low: F64, high: F64, width: int) -> U8:
     """A map of the points by class, the highest of a pixel on top, its colour dimmed by depth."""
-    assert cloud.label is not None
+    assert cloud.classification is not None
     metre = max(float((high - low)[:2].max()) / width, COARSE)
     size = np.maximum(np.ceil((high - low)[:2] / metre).astype(int), 1)
     inside = ((cloud.xyz[:, :2] >= low[:2]) & (cloud.xyz[:, :2] < high[:2])).all(axis=1)
-    xyz, label = cloud.xyz[inside], cloud.label[inside]
+    xyz, classification = cloud.xyz[inside], cloud.classification[inside]
     order = np.argsort(xyz[:, 2], kind="stable")
     cell = ((xyz[order, :2] - low[:2]) / metre).astype(int).clip(max=size - 1)
     picture = np.full((size[1], size[0], 3), 250, np.uint8)
     light = np.clip(0.75 + 0.35 * (xyz[order, 2] - low[2]) / max(high[2] - low[2], 1e-3), 0.6, 1.15)
-    picture[size[1] - 1 - cell[:, 1], cell[:, 0]] = np.clip(colour_of()[label[order]] * light[:, None], 0, 255)
+    picture[size[1] - 1 - cell[:, 1], cell[:, 0]] = np.clip(colour_of()[classification[order]] * light[:, None], 0, 255)
     return lying(picture.repeat(max(1, width // max(size)), axis=0).repeat(max(1, width // max(size)), axis=1))
 
 

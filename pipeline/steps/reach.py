@@ -113,8 +113,8 @@ def _worth(thin: PointCloud, views: Sequence[View], path: Trajectory, size: floa
     seen = finest(thin, views, size=size, coarsest=size, report=lambda f, m="": report(0.3 + 0.5 * f, m)) < size
     report(0.8, "surroundings")
     kept = along(thin.xyz, path.positions, LANES)
-    assert thin.label is not None
-    group = group_of()[thin.label]
+    assert thin.classification is not None
+    group = group_of()[thin.classification]
     for i, name in enumerate((*GROUPS, "rest")):
         of = np.flatnonzero(group == (i if name != "rest" else -1))
         near = around(thin.xyz[of], seen[of], RIM[name])

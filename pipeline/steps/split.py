@@ -52,8 +52,8 @@ def split(inputs: Inputs, params: SplitParams, out: Path, report: Report) -> Don
     from scan2sim.pipeline.types import PointCloud
 
     cloud = PointCloud.load(inputs["cloud"])
-    assert cloud.label is not None
-    group = group_of()[cloud.label]
+    assert cloud.classification is not None
+    group = group_of()[cloud.classification]
     if "taken" in inputs:
         with np.load(inputs["taken"]) as taken:
             group[taken["index"]] = FURNITURE
@@ -68,7 +68,7 @@ def split(inputs: Inputs, params: SplitParams, out: Path, report: Report) -> Don
     number |= {"furniture": FURNITURE, "vehicle": VEHICLE}
     for i, name in enumerate(parts):
         report(i / len(parts), name)
-        chosen = (group == -1) & ~np.isin(cloud.label, NOISE) if name == "rest" else group == number[name]
+        chosen = (group == -1) & ~np.isin(cloud.classification, NOISE) if name == "rest" else group == number[name]
         part = cloud.take(np.flatnonzero(chosen))
         part.save(out / f"{name}.npz")
         files[name] = out / f"{name}.npz"
@@ -81,7 +81,7 @@ def split(inputs: Inputs, params: SplitParams, out: Path, report: Report) -> Don
             "no point belongs to terrain, building or vegetation",
             "Check the cloud's classes, or classify it anew with --set segment.overwrite=true",
         )
-    codes, numbers = np.unique(cloud.label, return_counts=True)
+    codes, numbers = np.unique(cloud.classification, return_counts=True)
     classes = {name_of(int(c)): int(n) for c, n in zip(codes, numbers, strict=True)}
     vanished = {int(c): int(n) for c, n in zip(codes, numbers, strict=True) if not known()[c]}
     if sum(vanished.values()) > TELL * len(cloud):
@@ -103,7 +103,7 @@ def parked(cloud: PointCloud, things: Path) -> npt.NDArray[np.bool_]:
     import numpy as np
 
     inside = np.zeros(len(cloud), bool)
-    vehicle = np.flatnonzero(cloud.label == CODE["vehicle"])
+    vehicle = np.flatnonzero(cloud.classification == CODE["vehicle"])
     for feature in json.loads(things.read_text(encoding="utf-8"))["features"]:
         told = feature["properties"]
         if told["moved"] or told["kind"] == "person":

@@ -66,19 +66,19 @@ def walls(inputs: Inputs, params: WallsParams, out: Path, report: Report) -> Don
         flat = building.xyz[np.abs(building.normal[:, 2]) > FLAT]
         raster = Raster.over(spacing(flat), [building.xyz])
         top = raster.highest(flat)
-        label = roofs(top, raster.cell, max(params.step, 1.5 * raster.cell), params.least_area)
-        report(0.2, f"{label.max()} roofs")
+        component = roofs(top, raster.cell, max(params.step, 1.5 * raster.cell), params.least_area)
+        report(0.2, f"{component.max()} roofs")
         tolerance = max(params.tolerance, raster.cell)
-        heights = Heights(raster, top, label, floor)
+        heights = Heights(raster, top, component, floor)
         parts: list[tuple[F64, F64]] = []
         given = _given(inputs, building)
         if given:
             places = Places.along(given, DENSE)
             parts.append(heights.columns(places, 0, params.least_height))
         count = 0
-        for k in range(1, int(label.max()) + 1):
-            report(0.2 + 0.6 * k / label.max(), f"roof {k} of {label.max()}")
-            found = rings(label == k, raster, tolerance, params.least_area)
+        for k in range(1, int(component.max()) + 1):
+            report(0.2 + 0.6 * k / component.max(), f"roof {k} of {component.max()}")
+            found = rings(component == k, raster, tolerance, params.least_area)
             places = Places.along(found, DENSE)
             if given:
                 places = _apart(places, Places.along(given, DENSE).xy)
@@ -87,7 +87,7 @@ def walls(inputs: Inputs, params: WallsParams, out: Path, report: Report) -> Don
         xyz = np.concatenate([np.zeros((0, 3)), *(part[0] for part in parts)])
         normal = np.concatenate([np.zeros((0, 3)), *(part[1] for part in parts)])
         made = _cloud(xyz, normal, building, params)
-        facts |= {"roofs": int(label.max()), "sides": count, "footprints": len(given)}
+        facts |= {"roofs": int(component.max()), "sides": count, "footprints": len(given)}
         facts |= {"points": len(made), "made_up_m2": round(len(made) * DENSE**2, 1)}
     made.save(out / "made.npz")
     return Done({"made": out / "made.npz"}, facts)
@@ -98,18 +98,18 @@ class Heights:
 
     Args:
         raster, top: heights of the roofs' points.
-        label: which roof a cell belongs to.
+        component: which roof a cell belongs to.
         floor: (N, 3) points of the ground.
     """
 
-    def __init__(self, raster: Raster, top: F64, label: object, floor: F32) -> None:
+    def __init__(self, raster: Raster, top: F64, component: object, floor: F32) -> None:
         import numpy as np
         from scipy.spatial import cKDTree
 
-        self._raster, self._label = raster, np.asarray(label)
-        self._known = np.isfinite(top) & (self._label > 0)
+        self._raster, self._component = raster, np.asarray(component)
+        self._known = np.isfinite(top) & (self._component > 0)
         cells = np.nonzero(self._known)
-        self._of, self._height = self._label[cells], top[cells]
+        self._of, self._height = self._component[cells], top[cells]
         self._roof = cKDTree(raster.centres(self._known))
         self._places = raster.centres(self._known)
         self._floor, self._floor_z = cKDTree(floor[:, :2]), floor[:, 2].astype(np.float64)
@@ -131,7 +131,7 @@ class Heights:
         low = self._floor_z[self._floor.query(places.xy + places.outward * OUTSIDE[0] * cell)[1]] - SUNK
         for reach in OUTSIDE[::-1] if roof else ():
             out = places.xy + places.outward * reach * cell
-            other = self._label[self._raster.at(out)]
+            other = self._component[self._raster.at(out)]
             beside = self._height[self._roof.query(out)[1]] - DENSE
             low = np.where((other > 0) & (other != roof), beside, low)
         for side in np.unique(places.side):
@@ -183,8 +183,8 @@ def _cloud(xyz: F64, normal: F64, building: PointCloud, params: WallsParams) -> 
     xyz, normal = on_grid(xyz[keep]), normal[keep]
     light = 0.8 + 0.2 * np.clip(normal @ LIGHT, 0, 1)  # so that corners are seen
     rgb = None if building.rgb is None else (light[:, None] * _colour(building)).astype(np.uint8)
-    label = np.full(len(xyz), CODE["building"], np.uint8)
-    return PointCloud(building.frame, xyz.astype(np.float32), rgb, normal.astype(np.float32), label)
+    classification = np.full(len(xyz), CODE["building"], np.uint8)
+    return PointCloud(building.frame, xyz.astype(np.float32), rgb, normal.astype(np.float32), classification)
 
 
 def _colour(building: PointCloud) -> F64:

@@ -87,12 +87,12 @@ def test_points_lie_on_the_true_surface_and_carry_its_label(street: Street) -> N
 
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(o3d.core.Tensor(street.mesh.vertices), o3d.core.Tensor(street.mesh.faces.astype(np.uint32)))
-    still = street.cloud.label != CODE["vehicle"]
+    still = street.cloud.classification != CODE["vehicle"]
     nearest = scene.compute_closest_points(o3d.core.Tensor(street.cloud.xyz[still]))
     distance = np.linalg.norm(nearest["points"].numpy() - street.cloud.xyz[still], axis=1)
     assert np.quantile(distance, 0.99) < 0.03  # range noise of 1 cm
-    assert street.mesh.label is not None and street.cloud.label is not None
-    same = street.mesh.label[nearest["primitive_ids"].numpy()] == street.cloud.label[still]
+    assert street.mesh.classification is not None and street.cloud.classification is not None
+    same = street.mesh.classification[nearest["primitive_ids"].numpy()] == street.cloud.classification[still]
     assert same.mean() > 0.97
 
 
@@ -118,10 +118,10 @@ def test_photos_show_the_true_colours_where_they_should(street: Street) -> None:
         length = np.linalg.norm(ray, axis=1)
         rays = np.concatenate([np.broadcast_to(centre, ray.shape), ray / length[:, None]], axis=1).astype(np.float32)
         hit = everything.cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy()
-        label = cv2.imread(str(folder / "truth/labels" / f"{Path(view.name).name}.png"), cv2.IMREAD_UNCHANGED)
-        assert label.shape == (view.camera.height, view.camera.width)
+        codes = cv2.imread(str(folder / "truth/labels" / f"{Path(view.name).name}.png"), cv2.IMREAD_UNCHANGED)
+        assert codes.shape == (view.camera.height, view.camera.width)
         at = np.rint(uv[inside]).astype(int)
-        seen = (np.abs(hit - length) < 0.01) & (label[at[:, 1], at[:, 0]] != CODE["vehicle"]) & (length < 12)
+        seen = (np.abs(hit - length) < 0.01) & (codes[at[:, 1], at[:, 0]] != CODE["vehicle"]) & (length < 12)
         photo = cv2.imread(str(view.photo))[..., ::-1].astype(np.float64)[at[seen, 1], at[seen, 0]] / 255
         gain = 2.0 ** float(ev[f"{view.name}.jpg"])
         expected = np.clip(_linear(street.truth.rgb[inside][seen] / 255) * gain, 0, 1)
@@ -141,19 +141,19 @@ def longer() -> tuple[Scene, PointCloud]:
 def test_every_class_occurs_on_a_longer_street(longer: tuple[Scene, PointCloud]) -> None:
     scene, cloud = longer
     mesh = scene.truth_mesh()
-    assert cloud.label is not None and mesh.label is not None and cloud.time is not None
-    assert set(np.unique(cloud.label)) == {2, 3, 5, 6, 11, 64, 65, 66, 68, 69}
-    assert set(np.unique(mesh.label)) == {2, 3, 5, 6, 11, 64, 65, 68, 69}  # vehicles are left out of worlds
+    assert cloud.classification is not None and mesh.classification is not None and cloud.time is not None
+    assert set(np.unique(cloud.classification)) == {2, 3, 5, 6, 11, 64, 65, 66, 68, 69}
+    assert set(np.unique(mesh.classification)) == {2, 3, 5, 6, 11, 64, 65, 68, 69}  # vehicles are left out of worlds
     assert len(mesh) < 6000 * 40
 
 
 def test_the_moving_car_leaves_a_trail(longer: tuple[Scene, PointCloud]) -> None:
     scene, cloud = longer
-    assert cloud.label is not None and cloud.time is not None
+    assert cloud.classification is not None and cloud.time is not None
     layout = scene.layout
-    s, t = layout.axis.locate(cloud.xyz[cloud.label == CODE["vehicle"], :2].astype(np.float64))
+    s, t = layout.axis.locate(cloud.xyz[cloud.classification == CODE["vehicle"], :2].astype(np.float64))
     in_lane = np.abs(t) < layout.lane - 0.3  # parked cars are beside the lanes
-    time = cloud.time[cloud.label == CODE["vehicle"]][in_lane]
+    time = cloud.time[cloud.classification == CODE["vehicle"]][in_lane]
     assert np.ptp(s[in_lane]) > 12 and np.ptp(time) > 1
 
 
@@ -164,8 +164,8 @@ def test_the_moving_car_can_be_left_out(longer: tuple[Scene, PointCloud]) -> Non
     still = scan(without, plan_drive(without.layout, 60_000), 60_000)
 
     def in_lanes(points: PointCloud) -> int:
-        assert points.label is not None
-        _, t = scene.layout.axis.locate(points.xyz[points.label == CODE["vehicle"], :2].astype(np.float64))
+        assert points.classification is not None
+        _, t = scene.layout.axis.locate(points.xyz[points.classification == CODE["vehicle"], :2].astype(np.float64))
         return int((np.abs(t) < scene.layout.lane - 0.3).sum())
 
     assert in_lanes(cloud) > 0 and in_lanes(still) == 0
@@ -182,8 +182,8 @@ def test_the_moving_car_can_be_left_out(longer: tuple[Scene, PointCloud]) -> Non
 
 def test_facades_are_seen_at_the_scanners_own_height_too(longer: tuple[Scene, PointCloud]) -> None:
     scene, cloud = longer
-    s, _ = scene.layout.axis.locate(cloud.xyz[cloud.label == CODE["building"], :2].astype(np.float64))
-    above = cloud.xyz[cloud.label == CODE["building"], 2] - scene.layout.height(s, 0.0)
+    s, _ = scene.layout.axis.locate(cloud.xyz[cloud.classification == CODE["building"], :2].astype(np.float64))
+    above = cloud.xyz[cloud.classification == CODE["building"], 2] - scene.layout.height(s, 0.0)
     counts, _ = np.histogram(above, np.arange(1.0, 3.0, 0.1))
     assert counts.min() > 0.4 * np.median(counts)
 

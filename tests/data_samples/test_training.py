@@ -35,8 +35,8 @@ def test_streets_of_training_have_every_class_and_no_two_are_alike() -> None:
         some = varied(layout, 30.0)
         assert not layout.more and not layout.walks
         scene = Scene(some)
-        labels.append(np.bincount(scene.surface.label, minlength=256))
-        world = scene.truth_mesh().label
+        labels.append(np.bincount(scene.surface.classification, minlength=256))
+        world = scene.truth_mesh().classification
         assert world is not None and CODE["person"] not in world, "people are no part of a world"
     found = {name for name in CLASSES if name != "sky" and np.sum(labels, axis=0)[CODE[name]] > 0}
     assert found == set(CLASSES) - {"sky"}
@@ -53,8 +53,8 @@ def test_a_street_is_the_same_each_time_its_things_are_made() -> None:
 
 
 def test_channels_show_what_the_labels_show(made: Path) -> None:
-    for image, label in pairs(made):
-        codes = cv2.imread(str(label), cv2.IMREAD_GRAYSCALE)
+    for image, truth in pairs(made):
+        codes = cv2.imread(str(truth), cv2.IMREAD_GRAYSCALE)
         channels = read_channels(image, codes.shape)
         assert channels.shape == (codes.shape[0] // FRACTION, codes.shape[1] // FRACTION, 4)
         coarse = codes[FRACTION // 2 :: FRACTION, FRACTION // 2 :: FRACTION]

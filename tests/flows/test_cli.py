@@ -80,7 +80,7 @@ def test_rasters_are_made_where_they_are_asked_for(street: Path, world: Path, tm
     tile = read_tile(street)
     assert tile.truth_mesh is not None
     truth = Mesh.load(tile.truth_mesh)
-    ground = truth.keep(group_of()[truth.label] == GROUPS.index("terrain"))
+    ground = truth.keep(group_of()[truth.classification] == GROUPS.index("terrain"))
     with rasterio.open(next(out.glob("rasters/*_dtm.tif"))) as raster:
         assert raster.crs.to_epsg() == 32633
         middle = truth.frame.to_crs(ground.corners.mean(axis=1))

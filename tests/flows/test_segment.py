@@ -29,8 +29,8 @@ def test_points_get_their_classes_from_the_photos(small_street: Path, told: tupl
     after = las.read(out / "classified" / "cloud.laz", tile.frame)
     np.testing.assert_array_equal(before.xyz, after.xyz)
     np.testing.assert_array_equal(before.time, after.time)
-    assert before.label is not None and after.label is not None
-    iou = confusion(before.label, after.label).iou
+    assert before.classification is not None and after.classification is not None
+    iou = confusion(before.classification, after.classification).iou
     assert iou["road"] > 0.8 and iou["building"] > 0.85 and iou["high_vegetation"] > 0.8
     assert "known as" in printed and "road_sign" in printed
 
@@ -38,10 +38,10 @@ def test_points_get_their_classes_from_the_photos(small_street: Path, told: tupl
 def test_photos_get_labels_and_masks(small_street: Path, told: tuple[Path, str]) -> None:
     out, _ = told
     for view in read_tile(small_street).views:
-        label = cv2.imread(str(out / "labels" / f"{view.photo.stem}.png"), cv2.IMREAD_GRAYSCALE)
+        codes = cv2.imread(str(out / "labels" / f"{view.photo.stem}.png"), cv2.IMREAD_GRAYSCALE)
         mask = cv2.imread(str(out / "masks" / f"{view.photo.stem}.png"), cv2.IMREAD_GRAYSCALE)
-        assert label.shape == mask.shape == (view.camera.height, view.camera.width)
-        np.testing.assert_array_equal(mask == 0, np.isin(label, (0, 66, 67)))
+        assert codes.shape == mask.shape == (view.camera.height, view.camera.width)
+        np.testing.assert_array_equal(mask == 0, np.isin(codes, (0, 66, 67)))
 
 
 def test_a_run_goes_on_from_there(small_street: Path, told: tuple[Path, str]) -> None:
@@ -56,8 +56,8 @@ def test_classes_that_are_there_are_kept(small_street: Path, tmp_path: Path) -> 
     tile = read_tile(small_street)
     before = las.read(tile.clouds[0], tile.frame)
     after = las.read(tmp_path / "classified" / "cloud.laz", tile.frame)
-    assert before.label is not None and after.label is not None
-    np.testing.assert_array_equal(before.label, after.label)
+    assert before.classification is not None and after.classification is not None
+    np.testing.assert_array_equal(before.classification, after.classification)
     assert not list((tmp_path / "labels").glob("*.png"))
 
 

@@ -59,7 +59,7 @@ def test_where_classes_meet_there_is_no_hole(made: Path, survey: Path) -> None:
         tile = read_tile(path)
         assert tile.cell is not None
         cloud = las.read(tile.clouds[0], tile.frame)
-        group = group_of()[cloud.label]
+        group = group_of()[cloud.classification]
         xyz = cloud.xyz[tile.cell.outside(cloud.xyz[:, :2] + np.asarray(tile.frame.origin)[:2]) < -0.2]
         group = group[tile.cell.outside(cloud.xyz[:, :2] + np.asarray(tile.frame.origin)[:2]) < -0.2]
         ground, wall = xyz[group == GROUPS.index("terrain")], xyz[group == GROUPS.index("building")]

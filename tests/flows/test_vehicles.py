@@ -45,8 +45,8 @@ def test_what_is_parked_is_kept_and_what_moved_is_not(tmp_path: Path) -> None:
     body = random.uniform((-2.2, -0.9, 0.2), (2.2, 0.9, 1.5), (500, 3))
     road = np.column_stack([random.uniform(-5, 25, (500, 2)), np.zeros(500)])
     xyz = np.concatenate([road, *(body + (*xy, 0.0) for xy in places.values())]).astype(np.float32)
-    label = np.repeat([CODE["road"], CODE["vehicle"]], [500, 1500]).astype(np.uint8)
-    PointCloud(frame, xyz, label=label).save(tmp_path / "cloud.npz")
+    classification = np.repeat([CODE["road"], CODE["vehicle"]], [500, 1500]).astype(np.uint8)
+    PointCloud(frame, xyz, classification=classification).save(tmp_path / "cloud.npz")
     features = [
         {
             "geometry": {

@@ -278,7 +278,7 @@ def cloud(frame: Frame, seed: int = 0, n: int = 60_000) -> PointCloud:
         frame,
         (xyz - np.asarray(frame.origin)).astype(np.float32),
         random.integers(0, 255, (n, 3), np.uint8),
-        label=np.full(n, CODE["road"], np.uint8),
+        classification=np.full(n, CODE["road"], np.uint8),
         time=np.arange(n, dtype=np.float64),
         intensity=random.integers(0, 65535, n, np.uint16),
     )
@@ -292,7 +292,7 @@ def overlapped(seeds: Mapping[str, tuple[float, float]], out: Path, missing: str
         whole = cloud(frame)
         outside = cell.outside(whole.xyz[:, :2] + np.asarray(frame.origin[:2]))
         part = whole.take(np.flatnonzero(outside <= 2.0))
-        replace(part, label=np.full(len(part), 2 + k, np.uint8)).save(out / f"{name}.npz")
+        replace(part, classification=np.full(len(part), 2 + k, np.uint8)).save(out / f"{name}.npz")
     for name, cell in where.items():
         inputs = {"cloud": out / f"{name}.npz"}
         inputs |= {f"cloud.{other}": out / f"{other}.npz" for other in where if other not in (name, missing)}
@@ -323,16 +323,16 @@ def test_overlap_loses_no_point_and_doubles_none(count: int, tmp_path: Path) -> 
         assert (inside == (outside <= 2))[sure].all()
         assert len(np.unique(times(points))) == len(points), "none twice"
         own = where[name].outside(everywhere(points)[:, :2]) <= -0.001
-        label = present(points.label)
-        assert (label[own] == labels[name]).all() and len(set(label.tolist())) > 1
-    taken = [times(found[name], present(found[name].label) == labels[name]) for name in seeds]
+        classification = present(points.classification)
+        assert (classification[own] == labels[name]).all() and len(set(classification.tolist())) > 1
+    taken = [times(found[name], present(found[name].classification) == labels[name]) for name in seeds]
     assert np.array_equal(np.sort(np.concatenate(taken)), times(whole)), "every point is one tile's own"
 
 
 def test_overlap_leaves_what_a_missing_neighbour_would_give(tmp_path: Path) -> None:
     seeds = {"a": (X - 4.0, Y), "b": (X + 4.0, Y), "c": (X, Y + 6.0)}
     found = overlapped(seeds, tmp_path, missing="c")["a"]
-    assert sorted(set(present(found.label).tolist())) == [2, 3]
+    assert sorted(set(present(found.classification).tolist())) == [2, 3]
     assert np.array_equal(times(found), times(PointCloud.load(tmp_path / "a.npz")))
 
 
@@ -341,12 +341,15 @@ def test_points_on_a_border_are_the_first_tiles(tmp_path: Path) -> None:
     for k, name in enumerate(seeds):
         frame = Frame("EPSG:32633", (X - k, Y, Z))
         xyz = np.array([[k, y, 0] for y in np.linspace(-1, 1, 50)], np.float32)
-        PointCloud(frame, xyz, label=np.full(50, 2 + k, np.uint8)).save(tmp_path / f"{name}.npz")
+        PointCloud(frame, xyz, classification=np.full(50, 2 + k, np.uint8)).save(tmp_path / f"{name}.npz")
     for name, other in (("a", "b"), ("b", "a")):
         cell = cells(seeds)[name]
         inputs = {"cloud": tmp_path / f"{name}.npz", f"cloud.{other}": tmp_path / f"{other}.npz"}
         done = go(OVERLAP, tmp_path / name, inputs, name=name, seed=cell.seed, neighbours=cell.neighbours)
-        assert np.all(PointCloud.load(done.files["cloud"]).label == 2) and done.facts["points"] == {"a": 50, "b": 0}
+        assert np.all(PointCloud.load(done.files["cloud"]).classification == 2) and done.facts["points"] == {
+            "a": 50,
+            "b": 0,
+        }
 
 
 def test_voxels_of_two_tiles_are_the_same_where_they_overlap(tmp_path: Path) -> None:
@@ -358,7 +361,7 @@ def test_voxels_of_two_tiles_are_the_same_where_they_overlap(tmp_path: Path) -> 
         xyz = everywhere(thin)
         both = np.abs(where["a"].beyond("b", xyz[:, :2])) < 1.8
         assert both.sum() > 1000
-        columns = (xyz, thin.rgb, thin.label, thin.time, thin.intensity)
+        columns = (xyz, thin.rgb, thin.classification, thin.time, thin.intensity)
         rows[name] = np.column_stack([column[both] for column in columns if column is not None])
     assert np.array_equal(rows["a"], rows["b"])
 
@@ -400,8 +403,8 @@ def test_geometry_asks_the_cells_own_points_alone(two: Any, tmp_path: Path) -> N
 def test_a_real_reconstruction_cut_in_two_meets_again(tmp_path: Path) -> None:
     frame = Frame("EPSG:32633", (391_204.0, 5_820_376.0, 33.0))
     whole = las.read(ROOT / "data_samples" / "tile" / "cloud.laz", frame)
-    assert whole.label is not None
-    whole = whole.take(np.flatnonzero(group_of()[whole.label] == GROUPS.index("terrain")))
+    assert whole.classification is not None
+    whole = whole.take(np.flatnonzero(group_of()[whole.classification] == GROUPS.index("terrain")))
     along = np.array([-0.6, 0.8])  # the street
     middle = np.array(frame.origin[:2])
     seeds = {name: tuple((middle + way * along).tolist()) for name, way in (("a", -10), ("b", 10))}

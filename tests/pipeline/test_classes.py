@@ -58,7 +58,7 @@ def test_codes_of_the_survey_are_ours_only_where_the_file_says_so(tmp_path: Path
 
 
 def test_what_is_written_here_is_read_as_ours(tmp_path: Path) -> None:
-    las.write(tmp_path / "own.laz", PointCloud(Frame(), np.zeros((5, 3), np.float32), label=LABEL[:5]))
+    las.write(tmp_path / "own.laz", PointCloud(Frame(), np.zeros((5, 3), np.float32), classification=LABEL[:5]))
     assert taken(tmp_path / "own.laz")[3] == 65
     code = np.full(N, 65, np.uint8)
     write_classified(foreign(tmp_path / "a.las"), tmp_path / "told.laz", code, code, code)
@@ -92,7 +92,7 @@ def test_points_that_vanish_are_named_with_their_share_and_what_to_do(tmp_path: 
     assert warning.startswith("60.0% of the points") and "unclassified 40.0%, code_31 20.0%" in warning
     assert '31 = "building"' in warning and "segment.overwrite=true" in warning
     cloud = PointCloud.load(done.files["cloud"])
-    cloud.take(np.flatnonzero(present(cloud.label) != 31)).save(tmp_path / "rest.npz")
+    cloud.take(np.flatnonzero(present(cloud.classification) != 31)).save(tmp_path / "rest.npz")
     told = split({"cloud": tmp_path / "rest.npz"}, SplitParams(), tmp_path / "split", silent)
     assert "Have all classes told anew" in told.warnings[-1] and "[classes]" not in told.warnings[-1]
 
@@ -110,5 +110,5 @@ def test_tiles_of_a_survey_hold_codes_as_the_corridor_says(tmp_path: Path) -> No
     survey = read_survey(cut_survey(path, tmp_path / "survey", CutParams(length=100.0), warn=told.append))
     assert len(told) == 1 and told[0].startswith("a.las: codes 200 (20.0%) are the survey's own")
     tile = read_tile(next(iter(survey.tiles.values())))
-    codes = clouds.meanings(tile.clouds[0], tile.classes)[clouds.read(tile.clouds[0], tile.frame).label]
+    codes = clouds.meanings(tile.clouds[0], tile.classes)[clouds.read(tile.clouds[0], tile.frame).classification]
     assert np.unique(codes).tolist() == [1, 2, 31, 69]

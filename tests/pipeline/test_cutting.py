@@ -56,7 +56,7 @@ def points(n: int = 200_000, seed: int = 0, frame: Frame = UTM) -> PointCloud:
         frame,
         np.column_stack([xy, rng.uniform(0, 8, n)]).astype(np.float32),
         rng.integers(0, 256, (n, 3)).astype(np.uint8),
-        label=rng.choice([2, 6, 69], n).astype(np.uint8),
+        classification=rng.choice([2, 6, 69], n).astype(np.uint8),
         time=100 + along / 10,
         intensity=rng.integers(0, 65536, n).astype(np.uint16),
     )
@@ -113,14 +113,14 @@ def tiles(survey: Path) -> dict[str, Tile]:
 
 def rows(files: Iterator[Path] | list[Path], frame: Frame) -> np.ndarray:
     """(N,) records of all points of files, in their order: thousandths of CRS units, and attributes."""
-    kinds = [("place", "<i8", 3), ("rgb", "u1", 3), ("label", "u1"), ("time", "f8"), ("intensity", "u2")]
+    kinds = [("place", "<i8", 3), ("rgb", "u1", 3), ("classification", "u1"), ("time", "f8"), ("intensity", "u2")]
     out = []
     for file in files:
         raw = laspy.read(file)
         some = np.zeros(len(raw.points), kinds)
         some["place"] = np.rint(np.column_stack([raw.x, raw.y, raw.z]) * 1000)
         cloud = las.read(file, frame)
-        for name in ("rgb", "label", "time", "intensity"):
+        for name in ("rgb", "classification", "time", "intensity"):
             if getattr(cloud, name) is not None:
                 some[name] = getattr(cloud, name)
         out.append(some)
@@ -373,7 +373,7 @@ def test_clouds_of_all_kinds_join_as_in_a_tile(tmp_path: Path) -> None:
     first, middle, last = (clouds.read(tile.clouds[0], tile.frame) for tile in made.values())
     assert first.time is not None and first.intensity is not None and (first.rgb != 128).any()  # type: ignore[union-attr]
     assert middle.rgb is not None and (middle.rgb == 128).all(axis=1).mean() > 0.5
-    assert last.time is None and not last.intensity.any() and set(np.unique(last.label)) == {1, 2, 6, 69}  # type: ignore
+    assert last.time is None and not last.intensity.any() and set(np.unique(last.classification)) == {1, 2, 6, 69}  # type: ignore
 
 
 def test_chunks_are_what_reading_at_once_gives(tmp_path: Path) -> None:
@@ -387,7 +387,7 @@ def test_chunks_are_what_reading_at_once_gives(tmp_path: Path) -> None:
         moved = [replace(p, frame=UTM, xyz=UTM.to_local(p.frame.to_crs(p.xyz)).astype(np.float32)) for p in parts]
         joined = PointCloud.join(moved)
         assert np.abs(joined.xyz - whole.xyz).max() < 1e-4
-        for name in ("rgb", "label", "time", "intensity"):
+        for name in ("rgb", "classification", "time", "intensity"):
             assert np.array_equal(getattr(joined, name), getattr(whole, name)), name
 
 

@@ -78,7 +78,7 @@ def survey(seconds: float = SECONDS, *, off: float = 0.0, begin: float = 0.0, le
             PointCloud(
                 Frame(),
                 (o + d[good] * noisy[:, None] + shift).astype(np.float32),
-                label=np.array(kinds, np.uint8)[what[good]],
+                classification=np.array(kinds, np.uint8)[what[good]],
                 time=np.full(good.sum(), begin + time),
             )
         )
@@ -102,9 +102,9 @@ def carve(cloud: PointCloud, out: Path, way: Trajectory | None, **params: Any) -
 
 def lost(cloud: PointCloud, done: Done) -> dict[int, float]:
     """Share of each kind's points that are gone."""
-    kept = PointCloud.load(done.files["cloud"]).label
-    assert cloud.label is not None and kept is not None
-    before, after = np.bincount(cloud.label, minlength=10), np.bincount(kept, minlength=10)
+    kept = PointCloud.load(done.files["cloud"]).classification
+    assert cloud.classification is not None and kept is not None
+    before, after = np.bincount(cloud.classification, minlength=10), np.bincount(kept, minlength=10)
     return {kind: float(1 - after[kind] / before[kind]) for kind in np.flatnonzero(before).tolist()}
 
 
@@ -160,12 +160,14 @@ def test_a_profile_scanner_tells_nothing_in_one_pass(tmp_path: Path) -> None:
 def test_the_recording_vehicle_and_cameras_have_room(street: PointCloud, tmp_path: Path) -> None:
     """Returns of the car's own roof and mirrors, and of something before a lens, go; the road below stays."""
     places = np.array([[5.0, 0.8, 1.2], [6.0, -0.5, 1.7], [20.0, 0.0, 0.6], [9.0, 6.0, 8.3], [9.0, 6.0, 9.2]])
-    extra = PointCloud(street.frame, places.astype(np.float32), label=np.full(5, POLE, np.uint8), time=np.full(5, 1.0))
+    extra = PointCloud(
+        street.frame, places.astype(np.float32), classification=np.full(5, POLE, np.uint8), time=np.full(5, 1.0)
+    )
     cloud = PointCloud.join([street, extra])
     done = carve(cloud, tmp_path, path(), cameras=((9.0, 6.0, 8.0),))
     kept = np.load(done.files["dropped"]) == 0
     assert kept[-5:].tolist() == [False, False, False, False, True]
-    assert cloud.label is not None and kept[cloud.label == GROUND].all()
+    assert cloud.classification is not None and kept[cloud.classification == GROUND].all()
 
 
 def test_what_stood_in_one_pass_and_not_in_the_next_goes(tmp_path: Path) -> None:

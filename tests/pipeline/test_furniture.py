@@ -59,10 +59,10 @@ def test_what_stands_in_a_street_is_found_and_nothing_else(street: tuple[Path, P
     # their points are no surface's any more, and their meshes are the classes' own
     cloud = PointCloud.load(street[0])
     done = SPLIT.run({"cloud": street[0], "taken": done.files["taken"]}, SplitParams(), tmp_path / "whole", silent)
-    left = PointCloud.load(done.files["building"]).label
-    assert cloud.label is not None and left is not None
+    left = PointCloud.load(done.files["building"]).classification
+    assert cloud.classification is not None and left is not None
     for code in (CODE["road_sign"], CODE["pole"]):
-        assert (left == code).sum() < 0.25 * (cloud.label == code).sum()  # the lamp's arm is left
+        assert (left == code).sum() < 0.25 * (cloud.classification == code).sum()  # the lamp's arm is left
 
 
 def test_signs_look_where_they_look_in_their_size(street: tuple[Path, Path], tmp_path: Path) -> None:
@@ -101,11 +101,11 @@ def test_things_keep_their_triangles_and_classes_within_the_target(tmp_path: Pat
     Mesh(FRAME, vertices, faces.astype(np.int32)).save(tmp_path / "surface.npz")
     pole = primitives.tube([(5, 5, 0), (5, 5, 3)], [0.03, 0.03], 8)
     codes = np.full(len(pole[1]), CODE["pole"], np.uint8)
-    Mesh(FRAME, pole[0].astype(np.float32), pole[1], label=codes).save(tmp_path / "things.npz")
+    Mesh(FRAME, pole[0].astype(np.float32), pole[1], classification=codes).save(tmp_path / "things.npz")
     inputs = {"mesh": tmp_path / "surface.npz", "furniture": tmp_path / "things.npz"}
     mesh = Mesh.load(DECIMATE.run(inputs, DecimateParams(target=10_000), tmp_path, silent).files["mesh"])
-    assert len(mesh) <= 10_000 and mesh.label is not None
-    kept = mesh.keep(mesh.label == CODE["pole"])
+    assert len(mesh) <= 10_000 and mesh.classification is not None
+    kept = mesh.keep(mesh.classification == CODE["pole"])
     assert len(kept) == len(codes) and kept.vertices[:, 2].max() == 3
 
 

@@ -32,7 +32,7 @@ def scanned(folder: Path, frame: Frame, name: str = "cloud.laz") -> Cloud:
     xyz[:2] = [-10, -5, -2.5], [10, 5, 2.5]
     rgb = np.full((100, 3), 90, np.uint8)
     time = np.linspace(ADJUSTED, ADJUSTED + 60, 100)
-    cloud = PointCloud(frame, xyz.astype(np.float32), rgb, label=np.full(100, 2, np.uint8), time=time)
+    cloud = PointCloud(frame, xyz.astype(np.float32), rgb, classification=np.full(100, 2, np.uint8), time=time)
     las.write(folder / name, cloud)
     return Cloud(folder / name, clouds.read_header(folder / name), digest(folder / name))
 

@@ -24,7 +24,7 @@ def test_frame_there_and_back_in_feet() -> None:
 def test_what_is_saved_comes_back(tmp_path: Path) -> None:
     random = np.random.default_rng(0)
     cloud = PointCloud(
-        FRAME, random.random((5, 3), np.float32), time=random.random(5), label=np.arange(5, dtype=np.uint8)
+        FRAME, random.random((5, 3), np.float32), time=random.random(5), classification=np.arange(5, dtype=np.uint8)
     )
     cloud.save(tmp_path / "c.npz")
     back = PointCloud.load(tmp_path / "c.npz")
@@ -57,10 +57,10 @@ def test_numbers_of_numpy_are_saved_and_loaded(tmp_path: Path, kind: type) -> No
 
 def test_join_fills_what_some_clouds_lack() -> None:
     a = PointCloud(FRAME, np.zeros((2, 3), np.float32), rgb=np.zeros((2, 3), np.uint8), time=np.zeros(2))
-    b = PointCloud(FRAME, np.ones((3, 3), np.float32), label=np.full(3, 6, np.uint8))
+    b = PointCloud(FRAME, np.ones((3, 3), np.float32), classification=np.full(3, 6, np.uint8))
     both = PointCloud.join([a, b])
     assert both.rgb is not None and both.rgb[2:].tolist() == [[128] * 3] * 3
-    assert both.label is not None and both.label.tolist() == [1, 1, 6, 6, 6]
+    assert both.classification is not None and both.classification.tolist() == [1, 1, 6, 6, 6]
     assert both.time is None
 
 

@@ -100,11 +100,15 @@ def side_of(x: float, y0: float, y1: float, z0: float, z1: float, step: float = 
     return np.column_stack([np.full(y.size, x), y, z]).astype(np.float32)
 
 
-def cloud_of(*parts: F32, label: U8 | None = None, time: F64 | None = None) -> PointCloud:
+def cloud_of(*parts: F32, classification: U8 | None = None, time: F64 | None = None) -> PointCloud:
     """Points that look towards the camera."""
     xyz = np.concatenate(parts)
     return PointCloud(
-        Frame(), xyz, normal=np.tile(np.array([-1, 0, 0], np.float32), (len(xyz), 1)), label=label, time=time
+        Frame(),
+        xyz,
+        normal=np.tile(np.array([-1, 0, 0], np.float32), (len(xyz), 1)),
+        classification=classification,
+        time=time,
     )
 
 
@@ -130,7 +134,7 @@ def test_points_without_a_mesh_hide_what_is_behind_them() -> None:
 
 def test_the_trail_of_what_drove_past_hides_only_while_it_was_there() -> None:
     wall, trail = side_of(8.0, -2, 2.05, 0, 3.05), side_of(4.0, -1, 0.5, 0.5, 2.5)
-    label = np.repeat(np.array([6, 66], np.uint8), [len(wall), len(trail)])
+    classification = np.repeat(np.array([6, 66], np.uint8), [len(wall), len(trail)])
     passed = np.concatenate([np.full(len(wall), 100.0), np.linspace(100.0, 100.2, len(trail))])
     stood = np.concatenate([np.full(len(wall), 100.0), np.linspace(100.0, 104.0, len(trail))])
     camera, pose = CAMERAS["pinhole"], forward_pose()
@@ -139,7 +143,7 @@ def test_the_trail_of_what_drove_past_hides_only_while_it_was_there() -> None:
         depth = depth_map(camera, pose, scene([WALL], cloud), time=time)
         return bool(visible(depth, ON_WALL[:1], FACING[:1])[0])
 
-    moving, parked = (cloud_of(wall, trail, label=label, time=t) for t in (passed, stood))
+    moving, parked = (cloud_of(wall, trail, classification=classification, time=t) for t in (passed, stood))
     assert not sees_wall(moving, 100.2)
     assert sees_wall(moving, 103.0)
     assert sees_wall(moving, 97.0)
@@ -174,8 +178,8 @@ def test_things_of_their_own_hide_though_their_points_are_in_no_surfaces_cloud()
         Frame(), ground.vertices, normal=np.tile(np.array([0, 0, 1], np.float32), (len(ground.vertices), 1))
     )
     behind = [[6.0, 0.0, 1.0]]
-    for label, hidden in ((0, False), (64, True)):
-        mesh = replace(pole, label=np.full(len(pole), label, np.uint8))
+    for classification, hidden in ((0, False), (64, True)):
+        mesh = replace(pole, classification=np.full(len(pole), classification, np.uint8))
         hides = scene([ground, mesh], cloud)
         depth = depth_map(CAMERAS["pinhole"], forward_pose(z=1.5), hides)
         assert visible(depth, behind).tolist() == [not hidden]

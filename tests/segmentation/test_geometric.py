@@ -65,26 +65,26 @@ def street(slope: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     return xyz.astype(np.float32), np.concatenate([np.full(len(points), code) for code, points in parts])
 
 
-def recalls(label: np.ndarray, truth: np.ndarray) -> dict[str, float]:
-    told, true = (np.array([GROUPS.get(code, "none") for code in codes.tolist()]) for codes in (label, truth))
+def recalls(classification: np.ndarray, truth: np.ndarray) -> dict[str, float]:
+    told, true = (np.array([GROUPS.get(code, "none") for code in codes.tolist()]) for codes in (classification, truth))
     return {group: float(np.mean(told[true == group] == group)) for group in set(GROUPS.values())}
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.06])
 def test_a_street_is_told_apart(slope: float) -> None:
     xyz, truth = street(slope)
-    label = classify(PointCloud(Frame(), xyz))
-    recall = recalls(label, truth)
+    classification = classify(PointCloud(Frame(), xyz))
+    recall = recalls(classification, truth)
     bars = {"ground": 0.98, "building": 0.95, "plant": 0.9, "vehicle": 0.8, "pole": 0.8}
     assert all(recall[group] >= bar for group, bar in bars.items()), recall
-    told = recalls(truth, label)  # the other way round: precision
+    told = recalls(truth, classification)  # the other way round: precision
     assert all(told[group] >= 0.8 for group in bars), told
 
 
 def test_plants_are_classed_by_their_height() -> None:
     xyz, truth = street()
-    label = classify(PointCloud(Frame(), xyz))
-    tall, hedge = label[(truth == 5) & (xyz[:, 2] > 3)], label[(truth == 4) & (xyz[:, 2] > 0.7)]
+    classification = classify(PointCloud(Frame(), xyz))
+    tall, hedge = classification[(truth == 5) & (xyz[:, 2] > 3)], classification[(truth == 4) & (xyz[:, 2] > 0.7)]
     assert np.mean(tall == CODE["high_vegetation"]) > 0.9
     assert np.mean(hedge == CODE["mid_vegetation"]) > 0.8
 
@@ -113,7 +113,7 @@ def test_tiny_clouds_get_classes_of_some_kind(n: int) -> None:
 
 def test_a_cloud_keeps_its_own_classes_unless_told_otherwise(tmp_path: Path) -> None:
     xyz, truth = street()
-    cloud = PointCloud(Frame(), xyz, label=truth.astype(np.uint8), time=np.arange(len(xyz), dtype=np.float64))
+    cloud = PointCloud(Frame(), xyz, classification=truth.astype(np.uint8), time=np.arange(len(xyz), dtype=np.float64))
     cloud.save(tmp_path / "in.npz")
     inputs = {"cloud": tmp_path / "in.npz"}
 
@@ -123,16 +123,18 @@ def test_a_cloud_keeps_its_own_classes_unless_told_otherwise(tmp_path: Path) -> 
         return PointCloud.load(done.files["cloud"]), done.facts
 
     kept, facts = run("kept")
-    assert np.array_equal(present(kept.label), truth) and facts["source"] == "cloud"
+    assert np.array_equal(present(kept.classification), truth) and facts["source"] == "cloud"
     assert facts["points"]["terrain"] == int((truth == 2).sum())
     anew, facts = run("anew", overwrite=True)
-    assert facts["source"] == "shape" and not np.array_equal(present(anew.label), truth)
+    assert facts["source"] == "shape" and not np.array_equal(present(anew.classification), truth)
     assert np.array_equal(present(anew.time), present(cloud.time)) and np.array_equal(anew.xyz, xyz)
 
-    replace(cloud, label=np.where(np.arange(len(xyz)) % 10 == 0, truth, 1).astype(np.uint8)).save(inputs["cloud"])
+    replace(cloud, classification=np.where(np.arange(len(xyz)) % 10 == 0, truth, 1).astype(np.uint8)).save(
+        inputs["cloud"]
+    )
     assert run("few")[1]["source"] == "shape"  # a tenth of the points is too little
     assert run("enough", min_classified=0.05)[1]["source"] == "cloud"
-    replace(cloud, label=None).save(inputs["cloud"])
+    replace(cloud, classification=None).save(inputs["cloud"])
     assert run("none", min_classified=0.0)[1]["source"] == "shape"
     assert SEGMENT.name == "segment"
 
@@ -140,10 +142,10 @@ def test_a_cloud_keeps_its_own_classes_unless_told_otherwise(tmp_path: Path) -> 
 def test_an_airborne_survey_agrees_with_its_own_classes(real_data: Path, tmp_path: Path) -> None:
     tile = read_tile(import_las(sorted((real_data / "las").glob("ign_77*.laz")), tmp_path / "tile"))
     cloud = PointCloud.join([clouds.read(path, tile.frame) for path in tile.clouds])
-    assert cloud.label is not None
-    known = np.isin(cloud.label, (2, 3, 4, 5, 6))
-    label, truth = classify(cloud)[known], cloud.label[known]
+    assert cloud.classification is not None
+    known = np.isin(cloud.classification, (2, 3, 4, 5, 6))
+    classification, truth = classify(cloud)[known], cloud.classification[known]
     for group, bar in (("ground", 0.97), ("plant", 0.72), ("building", 0.76)):
         codes = [code for code, name in GROUPS.items() if name == group]
-        told, true = np.isin(label, codes), np.isin(truth, codes)
+        told, true = np.isin(classification, codes), np.isin(truth, codes)
         assert (told & true).sum() / (told | true).sum() > bar, group

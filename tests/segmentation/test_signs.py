@@ -91,8 +91,8 @@ def _run(folder: Path, plates: list[Plate], known: list[Plate]) -> Done:
     before = np.array([(13.8, -3.1, 3.1), (13.8, -2.9, 3.1), (13.8, -3, 3.3), (5, 9, 0), (5, 9, 3), (6, 9, 0)])
     parts += [((before, np.array([[0, 1, 2], [3, 4, 5]], np.int32)), 0)]
     vertices, faces = primitives.join([part for part, _ in parts])
-    label = np.concatenate([np.full(len(part[1]), code, np.uint8) for part, code in parts])
-    Mesh(FRAME, vertices.astype(np.float32), faces, label=label).save(folder / "building.npz")
+    classification = np.concatenate([np.full(len(part[1]), code, np.uint8) for part, code in parts])
+    Mesh(FRAME, vertices.astype(np.float32), faces, classification=classification).save(folder / "building.npz")
     flat = np.array([(-20, -20, 0), (40, -20, 0), (40, 20, 0), (-20, 20, 0)], np.float32)
     Mesh(FRAME, flat, np.array([[0, 1, 2], [0, 2, 3]], np.int32)).save(folder / "terrain.npz")
     (folder / "plates.json").write_text(json.dumps([plate.to_json() for plate in known]))
@@ -131,10 +131,10 @@ def test_a_sign_is_whole_where_photos_show_it(tmp_path: Path, known: list[Plate]
         assert np.ptp(front @ plate.across) == pytest.approx(plate.width, abs=0.03)
         assert np.ptp(front @ plate.normal) < 0.1
     mesh = Mesh.load(done.files["building"])
-    assert mesh.label is not None
-    pole = mesh.vertices[np.unique(mesh.faces[mesh.label == CODE["pole"]])]
+    assert mesh.classification is not None
+    pole = mesh.vertices[np.unique(mesh.faces[mesh.classification == CODE["pole"]])]
     assert ((pole - SIGN.centre) @ SIGN.normal).max() < 0  # it stands behind its plate
-    assert (mesh.label == 0).sum() == 1  # what points made before the plate is gone
+    assert (mesh.classification == 0).sum() == 1  # what points made before the plate is gone
     (feature,) = json.loads(done.files["geojson"].read_text())["features"]
     told = feature["properties"]
     assert told["kind"] == "sign" and told["shape"] == "disc" and told["radius_m"] == 0.04

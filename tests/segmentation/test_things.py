@@ -55,11 +55,15 @@ SCENE: dict[str, tuple[F32, int]] = {
 def street(out: Path, wrong: dict[str, float] | None = None, kind: int = PHOTO, **more: F32) -> dict[str, Path]:
     """The scene's inputs; of things in `wrong` that share of points, at one end, is told to be of a building."""
     parts = {**{name: xyz for name, (xyz, _) in SCENE.items()}, **more}
-    label = {name: np.full(len(xyz), SCENE.get(name, (None, HEDGE))[1], np.uint8) for name, xyz in parts.items()}
+    classification = {
+        name: np.full(len(xyz), SCENE.get(name, (None, HEDGE))[1], np.uint8) for name, xyz in parts.items()
+    }
     for name, share in (wrong or {}).items():
         x = parts[name][:, 0]
-        label[name][x < np.quantile(x, share)] = BUILDING
-    cloud = PointCloud(FRAME, np.concatenate(list(parts.values())), label=np.concatenate(list(label.values())))
+        classification[name][x < np.quantile(x, share)] = BUILDING
+    cloud = PointCloud(
+        FRAME, np.concatenate(list(parts.values())), classification=np.concatenate(list(classification.values()))
+    )
     cloud.save(out / "in.npz")
     n = len(cloud)
     np.savez(out / "sure.npz", confidence=np.full(n, 200, np.uint8), source=np.full(n, kind, np.uint8))
@@ -74,10 +78,10 @@ def go(inputs: dict[str, Path], out: Path, **params: Any) -> Done:
 
 def told(done: Done, *more: F32) -> dict[str, np.ndarray]:
     """Classes of every thing's points."""
-    label = PointCloud.load(done.files["cloud"]).label
-    assert label is not None
+    classification = PointCloud.load(done.files["cloud"]).classification
+    assert classification is not None
     ends = np.cumsum([len(xyz) for xyz, _ in SCENE.values()] + [len(xyz) for xyz in more])
-    return dict(zip([*SCENE, *map(str, range(len(more)))], np.split(label, ends[:-1]), strict=True))
+    return dict(zip([*SCENE, *map(str, range(len(more)))], np.split(classification, ends[:-1]), strict=True))
 
 
 def features(done: Done) -> list[dict[str, Any]]:
@@ -155,7 +159,7 @@ def test_the_end_of_a_trail_goes_with_it(tmp_path: Path) -> None:
 def test_classes_of_the_cloud_itself_stay_as_they_are(tmp_path: Path) -> None:
     inputs = street(tmp_path, {"car": 0.2}, OWN)
     done = go(inputs, tmp_path)
-    before, after = (present(PointCloud.load(path).label) for path in (inputs["cloud"], done.files["cloud"]))
+    before, after = (present(PointCloud.load(path).classification) for path in (inputs["cloud"], done.files["cloud"]))
     assert np.array_equal(before, after)
     assert {f["properties"]["kind"] for f in features(done)} >= {"car", "van"}, "but its vehicles are listed"
 
@@ -164,10 +168,10 @@ def test_people_are_whole(tmp_path: Path) -> None:
     person = shell((0.5, 0.4, 1.75), (4, -3), 0.0)
     inputs = street(tmp_path, person=person)
     cloud = PointCloud.load(inputs["cloud"])
-    assert cloud.label is not None
-    label = cloud.label.copy()
-    label[len(label) - len(person) + len(person) // 3 :] = CODE["person"]
-    replace(cloud, label=label).save(inputs["cloud"])
+    assert cloud.classification is not None
+    classification = cloud.classification.copy()
+    classification[len(classification) - len(person) + len(person) // 3 :] = CODE["person"]
+    replace(cloud, classification=classification).save(inputs["cloud"])
     done = go(inputs, tmp_path)
     assert done.facts["people"] == 1
     assert (told(done, person)["0"][person[:, 2] > 0.25] == CODE["person"]).mean() > 0.98
@@ -177,10 +181,10 @@ def test_a_post_that_is_told_to_be_a_person_in_part_stays(tmp_path: Path) -> Non
     post = shell((0.4, 0.3, 1.05), (4, -3), 0.0)
     inputs = street(tmp_path, person=post)
     cloud = PointCloud.load(inputs["cloud"])
-    assert cloud.label is not None
-    label = cloud.label.copy()
-    label[-len(post) :][post[:, 2] > 0.7] = CODE["person"]
-    replace(cloud, label=label).save(inputs["cloud"])
+    assert cloud.classification is not None
+    classification = cloud.classification.copy()
+    classification[-len(post) :][post[:, 2] > 0.7] = CODE["person"]
+    replace(cloud, classification=classification).save(inputs["cloud"])
     done = go(inputs, tmp_path)
     assert done.facts["people"] == 0
     assert (told(done, post)["0"] == HEDGE).mean() > 0.95

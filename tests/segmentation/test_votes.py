@@ -42,7 +42,7 @@ def labelled(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, U8]:
         index = index_of_code()[codes[::2, ::2]]
         np.save(folder / "labels" / f"{i}.npy", np.uint8(255) * (index[..., None] == np.arange(len(CLASSES))))
     (folder / "labels" / "network.json").write_text(json.dumps({"tells": CLASSES}))
-    return folder, present(cloud.label)
+    return folder, present(cloud.classification)
 
 
 def segment(
@@ -54,7 +54,7 @@ def segment(
     from scan2sim.pipeline.types import PointCloud
 
     with np.load(done.files["confidence"]) as beside:
-        return present(PointCloud.load(done.files["cloud"]).label), dict(beside), done
+        return present(PointCloud.load(done.files["cloud"]).classification), dict(beside), done
 
 
 def test_photos_that_are_right_make_points_right(labelled: tuple[Path, U8], tmp_path: Path) -> None:
@@ -103,7 +103,7 @@ def test_a_network_that_knows_only_vegetation_has_it_parted_by_height(
     done = SEGMENT.run(inputs, SEGMENT.params(), tmp_path, silent)
     from scan2sim.pipeline.types import PointCloud
 
-    iou = confusion(truth, present(PointCloud.load(done.files["cloud"]).label)).iou
+    iou = confusion(truth, present(PointCloud.load(done.files["cloud"]).classification)).iou
     assert iou["low_vegetation"] > 0.5 and iou["high_vegetation"] > 0.85
 
 
@@ -122,14 +122,14 @@ def test_classes_that_are_there_are_kept_and_photos_not_looked_at(labelled: tupl
 
     folder, truth = labelled
     cloud = PointCloud.load(folder / "cloud.npz")
-    PointCloud(cloud.frame, cloud.xyz, label=truth).save(tmp_path / "own.npz")
+    PointCloud(cloud.frame, cloud.xyz, classification=truth).save(tmp_path / "own.npz")
     for name in ("label", "kept"):
         (tmp_path / name).mkdir()
     inputs = {"cloud": tmp_path / "own.npz", "views": folder / "views.json"}
     done = LABEL.run(inputs, LabelParams(network="nonsense"), tmp_path / "label", silent)
     assert done.facts["photos"] == 0 and "classes" in done.facts["why"]
     kept = SEGMENT.run(inputs | {"labels": done.files["labels"]}, SEGMENT.params(), tmp_path / "kept", silent)
-    np.testing.assert_array_equal(PointCloud.load(kept.files["cloud"]).label, truth)
+    np.testing.assert_array_equal(PointCloud.load(kept.files["cloud"]).classification, truth)
 
 
 def test_ground_codes_and_vehicles_have_their_own_classes(labelled: tuple[Path, U8], tmp_path: Path) -> None:

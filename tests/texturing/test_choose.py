@@ -12,7 +12,9 @@ from scan2sim.texturing.choose import Choice, with_whole_signs
 
 def test_a_plates_side_is_painted_from_the_photos_that_see_all_of_it_finely() -> None:
     vertices, faces = primitives.plate([(0, 0, 0), (0, 1, 0), (0, 1, 1), (0, 0, 1)], (0.02, 0, 0))
-    mesh = Mesh(Frame(), vertices.astype(np.float32), faces, label=np.full(len(faces), CODE["road_sign"], np.uint8))
+    mesh = Mesh(
+        Frame(), vertices.astype(np.float32), faces, classification=np.full(len(faces), CODE["road_sign"], np.uint8)
+    )
     front = np.flatnonzero(mesh.face_normal[:, 0] < -0.9)
     view, quality = np.full((len(faces), 4), -1, np.int32), np.zeros((len(faces), 4), np.float32)
     view[front], quality[front] = [2, 0, 1, 3], [0.04, 0.03, 0.02, 0.003]

@@ -113,7 +113,11 @@ def _points(values: dict[str, F64], places: tuple[str, ...], pose: F64, node: An
     if time is not None and node.isDefined("acquisitionStart/dateTimeValue"):
         time = time + node["acquisitionStart"]["dateTimeValue"].value()
     return Points(
-        xyz @ pose[:3, :3].T + pose[:3, 3], rgb, label=values.get("classification"), time=time, intensity=intensity
+        xyz @ pose[:3, :3].T + pose[:3, 3],
+        rgb,
+        classification=values.get("classification"),
+        time=time,
+        intensity=intensity,
     )
 
 

@@ -98,7 +98,7 @@ def _laszip(tile: Path) -> Iterator[Points]:
         yield Points(
             np.column_stack([part.x, part.y, part.z]),
             np.column_stack([part.red, part.green, part.blue]) if "red" in names else None,
-            label=np.array(part.classification),
+            classification=np.array(part.classification),
             time=np.array(part.gps_time) if "gps_time" in names else None,
             intensity=np.array(part.intensity),
         )
@@ -120,7 +120,7 @@ def _packed(tile: Path, schema: Schema, count: int) -> Iterator[Points]:
         yield Points(
             np.column_stack([np.asarray(column(rows, axis), np.float64) for axis in "XYZ"]),
             None if any(values is None for values in rgb) else np.column_stack(rgb),
-            label=column(rows, "Classification"),
+            classification=column(rows, "Classification"),
             time=column(rows, "GpsTime"),
             intensity=column(rows, "Intensity"),
         )

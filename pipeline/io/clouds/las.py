@@ -107,7 +107,7 @@ def read(path: Path, frame: Frame) -> PointCloud:
         names = set(reader.header.point_format.dimension_names)
         try:
             xyz = np.empty((n, 3), np.float32)
-            label = np.empty(n, np.uint8)
+            classification = np.empty(n, np.uint8)
             intensity = np.empty(n, np.uint16)
             time = np.empty(n, np.float64) if "gps_time" in names else None
             rgb = np.empty((n, 3), np.uint16) if "red" in names else None
@@ -117,7 +117,7 @@ def read(path: Path, frame: Frame) -> PointCloud:
         for part in _parts(path, reader, CHUNK):
             here = slice(at, at + len(part))
             xyz[here] = frame.to_local(_places(part))
-            label[here] = part.classification
+            classification[here] = part.classification
             intensity[here] = part.intensity
             if time is not None:
                 time[here] = part.gps_time
@@ -126,7 +126,7 @@ def read(path: Path, frame: Frame) -> PointCloud:
             at += len(part)
     if time is not None and not time.any():  # a format with times that were never filled
         time = None
-    return PointCloud(frame, xyz, _eight_bits(rgb), label=label, time=time, intensity=intensity)
+    return PointCloud(frame, xyz, _eight_bits(rgb), classification=classification, time=time, intensity=intensity)
 
 
 def class_names(path: Path) -> tuple[bool, dict[int, str]]:
@@ -165,7 +165,7 @@ def chunks(path: Path, frame: Frame, size: int = CHUNK) -> Iterator[PointCloud]:
                 near,
                 near.to_local(places).astype(np.float32),
                 None if shift is None else (_colours(part) >> shift).astype(np.uint8),
-                label=np.array(part.classification, np.uint8),
+                classification=np.array(part.classification, np.uint8),
                 time=np.array(part.gps_time, np.float64) if timed else None,
                 intensity=np.array(part.intensity, np.uint16),
             )
@@ -221,8 +221,8 @@ def _record(cloud: PointCloud, header: Any) -> Any:
 
     record = laspy.ScaleAwarePointRecord.zeros(len(cloud), header=header)
     record["x"], record["y"], record["z"] = cloud.frame.to_crs(cloud.xyz).T
-    if cloud.label is not None:
-        record["classification"] = cloud.label
+    if cloud.classification is not None:
+        record["classification"] = cloud.classification
     if cloud.time is not None:
         record["gps_time"] = cloud.time
     if cloud.intensity is not None:

@@ -214,7 +214,7 @@ def _points(path: Path, rows: npt.NDArray[Any]) -> Points:
         rgb = np.column_stack([rows[name] for name in "rgb"])
     else:
         rgb = None
-    return Points(xyz, rgb, label=first(CLASSES), time=first(TIMES), intensity=first(INTENSITIES))
+    return Points(xyz, rgb, classification=first(CLASSES), time=first(TIMES), intensity=first(INTENSITIES))
 
 
 def _short(path: Path, there: int, count: int) -> InputError:

@@ -139,7 +139,7 @@ def _parts(path: Path) -> Iterator[Points]:
         yield Points(
             np.column_stack([rows[axis].astype(np.float64) for axis in "xyz"]),
             None if three is None else np.column_stack([rows[name] for name in three]),
-            label=first(CLASSES),
+            classification=first(CLASSES),
             time=first(TIMES),
             intensity=first(INTENSITIES),
         )

@@ -103,7 +103,7 @@ def _points(values: F64, form: _Form) -> Points:
     return Points(
         np.column_stack([column[axis] for axis in "xyz"]),
         np.column_stack([column[c] for c in "rgb"]) if {"r", "g", "b"} <= set(column) else None,
-        label=column.get("class"),
+        classification=column.get("class"),
         time=column.get("time"),
         intensity=column.get("intensity"),
     )

@@ -30,7 +30,7 @@ PLACES = {"bounds": 179, "count": 247, "vlrs": 100, "extended": 235, "scale": 13
 def made(path: Path, n: int = 3000, reach: float = 20.0) -> Path:
     rng = np.random.default_rng(0)
     xyz = rng.uniform(0, reach, (n, 3)).astype(np.float32)
-    las.write(path, PointCloud(FRAME, xyz, label=np.full(n, 2, np.uint8)))
+    las.write(path, PointCloud(FRAME, xyz, classification=np.full(n, 2, np.uint8)))
     return path
 
 

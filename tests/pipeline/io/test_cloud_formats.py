@@ -46,14 +46,14 @@ def write_copc(path: Path, cloud: PointCloud, levels: int = 2) -> None:
     keys, node = np.unique(np.column_stack([depth, cell]), axis=0, return_inverse=True)
     writer = copclib.FileWriter(str(path), config)
     rgb, time = present(cloud.rgb), present(cloud.time)
-    label, intensity = present(cloud.label), present(cloud.intensity)
+    classification, intensity = present(cloud.classification), present(cloud.intensity)
     for k, key in enumerate(keys.tolist()):
         points = copclib.Points(header)
         for i in np.flatnonzero(node.ravel() == k):
             point = points.CreatePoint()
             point.x, point.y, point.z = xyz[i]
             point.red, point.green, point.blue = (int(v) * 257 for v in rgb[i])
-            point.classification, point.intensity = int(label[i]), int(intensity[i])
+            point.classification, point.intensity = int(classification[i]), int(intensity[i])
             point.gps_time = time[i]
             points.AddPoint(point)
         writer.AddNode(copclib.VoxelKey(*key), points)
@@ -91,7 +91,7 @@ def pcd(data: str, double: bool = True) -> Callable[[Path, PointCloud], None]:
             rows[axis] = cloud.frame.to_crs(cloud.xyz)[:, i] if double else cloud.xyz[:, i]
         red, green, blue = present(cloud.rgb).astype(np.uint32).T
         rows["rgb"] = red << 16 | green << 8 | blue
-        rows["label"], rows["intensity"] = cloud.label, cloud.intensity
+        rows["label"], rows["intensity"] = cloud.classification, cloud.intensity
         write_pcd(path, rows, data)
 
     return write
@@ -164,10 +164,12 @@ def text(delimiter: str, heading: str | None, wide: bool = False) -> Callable[[P
     def write(path: Path, cloud: PointCloud) -> None:
         rows = [heading] if heading else []
         colours = present(cloud.rgb).astype(int) * (257 if wide else 1)
-        for place, rgb, intensity, label in zip(
-            cloud.frame.to_crs(cloud.xyz), colours, present(cloud.intensity), present(cloud.label), strict=True
+        for place, rgb, intensity, classification in zip(
+            cloud.frame.to_crs(cloud.xyz), colours, present(cloud.intensity), present(cloud.classification), strict=True
         ):
-            rows.append(delimiter.join([*(f"{v:.4f}" for v in place), *map(str, rgb), str(intensity), str(label)]))
+            rows.append(
+                delimiter.join([*(f"{v:.4f}" for v in place), *map(str, rgb), str(intensity), str(classification)])
+            )
         path.write_text("\n".join(rows) + "\n")
 
     return write
@@ -201,7 +203,7 @@ def ept(kind: str) -> Callable[[Path, PointCloud], None]:
                 rows[axis] = np.rint(part.xyz[:, i].astype(float) / 0.001)
             for i, name in enumerate(("Red", "Green", "Blue")):
                 rows[name] = present(part.rgb)[:, i].astype(np.uint16) * 257
-            rows["Intensity"], rows["Classification"], rows["GpsTime"] = part.intensity, part.label, part.time
+            rows["Intensity"], rows["Classification"], rows["GpsTime"] = part.intensity, part.classification, part.time
             if kind == "binary":
                 file.with_suffix(".bin").write_bytes(rows.tobytes())
             else:
@@ -224,17 +226,19 @@ class Format:
     file: str
     write: Callable[[Path, PointCloud], None]
     precision: float = 6e-4
-    keeps: tuple[str, ...] = ("rgb", "label", "time", "intensity")
+    keeps: tuple[str, ...] = ("rgb", "classification", "time", "intensity")
     crs: bool = False
     ordered: bool = True
 
 
-MOST = ("rgb", "label", "intensity")
+MOST = ("rgb", "classification", "intensity")
 FORMATS = {
     "las": Format("c.las", write_las, crs=True),
     "laz": Format("c.laz", write_las, crs=True),
     "copc": Format("c.copc.laz", write_copc, crs=True, ordered=False),
-    "ply": Format("c.ply", lambda p, c: write_ply(p, c, "binary_little_endian", "class"), 1e-5, ("rgb", "label")),
+    "ply": Format(
+        "c.ply", lambda p, c: write_ply(p, c, "binary_little_endian", "class"), 1e-5, ("rgb", "classification")
+    ),
     "e57": Format("c.e57", write_e57, 2e-5, ("rgb", "intensity")),
     "pcd ascii": Format("c.pcd", pcd("ascii"), 1e-5, MOST),
     "pcd binary": Format("c.pcd", pcd("binary"), 1e-5, MOST),
@@ -263,7 +267,7 @@ def same(form: Format, read: PointCloud, cloud: PointCloud, precision: float) ->
         read, cloud = read.take(np.argsort(present(read.time))), cloud.take(np.argsort(present(cloud.time)))
     error = read.frame.to_crs(read.xyz) - cloud.frame.to_crs(cloud.xyz)
     assert np.abs(error).max() < precision
-    for name in ("rgb", "label", "time", "intensity"):
+    for name in ("rgb", "classification", "time", "intensity"):
         values = getattr(read, name)
         if name in form.keeps:
             assert np.array_equal(values, getattr(cloud, name)), name
@@ -491,7 +495,7 @@ def test_a_real_tile_as_copc(real_data: Path, tmp_path: Path) -> None:
         frame,
         frame.to_local(np.column_stack([some.x, some.y, some.z])).astype(np.float32),
         np.zeros((len(some), 3), np.uint8),
-        label=np.array(some.classification),
+        classification=np.array(some.classification),
         time=np.array(some.gps_time),
         intensity=np.array(some.intensity),
     )
@@ -500,7 +504,7 @@ def test_a_real_tile_as_copc(real_data: Path, tmp_path: Path) -> None:
         assert len(reader.query()) == len(cloud) and reader.header.point_count == len(cloud)
     read = clouds.read(tmp_path / "c.copc.laz", frame)
     assert np.abs(np.sort(read.xyz, axis=0) - np.sort(cloud.xyz, axis=0)).max() < 1e-3
-    assert np.array_equal(np.bincount(present(read.label)), np.bincount(present(cloud.label)))
+    assert np.array_equal(np.bincount(present(read.classification)), np.bincount(present(cloud.classification)))
     assert np.array_equal(np.sort(present(read.time)), np.sort(present(cloud.time)))
     tile = read_tile(import_las([tmp_path / "c.copc.laz"], tmp_path / "tile"))
     assert tile.frame.crs == "EPSG:2154" and len(clouds.read(tile.clouds[0], tile.frame)) == len(cloud)

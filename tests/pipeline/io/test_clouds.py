@@ -22,7 +22,7 @@ def made(n: int = 1000) -> PointCloud:
         FRAME,
         rng.uniform(-50, 50, (n, 3)).astype(np.float32),
         rgb=rng.integers(0, 256, (n, 3)).astype(np.uint8),
-        label=rng.choice([2, 5, 6, 66, 69], n).astype(np.uint8),
+        classification=rng.choice([2, 5, 6, 66, 69], n).astype(np.uint8),
         time=1e9 + rng.uniform(0, 10, n),
         intensity=rng.integers(0, 65536, n).astype(np.uint16),
     )
@@ -34,7 +34,7 @@ def test_las_keeps_places_classes_colours_times_and_crs(tmp_path: Path, suffix: 
     las.write(path, cloud)
     read = clouds.read(path, FRAME)
     assert np.abs(read.xyz - cloud.xyz).max() < 6e-4
-    for name in ("rgb", "label", "time", "intensity"):
+    for name in ("rgb", "classification", "time", "intensity"):
         assert np.array_equal(getattr(read, name), getattr(cloud, name)), name
     header = clouds.read_header(path)
     assert header.count == 1000 and header.crs is not None and "UTM zone 32N" in header.crs
@@ -61,7 +61,7 @@ def test_ply_keeps_double_coordinates_colours_and_classes(tmp_path: Path, form: 
     read = clouds.read(path, FRAME)
     assert np.abs(read.xyz - cloud.xyz).max() < 1e-4  # single precision would be half a metre off
     assert np.array_equal(present(read.rgb), present(cloud.rgb))
-    assert np.array_equal(present(read.label), present(cloud.label))
+    assert np.array_equal(present(read.classification), present(cloud.classification))
     header = clouds.read_header(path)
     assert (header.count, header.crs) == (50, None)
     assert np.allclose(header.low, FRAME.to_crs(cloud.xyz).min(axis=0))
@@ -73,7 +73,7 @@ def test_a_ply_without_colours_and_classes(tmp_path: Path) -> None:
     (tmp_path / "c.ply").write_text(f"{heading}end_header\n{rows}\n")
     read = clouds.read(tmp_path / "c.ply", Frame())
     assert read.xyz[:, 0].tolist() == [0, 1, 2, 3, 4]
-    assert read.rgb is None and read.label is None
+    assert read.rgb is None and read.classification is None
 
 
 @pytest.mark.parametrize(
@@ -94,7 +94,7 @@ def write_ply(path: Path, cloud: PointCloud, form: str, class_name: str) -> None
     assert cloud.rgb is not None
     for k, name in enumerate(("red", "green", "blue")):
         rows[name] = cloud.rgb[:, k]
-    rows[class_name] = cloud.label
+    rows[class_name] = cloud.classification
     types = "".join(f"property {'double' if kind[-1] == '8' else 'uchar'} {name}\n" for name, kind in kind)
     heading = f"ply\nformat {form} 1.0\nelement vertex {len(rows)}\n{types}end_header\n"
     if form == "ascii":

@@ -121,7 +121,11 @@ def test_the_pipeline_reads_the_same_cloud(tmp_path: Path, point_format: int) ->
     source, told = made(tmp_path / "a.laz", point_format), answers()
     write_classified(source, tmp_path / "b.laz", *told)
     old, new = las.read(source, FRAME), las.read(tmp_path / "b.laz", FRAME)
-    assert np.array_equal(old.xyz, new.xyz) and new.label is not None and np.array_equal(new.label, told[0])
+    assert (
+        np.array_equal(old.xyz, new.xyz)
+        and new.classification is not None
+        and np.array_equal(new.classification, told[0])
+    )
     for name in ("time", "intensity", "rgb"):
         assert np.array_equal(getattr(old, name), getattr(new, name)), name
     assert las.read_header(source)[0] == las.read_header(tmp_path / "b.laz")[0]

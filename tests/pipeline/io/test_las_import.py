@@ -22,7 +22,7 @@ VALUES = "opencv,64,48,50,31,23,-0.1"
 def cloud(path: Path, crs: str = "EPSG:32632", at: float = 500_000.0) -> Path:
     frame = Frame(crs, (at, 5_400_000.0, 100.0))
     xyz = np.random.default_rng(0).uniform(0, 20, (50, 3)).astype(np.float32)
-    las.write(path, PointCloud(frame, xyz, label=np.full(50, 2, np.uint8)))
+    las.write(path, PointCloud(frame, xyz, classification=np.full(50, 2, np.uint8)))
     return path
 
 

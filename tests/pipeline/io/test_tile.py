@@ -21,7 +21,7 @@ FT_CRS = "EPSG:2994"  # Oregon Lambert, international feet
 def cloud(path: Path, crs: str = "EPSG:32632", unit: float = 1.0, n: int = 100) -> Path:
     frame = Frame(crs, (500_000.0, 5_400_000.0, 100.0), unit)
     xyz = np.random.default_rng(0).uniform(0, 20, (n, 3)).astype(np.float32)
-    las.write(path, PointCloud(frame, xyz, label=np.full(n, 2, np.uint8)))
+    las.write(path, PointCloud(frame, xyz, classification=np.full(n, 2, np.uint8)))
     return path
 
 

@@ -45,7 +45,7 @@ def within(xy: np.ndarray, box: tuple[float, ...]) -> np.ndarray:
     return (xy[:, 0] > box[0]) & (xy[:, 0] < box[2]) & (xy[:, 1] > box[1]) & (xy[:, 1] < box[3])
 
 
-def scanned(label: str, rgb: tuple[int, int, int], seed: int = 0) -> PointCloud:
+def scanned(name: str, rgb: tuple[int, int, int], seed: int = 0) -> PointCloud:
     """What of the class is seen from above: about 16 points a square metre, with 2 cm of noise."""
     random = np.random.default_rng(seed)
     xy = random.uniform(-15, 15, (16 * 900, 2))
@@ -53,10 +53,10 @@ def scanned(label: str, rgb: tuple[int, int, int], seed: int = 0) -> PointCloud:
     for box in (HOUSE, ANNEX):
         z[within(xy, box)] = box[4]
     roof = within(xy, HOUSE) | within(xy, ANNEX)
-    chosen = roof if label == "building" else ~roof
+    chosen = roof if name == "building" else ~roof
     xyz = np.column_stack([xy, z + random.normal(0, 0.02, len(xy))])[chosen].astype(np.float32)
     colour = np.tile(np.array(rgb, np.uint8), (len(xyz), 1))
-    return PointCloud(FRAME, xyz, colour, label=np.full(len(xyz), CODE[label], np.uint8))
+    return PointCloud(FRAME, xyz, colour, classification=np.full(len(xyz), CODE[name], np.uint8))
 
 
 @pytest.fixture(scope="module")
@@ -64,8 +64,8 @@ def house(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Voxels of ground and roofs, and what is made up of both."""
     out = tmp_path_factory.mktemp("house")
     files: dict[str, Path] = {}
-    for part, label in (("terrain", "terrain"), ("building", "building")):
-        scanned(label, (90, 120, 60)).save(out / f"{part}.npz")
+    for part in ("terrain", "building"):
+        scanned(part, (90, 120, 60)).save(out / f"{part}.npz")
         files[part] = go(VOXEL, out / f"voxel_{part}", {"cloud": out / f"{part}.npz"}).files["cloud"]
     empty = PointCloud(FRAME, np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros((0, 3), np.float32))
     for part in ("vegetation", "rest"):
@@ -267,7 +267,7 @@ def test_a_street_scanned_from_the_ground_gets_nothing_made_up_without_a_path_ei
     y, z = (a.ravel() for a in np.meshgrid(np.arange(-4, 4, 0.1), np.arange(0, 6, 0.1)))
     wall = np.column_stack([np.full(len(y), -6.0), y, z]).astype(np.float32)
     seen = PointCloud(FRAME, wall, normal=np.tile(np.array([-1, 0, 0], np.float32), (len(wall), 1)),
-                      label=np.full(len(wall), CODE["building"], np.uint8))  # fmt: skip
+                      classification=np.full(len(wall), CODE["building"], np.uint8))  # fmt: skip
     ledge = building.take(np.flatnonzero(building.xyz[:, 0] < -5))
     PointCloud.join([ledge, seen]).save(tmp_path / "building.npz")
     inputs = {name: house[name] for name in ("terrain", "vegetation", "rest")} | {"building": tmp_path / "building.npz"}

@@ -41,7 +41,7 @@ def bumpy(n: int = 120_000, size: float = 12.0, seed: int = 0) -> PointCloud:
     z = 0.3 * np.sin(xy[:, 0]) * np.cos(xy[:, 1]) + random.normal(0, 0.005, n)
     xyz = np.column_stack([xy, z]).astype(np.float32)
     rgb = np.full((n, 3), (90, 100, 110), np.uint8)
-    return PointCloud(FRAME, xyz, rgb, label=np.full(n, CODE["road"], np.uint8))
+    return PointCloud(FRAME, xyz, rgb, classification=np.full(n, CODE["road"], np.uint8))
 
 
 @pytest.fixture(scope="module")
@@ -81,8 +81,8 @@ def test_ingest_refuses_fifty_points(tmp_path: Path) -> None:
 def test_split_puts_signs_with_buildings_and_leaves_vehicles_out(tmp_path: Path) -> None:
     cloud = bumpy(700)
     names = ("road", "terrain", "building", "road_sign", "high_vegetation", "vehicle", "unclassified")
-    label = np.repeat([CODE[n] for n in names], 100).astype(np.uint8)
-    replace(cloud, label=label).save(tmp_path / "cloud.npz")
+    classification = np.repeat([CODE[n] for n in names], 100).astype(np.uint8)
+    replace(cloud, classification=classification).save(tmp_path / "cloud.npz")
     done = go(SPLIT, tmp_path / "out", {"cloud": tmp_path / "cloud.npz"})
     assert done.facts["points"] == {"terrain": 200, "building": 200, "vegetation": 100, "rest": 200}
 
@@ -91,7 +91,7 @@ def test_split_warns_of_an_empty_class_and_refuses_when_all_are(tmp_path: Path) 
     bumpy(300).save(tmp_path / "cloud.npz")
     done = go(SPLIT, tmp_path / "out", {"cloud": tmp_path / "cloud.npz"})
     assert any("building" in w for w in done.warnings)
-    replace(bumpy(300), label=np.full(300, CODE["vehicle"], np.uint8)).save(tmp_path / "cars.npz")
+    replace(bumpy(300), classification=np.full(300, CODE["vehicle"], np.uint8)).save(tmp_path / "cars.npz")
     with pytest.raises(DataError, match="no point belongs to"):
         go(SPLIT, tmp_path / "out2", {"cloud": tmp_path / "cars.npz"})
 
@@ -124,7 +124,7 @@ def test_normals_of_an_airborne_cloud_look_up_and_out(tmp_path: Path) -> None:
     wall = random.uniform(0, 1, (20_000, 3)) * (4, 0, 3)  # a wall to the south of its roof
     roof = random.uniform(0, 1, (20_000, 3)) * (4, 4, 0) + (0, 0, 3)
     xyz = np.concatenate([wall, roof]).astype(np.float32)
-    PointCloud(FRAME, xyz, label=np.full(len(xyz), 6, np.uint8)).save(tmp_path / "cloud.npz")
+    PointCloud(FRAME, xyz, classification=np.full(len(xyz), 6, np.uint8)).save(tmp_path / "cloud.npz")
     thin = PointCloud.load(go(VOXEL, tmp_path / "out", {"cloud": tmp_path / "cloud.npz"}).files["cloud"])
     assert thin.normal is not None
     on_roof = thin.xyz[:, 1] > 0.3

@@ -93,9 +93,9 @@ def built(
     parts = {"building": points, "terrain": ground, "vegetation": across}
     parts |= {} if others is None else {"rest": others}
     for name, (xyz, time) in parts.items():
-        label = np.full(len(xyz), CODE["building"], np.uint8)
+        classification = np.full(len(xyz), CODE["building"], np.uint8)
         noisy = (xyz + random.normal(0, 0.005, xyz.shape)).astype(np.float32)
-        PointCloud(FRAME, noisy, label=label, time=time).save(folder / f"{name}.npz")
+        PointCloud(FRAME, noisy, classification=classification, time=time).save(folder / f"{name}.npz")
         (folder / name).mkdir()
         inputs = {"cloud": folder / f"{name}.npz", "path": folder / "path.npz"}
         files[name] = VOXEL.run(inputs, VOXEL.params(), folder / name, silent).files["cloud"]

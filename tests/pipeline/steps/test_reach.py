@@ -38,8 +38,8 @@ PARTS = {"road": GROUND, "building": WALL, "wall_or_fence": SCREEN}
 def street(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """A drive of 10 m along x, with a photo every 2 m that looks ahead."""
     out = tmp_path_factory.mktemp("street")
-    label = np.concatenate([np.full(len(xyz), CODE[name], np.uint8) for name, xyz in PARTS.items()])
-    PointCloud(Frame(), np.concatenate(list(PARTS.values())), label=label).save(out / "cloud.npz")
+    classification = np.concatenate([np.full(len(xyz), CODE[name], np.uint8) for name, xyz in PARTS.items()])
+    PointCloud(Frame(), np.concatenate(list(PARTS.values())), classification=classification).save(out / "cloud.npz")
     poses = np.tile(np.eye(4), (6, 1, 1))
     poses[:, :3, :3] = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
     poses[:, :3, 3] = np.column_stack([np.arange(0, 12, 2), np.zeros(6), np.full(6, 1.7)])
@@ -61,7 +61,7 @@ def test_what_photos_see_and_the_lane_stay_and_the_rest_goes(street: dict[str, P
     done = go(street, tmp_path)
     cloud = left(done)
     x, y, z = cloud.xyz.T
-    ground = cloud.label == CODE["road"]
+    ground = cloud.classification == CODE["road"]
     assert ((x > 15) & (x < 25) & (abs(y) < 5) & ground).sum() > 0.97 * 100 * 100, "ahead"
     behind = ground & (x < -1)
     assert behind.any() and np.hypot(x[behind], y[behind]).max() < LANES + 1.5 * CELL, (
@@ -77,7 +77,7 @@ def test_what_photos_see_and_the_lane_stay_and_the_rest_goes(street: dict[str, P
 def test_ground_hidden_behind_something_small_is_kept(street: dict[str, Path], tmp_path: Path) -> None:
     cloud = left(go(street, tmp_path))
     x, y, _ = cloud.xyz.T
-    shadow = (x > 12.1) & (x < 13.5) & (y > -7) & (y < -6) & (cloud.label == CODE["road"])
+    shadow = (x > 12.1) & (x < 13.5) & (y > -7) & (y < -6) & (cloud.classification == CODE["road"])
     assert shadow.sum() > 0.95 * 13 * 9
 
 

@@ -20,11 +20,13 @@ def trimmed(
     """Which of the triangles stay, and what is told."""
     vertices = np.concatenate(triangles).astype(np.float32)
     faces = np.arange(len(vertices), dtype=np.int32).reshape(-1, 3)
-    label = np.arange(len(faces), dtype=np.uint8)
-    Mesh(Frame(), vertices, faces, np.ravel(density).astype(np.float32), label=label).save(folder / "in.npz")
+    classification = np.arange(len(faces), dtype=np.uint8)
+    Mesh(Frame(), vertices, faces, np.ravel(density).astype(np.float32), classification=classification).save(
+        folder / "in.npz"
+    )
     PointCloud(Frame(), points).save(folder / "points.npz")
     done = trim({"mesh": folder / "in.npz", "cloud": folder / "points.npz"}, TrimParams(), folder, silent)
-    left = Mesh.load(done.files["mesh"]).label
+    left = Mesh.load(done.files["mesh"]).classification
     assert left is not None
     return left.tolist(), done.facts
 

@@ -119,12 +119,12 @@ def colourful(folder: Path, n: int = 6) -> Path:
     for name in ("images", "labels"):
         (folder / name).mkdir(parents=True)
     for i in range(n):
-        label = np.zeros((128, 160), np.uint8)
+        codes = np.zeros((128, 160), np.uint8)
         split = int(rng.integers(40, 120))
-        label[:, :split], label[:, split:] = 11, 6
-        rgb = np.where(label[..., None] == 11, (90, 90, 90), (200, 120, 60)).astype(np.uint8)
+        codes[:, :split], codes[:, split:] = 11, 6
+        rgb = np.where(codes[..., None] == 11, (90, 90, 90), (200, 120, 60)).astype(np.uint8)
         cv2.imwrite(str(folder / "images" / f"{i:03d}_0.png"), rgb[..., ::-1])
-        cv2.imwrite(str(folder / "labels" / f"{i:03d}_0.png"), label)
+        cv2.imwrite(str(folder / "labels" / f"{i:03d}_0.png"), codes)
     return folder
 
 
