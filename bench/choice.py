@@ -1,4 +1,4 @@
-"""Solvers of the choice of photos (`texturing.labels`) side by side: energy, time, and the textures they lead to.
+"""Solvers of the choice of photos (`texturing.mrf`) side by side: energy, time, and the textures they lead to.
 
 `python -m bench.choice [--scenes kitti street_clean street_hard] [--solvers best ours ...] [--energies] [--out DIR]`,
 after `python -m bench.texture`, whose scenes and depth maps it takes (`--scenes sample` makes its own small one).
@@ -29,7 +29,7 @@ import numpy.typing as npt
 from bench.texture_ablation import figures
 from bench.texture_scenes import ROOT, SCENES, WARM, Scene, available, fresh, make, run
 from scan2sim.pipeline.types import F32, I32, Mesh
-from scan2sim.texturing import labels
+from scan2sim.texturing import mrf
 from scan2sim.texturing.choose import CHOOSE, Choice, ChooseParams, seams
 
 SWEEPS = 3
@@ -48,23 +48,23 @@ def best(view: I32, cost: F32, pairs: I32, price: F32) -> I32:
 
 def settled(view: I32, cost: F32, pairs: I32, price: F32) -> I32:
     """Face after face its cheapest photo, until none changes."""
-    label = best(view, cost, pairs, price)
+    chosen = best(view, cost, pairs, price)
     beside: list[list[tuple[int, float]]] = [[] for _ in view]
     for (a, b), paid in zip(pairs.tolist(), price.tolist(), strict=True):
-        if label[a] >= 0 and label[b] >= 0:
+        if chosen[a] >= 0 and chosen[b] >= 0:
             beside[a].append((b, paid))
             beside[b].append((a, paid))
     changed = True
     while changed:
         changed = False
-        for face in np.flatnonzero(label >= 0):
-            told = cost[face].copy()
+        for face in np.flatnonzero(chosen >= 0):
+            total = cost[face].copy()
             for other, paid in beside[face]:
-                told += np.where(view[face] != label[other], np.float32(paid), np.float32(0))
-            new = view[face, told.argmin()]
-            if new != label[face] and told.min() < told[np.flatnonzero(view[face] == label[face])[0]]:
-                label[face], changed = new, True
-    return label
+                total += np.where(view[face] != chosen[other], np.float32(paid), np.float32(0))
+            new = view[face, total.argmin()]
+            if new != chosen[face] and total.min() < total[np.flatnonzero(view[face] == chosen[face])[0]]:
+                chosen[face], changed = new, True
+    return chosen
 
 
 def expansion(problem: Problem, cut: Cut) -> I32:
@@ -147,17 +147,17 @@ def solvers() -> dict[str, Callable[[Problem], I32]]:
         "best": lambda problem: best(*problem),
         "settled": lambda problem: settled(*problem),
         "scipy": lambda problem: expansion(problem, by_scipy),
-        "ours": lambda problem: labels.solve(*problem).label,
+        "ours": lambda problem: mrf.solve(*problem).view,
     }
     if importlib.util.find_spec("maxflow"):
         found["pymaxflow"] = lambda problem: expansion(problem, by_pymaxflow)
     return found
 
 
-def energy(label: I32, view: I32, cost: F32, pairs: I32, price: F32) -> float:
-    """What a labelling costs."""
-    own = np.where((view == label[:, None]) & (label >= 0)[:, None], cost, 0).sum(dtype=np.float64)
-    apart = (label[pairs[:, 0]] != label[pairs[:, 1]]) & (label[pairs] >= 0).all(axis=1)
+def energy(chosen: I32, view: I32, cost: F32, pairs: I32, price: F32) -> float:
+    """What a choice costs: (F,) the view of each face."""
+    own = np.where((view == chosen[:, None]) & (chosen >= 0)[:, None], cost, 0).sum(dtype=np.float64)
+    apart = (chosen[pairs[:, 0]] != chosen[pairs[:, 1]]) & (chosen[pairs] >= 0).all(axis=1)
     return float(own + price[apart].sum(dtype=np.float64))
 
 
@@ -175,7 +175,7 @@ def prepare(scene: Scene, folder: Path) -> dict[str, Path]:
     return files
 
 
-def paint(files: dict[str, Path], choice: Choice, folder: Path) -> Path:
+def textured(files: dict[str, Path], choice: Choice, folder: Path) -> Path:
     """The texture that a choice leads to; its folder."""
     from scan2sim.texturing.texture import TEXTURE
     from scan2sim.texturing.unwrap import UNWRAP
@@ -194,26 +194,26 @@ def compare(scene: Scene, names: Sequence[str], *, textures: bool) -> dict[str, 
     files = prepare(scene, folder) if textures or not found.is_file() else {}
     choice, mesh = Choice.load(found), Mesh.load(scene.mesh)
     pairs, length, price = seams(mesh, ChooseParams.model_validate({}).smoothness)
-    problem = (choice.view, labels.costs(choice.view, choice.quality), pairs, price)
-    bound = labels.solve(*problem).bound
-    told: dict[str, dict[str, Any]] = {}
+    problem = (choice.view, mrf.costs(choice.view, choice.quality), pairs, price)
+    bound = mrf.solve(*problem).bound
+    result: dict[str, dict[str, Any]] = {}
     for name in names:
         solver = solvers()[name]
         began = time.process_time()
-        label = solver(problem)
+        chosen = solver(problem)
         seconds = time.process_time() - began
-        apart = (label[pairs[:, 0]] != label[pairs[:, 1]]) & (label[pairs] >= 0).all(axis=1)
-        told[name] = {
-            "above_bound_percent": round(100 * (energy(label, *problem) / bound - 1), 3),
+        apart = (chosen[pairs[:, 0]] != chosen[pairs[:, 1]]) & (chosen[pairs] >= 0).all(axis=1)
+        result[name] = {
+            "above_bound_percent": round(100 * (energy(chosen, *problem) / bound - 1), 3),
             "seconds": round(seconds, 2),
             "seam_share": round(float(length[apart].sum() / length.sum()), 4),
-            "again_the_same": bool((solver(problem) == label).all()),
+            "again_the_same": bool((solver(problem) == chosen).all()),
         }
         if textures:
-            painted = paint(files, Choice(choice.view, choice.quality, label.astype(np.int32)), folder)
-            told[name] |= figures(scene, painted, None)
-        print(f"{scene.folder.name:12s} {name:10s} {told[name]}", flush=True)
-    return told
+            painted = textured(files, Choice(choice.view, choice.quality, chosen.astype(np.int32)), folder)
+            result[name] |= figures(scene, painted, None)
+        print(f"{scene.folder.name:12s} {name:10s} {result[name]}", flush=True)
+    return result
 
 
 def main() -> None:
@@ -224,15 +224,15 @@ def main() -> None:
     parser.add_argument("--solvers", nargs="+", default=list(solvers()), choices=list(solvers()))
     parser.add_argument("--energies", action="store_true", help="no textures; candidates of an earlier run stand")
     arguments = parser.parse_args()
-    told = {}
+    result = {}
     for name in arguments.scenes:
         scene = Scene(arguments.out / name)
         if not available(name):
             continue
         if not scene.views.is_file():
             make(name, scene)
-        told[name] = compare(scene, arguments.solvers, textures=not arguments.energies)
-    print("RESULT " + json.dumps(told))
+        result[name] = compare(scene, arguments.solvers, textures=not arguments.energies)
+    print("RESULT " + json.dumps(result))
 
 
 if __name__ == "__main__":

@@ -337,9 +337,9 @@ def ghost_mask(mine: F32, predicted: Prediction, white: npt.NDArray[np.bool_]) -
     apart[~sure] = 0
     seeds = cv2.morphologyEx((apart > SEED).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3)))
     grown = cv2.morphologyEx((apart > GROWN).astype(np.uint8) | seeds, cv2.MORPH_CLOSE, np.ones((7, 7)))
-    n, label, stats, _ = cv2.connectedComponentsWithStats(grown, connectivity=8)
-    seeded = np.bincount(label[seeds > 0], minlength=n) * 4 > SPECK
-    ghost = (seeded & (stats[:, cv2.CC_STAT_AREA] > SPECK))[label] & (grown > 0)
+    n, component, stats, _ = cv2.connectedComponentsWithStats(grown, connectivity=8)
+    seeded = np.bincount(component[seeds > 0], minlength=n) * 4 > SPECK
+    ghost = (seeded & (stats[:, cv2.CC_STAT_AREA] > SPECK))[component] & (grown > 0)
     return np.asarray(cv2.dilate(ghost.astype(np.uint8), np.ones((7, 7)))) > 0
 
 

@@ -26,7 +26,7 @@ FINEST = 0.01
 
 
 @dataclass(frozen=True)
-class Chartered:
+class Unwrapped:
     """A block's place on its page.
 
     Attributes:
@@ -45,10 +45,10 @@ class Chartered:
 
 def unwrap_blocks(
     backend: Backend, blocks: Sequence[tuple[F32, I32]], texel: float, gutter: int
-) -> list[Chartered | str]:
+) -> list[Unwrapped | str]:
     """Unwrap blocks (vertices (V, 3) metres, faces (F, 3)), each onto a page of its own, or the reason why not."""
     backends = {"uvatlas": _uvatlas, "xatlas": _xatlas}
-    out: list[Chartered | str] = []
+    out: list[Unwrapped | str] = []
     for vertices, faces in blocks:
         try:
             out.append(backends[backend](vertices, faces, texel, gutter))
@@ -113,7 +113,7 @@ def _uv_area(uv: F32) -> float:
     return float(np.abs(edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]).sum() / 2)
 
 
-def _uvatlas(vertices: F32, faces: I32, texel: float, gutter: int) -> Chartered:
+def _uvatlas(vertices: F32, faces: I32, texel: float, gutter: int) -> Unwrapped:
     """Microsoft's UVAtlas (Zhou et al. 2004) through Open3D.
 
     It seeds itself from the system's entropy, which nothing can change from outside: charts differ by a
@@ -134,10 +134,10 @@ def _uvatlas(vertices: F32, faces: I32, texel: float, gutter: int) -> Chartered:
     if not np.isfinite(uv).all() or share <= 0:
         raise RuntimeError("UVAtlas returned no valid coordinates")
     side = _fit(math.sqrt(area / share) / texel)
-    return Chartered(uv, side, side, int(charts), "uvatlas")
+    return Unwrapped(uv, side, side, int(charts), "uvatlas")
 
 
-def _xatlas(vertices: F32, faces: I32, texel: float, gutter: int) -> Chartered:
+def _xatlas(vertices: F32, faces: I32, texel: float, gutter: int) -> Unwrapped:
     """By xatlas (Young), Thekla's atlas grown on."""
     import xatlas
 
@@ -151,7 +151,7 @@ def _xatlas(vertices: F32, faces: I32, texel: float, gutter: int) -> Chartered:
     if not atlas.width or not atlas.height:
         raise RuntimeError("xatlas made no atlas")
     _, index, uv = atlas.get_mesh(0)
-    return Chartered(
+    return Unwrapped(
         np.ascontiguousarray(uv[index], np.float32),
         max(SMALLEST, coarse * int(atlas.width)),
         max(SMALLEST, coarse * int(atlas.height)),

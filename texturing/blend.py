@@ -1,4 +1,4 @@
-"""Kernels that paint a page: what photos say of its texels, weighed and summed. Import late: it loads numba."""
+"""Kernels that bake a page: what photos say of its texels, weighed and summed. Import late: it loads numba."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ EDGE = 0.01
 """Share of its weight that a photo keeps beside something that hides what is behind."""
 
 
-class Shown(NamedTuple):
-    """What a photo shows.
+class Picture(NamedTuple):
+    """A photo as kernels sample it.
 
     Attributes:
         whole, half, quarter: (h, w, 3) uint8: the photo, halved, and halved again.
         low: its low frequencies, of any size.
         mask: (h, w) uint8, 0 where it must not be used; (0, 0) for none.
-        warp: (h, w, 2) pixels to be added to where it is looked up; (0, 0, 2) for none.
+        warp: (h, w, 2) pixels to be added to where it is sampled; (0, 0, 2) for none.
         exposure: (5,) of `photos.Exposures.of`.
     """
 
@@ -41,14 +41,14 @@ class Shown(NamedTuple):
     exposure: F64
 
 
-class Hides(NamedTuple):
+class Occlusion(NamedTuple):
     """What a photo's view sees first, as `looking.Ranges`, and around it.
 
     Attributes:
         first, pixel: of `looking.Ranges`.
         near, apart: the least range around every pixel of `first`, closely and as far as low frequencies reach;
             beside something nearer the photo's own pixels mix both, and its weight falls to `EDGE`.
-        reach: pixels of the range image by which `apart` looks around.
+        reach: pixels of the range image around which `apart` was taken.
     """
 
     first: F32
@@ -58,12 +58,12 @@ class Hides(NamedTuple):
     reach: int
 
 
-class Look(NamedTuple):
-    """All that a view brings: what its photo shows, its camera and pose, and what hides."""
+class Source(NamedTuple):
+    """All that a view brings: its picture, its camera and pose, and what hides."""
 
-    shown: Shown
+    picture: Picture
     eye: Eye
-    hides: Hides
+    occlusion: Occlusion
 
 
 class Weighing(NamedTuple):
@@ -113,13 +113,13 @@ class Sums(NamedTuple):
 class Rows(Protocol):
     """Rows of a page that photos are added to, one after another."""
 
-    def add(self, faces: npt.NDArray[np.int64], share: F32, look: Look, weighing: Weighing) -> int:
+    def add(self, faces: npt.NDArray[np.int64], share: F32, source: Source, weighing: Weighing) -> int:
         """Add what one photo says of `faces` (N,); returns the texels that it sees.
 
         Args:
             faces: indices into the page's faces.
             share: (N, 3) how much of the detail it is to give at the faces' corners, 0 to 1.
-            look: the photo.
+            source: the photo.
             weighing: of it.
         """
 
@@ -134,9 +134,9 @@ class NumbaRows:
         self._laid = laid
         self._sums = Sums(*(np.zeros((*laid.owner.shape, 4), np.float32) for _ in range(2)))
 
-    def add(self, faces: npt.NDArray[np.int64], share: F32, look: Look, weighing: Weighing) -> int:
+    def add(self, faces: npt.NDArray[np.int64], share: F32, source: Source, weighing: Weighing) -> int:
         """See `Rows`."""
-        return int(accumulate(self._sums, self._laid, faces, share, *look, weighing))
+        return int(accumulate(self._sums, self._laid, faces, share, *source, weighing))
 
     def resolve(self, rgb: U8, seen: U8) -> None:
         """See `Rows`."""
@@ -160,24 +160,24 @@ def corrected(value, factor):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, parallel=True)
-def accumulate(sums, laid, faces, share, shown, eye, hides, weighing):  # type: ignore[no-untyped-def]
+def accumulate(sums, laid, faces, share, picture, eye, occlusion, weighing):  # type: ignore[no-untyped-def]
     """`Rows.add` to `sums`, in place; `tests/texturing/plain_blend.py` says the same without haste."""
     used = np.zeros(len(faces), np.int64)
     for i in prange(len(faces)):
-        used[i] = _add_face(sums, laid, faces[i], share[i], shown, eye, hides, weighing)
+        used[i] = _add_face(sums, laid, faces[i], share[i], picture, eye, occlusion, weighing)
     return used.sum()
 
 
 @njit(cache=True)
-def _add_face(sums, laid, f, share, shown, eye, hides, weighing):  # type: ignore[no-untyped-def]
+def _add_face(sums, laid, f, share, picture, eye, occlusion, weighing):  # type: ignore[no-untyped-def]
     """Add what a photo says of face f, whose corners want `share` (3,) of their detail from it; the texels seen."""
     origin, per_x, per_y, ok = frame(laid.flat, laid.corners, f)
     if not ok:
         return 0
     # arrays by themselves: over tuples of them, the loops take a third longer
     owner, low_sum, detail_sum = laid.owner, sums.low, sums.detail
-    whole, half, quarter, coarser, mask, warp, exposure = shown
-    first, _, near, apart, reach = hides
+    whole, half, quarter, coarser, mask, warp, exposure = picture
+    first, _, near, apart, reach = occlusion
     p, wrap, bias, band = eye.p, eye.model == EQUIRECTANGULAR, weighing.bias, weighing.band
     n = turned(eye.T, laid.normals[f, 0], laid.normals[f, 1], laid.normals[f, 2])
     o = to_camera(eye.T, origin[0], origin[1], origin[2])
@@ -200,7 +200,7 @@ def _add_face(sums, laid, f, share, shown, eye, hides, weighing):  # type: ignor
             r, cos = sighted(eye, x, y, z, n[0], n[1], n[2])
             if cos < 0.5 * weighing.min_cos:  # the face as a whole passed; its far end may be a little flatter
                 continue
-            row, column, lean = met(eye, hides, u, v, r, cos)
+            row, column, lean = met(eye, occlusion, u, v, r, cos)
             if is_behind(r, first[row, column], lean, SLOPE_SHARE, bias):
                 continue
             used += 1

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from scan2sim.pipeline.types import F32, F64, U8
-    from scan2sim.texturing.blend import Laid, Look, Weighing
+    from scan2sim.texturing.blend import Laid, Source, Weighing
 
 CHUNK = 2_000_000
 """Texels that are worked on at a time: some 500 MB."""
@@ -55,14 +55,14 @@ class TorchRows:
         self._origin, self._per_x, self._per_y, self._flat_enough = _frames(self._flat, self._to(laid.corners).double())
         self._low, self._detail = (torch.zeros((laid.owner.size, 4), device=self._device) for _ in range(2))
 
-    def add(self, faces: npt.NDArray[np.int64], share: F32, look: Look, weighing: Weighing) -> int:
+    def add(self, faces: npt.NDArray[np.int64], share: F32, source: Source, weighing: Weighing) -> int:
         """Add what one photo says of `faces` (N,), its share of their detail (N, 3); returns the texels it sees."""
         which = torch.full((len(self._flat),), -1, dtype=torch.int64, device=self._device)
         which[self._to(faces)] = torch.arange(len(faces), device=self._device)
         which[~self._flat_enough] = -1
         mine = torch.nonzero(which[self._face] >= 0).ravel()
-        shares, photo = self._to(share).double(), Sampled(look, self._to)
-        seen = [self._add(part, which, shares, photo, look, weighing) for part in torch.split(mine, CHUNK)]
+        shares, photo = self._to(share).double(), Sampled(source, self._to)
+        seen = [self._add(part, which, shares, photo, source, weighing) for part in torch.split(mine, CHUNK)]
         return sum(seen)
 
     def resolve(self, rgb: U8, seen: U8) -> None:
@@ -76,8 +76,10 @@ class TorchRows:
     def _to(self, array: npt.NDArray[Any]) -> Tensor:
         return torch.from_numpy(np.ascontiguousarray(array)).to(self._device)
 
-    def _add(self, part: Tensor, which: Tensor, share: Tensor, photo: Sampled, look: Look, weighing: Weighing) -> int:
-        eye, p, g = look.eye, look.eye.p, weighing
+    def _add(
+        self, part: Tensor, which: Tensor, share: Tensor, photo: Sampled, source: Source, weighing: Weighing
+    ) -> int:
+        eye, p, g = source.eye, source.eye.p, weighing
         wide = eye.model == EQUIRECTANGULAR
         T = self._to(eye.T)
         R, t = T[:3, :3], T[:3, 3]
@@ -99,10 +101,10 @@ class TorchRows:
             ok &= (u >= -0.5) & (u < p[12] - 0.5)
         u, v = torch.where(ok, u, 0.0), torch.where(ok, v, 0.0)
         ok &= photo.allows(u, v)
-        rows, columns = look.hides.first.shape
+        rows, columns = source.occlusion.first.shape
         column = ((u + 0.5) * (columns / p[12])).long().clamp(0, columns - 1)
         row = ((v + 0.5) * (rows / p[13])).long().clamp(0, rows - 1)
-        lean = _slope(cos) * far * look.hides.pixel
+        lean = _slope(cos) * far * source.occlusion.pixel
         ok &= distance <= photo.first[row, column] + g.bias + SLOPE_SHARE * lean
         keep = torch.nonzero(ok).ravel()
         texel, f, tx, ty, u, v = (a[keep] for a in (texel, f, tx, ty, u, v))
@@ -112,10 +114,10 @@ class TorchRows:
         if not wide:
             border = torch.minimum(border, torch.minimum(u + 0.5, p[12] - 0.5 - u))
         whole = (cos * cos / alike**2) ** g.power * (0.02 + 0.98 * (border / g.feather).clamp(max=1.0))
-        apart = distance > photo.apart[row, column] + g.bias + (look.hides.reach + 0.5) * lean
+        apart = distance > photo.apart[row, column] + g.bias + (source.occlusion.reach + 0.5) * lean
         weight = torch.where(apart, whole * EDGE, whole)
-        factor = torch.exp(self._to(look.shown.exposure[:3])) * photo.vignette(u, v)[:, None]
-        if look.shown.warp.shape[0]:
+        factor = torch.exp(self._to(source.picture.exposure[:3])) * photo.vignette(u, v)[:, None]
+        if source.picture.warp.shape[0]:
             u, v = photo.warped(u, v)
         size = torch.maximum((per_x**2).sum(dim=1), (per_y**2).sum(dim=1)).sqrt()[f]
         chosen = (share.sum(dim=1) > 0)[which[f]]
@@ -145,12 +147,12 @@ class TorchRows:
 class Sampled:
     """A photo on the device, and lookups in it by pixel (u, v)."""
 
-    def __init__(self, look: Look, to: Any) -> None:
-        shown, hides = look.shown, look.hides
-        self._p, self._wide, self._exposure = look.eye.p, look.eye.model == EQUIRECTANGULAR, shown.exposure
-        self._levels = [to(level) for level in (shown.whole, shown.half, shown.quarter)]
-        self._low, self._mask, self._warp = to(shown.low), to(shown.mask), to(shown.warp)
-        self.first, self.near, self.apart = to(hides.first), to(hides.near), to(hides.apart)
+    def __init__(self, source: Source, to: Any) -> None:
+        picture, occlusion = source.picture, source.occlusion
+        self._p, self._wide, self._exposure = source.eye.p, source.eye.model == EQUIRECTANGULAR, picture.exposure
+        self._levels = [to(level) for level in (picture.whole, picture.half, picture.quarter)]
+        self._low, self._mask, self._warp = to(picture.low), to(picture.mask), to(picture.warp)
+        self.first, self.near, self.apart = to(occlusion.first), to(occlusion.near), to(occlusion.apart)
 
     def allows(self, u: Tensor, v: Tensor) -> Tensor:
         """As `sampling.allows`."""

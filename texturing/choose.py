@@ -1,7 +1,7 @@
 """Choose: which photos colour a face, and which one gives its detail.
 
 Candidates are the best few that see a face; the one for the detail comes from a Markov random field over the
-faces (`texturing.labels`), so that neighbours share a photo where it costs little.
+faces (`texturing.mrf`), so that neighbours share a photo where it costs little.
 """
 
 from __future__ import annotations
@@ -55,18 +55,18 @@ class Choice:
     Attributes:
         view: (F, K) int32 candidates, best first, -1 where fewer see the face.
         quality: (F, K) float32 of each, 1/m2 (cos / distance^2, where seen); 0 where there is none.
-        label: (F,) int32, the view that gives the detail, -1 where none sees the face.
+        detail_view: (F,) int32, the view that gives the detail, -1 where none sees the face.
     """
 
     view: I32
     quality: F32
-    label: I32
+    detail_view: I32
 
     def save(self, path: Path) -> None:
         """Write as .npz."""
         import numpy as np
 
-        np.savez(path, view=self.view, quality=self.quality, label=self.label)
+        np.savez(path, view=self.view, quality=self.quality, label=self.detail_view)
 
     @classmethod
     def load(cls, path: Path) -> Choice:
@@ -100,7 +100,7 @@ def choose(inputs: Inputs, params: ChooseParams, out: Path, report: Report) -> D
     choice, seams = choose_views(mesh, views, usable, depth, agreement.mask, agreement.sharpness, params, report)
     choice = with_whole_signs(choice, mesh, [pixel_angle(view.camera) for view in views])
     choice.save(out / "choice.npz")
-    seen = float((choice.label >= 0).mean()) if len(mesh) else 0.0
+    seen = float((choice.detail_view >= 0).mean()) if len(mesh) else 0.0
     return Done({"choice": out / "choice.npz"}, {"faces": len(mesh), "seen": round(seen, 4), "seam_share": seams})
 
 
@@ -115,8 +115,8 @@ def choose_views(
     report: Report,
 ) -> tuple[Choice, float]:
     """The choice for all faces, and the share of the edges' length that is a seam."""
-    from scan2sim.texturing.labels import label
-    from scan2sim.texturing.select import Candidates
+    from scan2sim.texturing.candidates import Candidates
+    from scan2sim.texturing.mrf import detail_views
 
     best = Candidates(mesh.corners, mesh.face_normal, params.views_per_face)
     for done, i in enumerate(usable):
@@ -127,7 +127,7 @@ def choose_views(
         )  # fmt: skip
     report(0.7, "seams")
     pairs, length, price = seams(mesh, params.smoothness)
-    chosen = label(best.view, best.quality, pairs, price)
+    chosen = detail_views(best.view, best.quality, pairs, price)
     apart = (chosen[pairs[:, 0]] != chosen[pairs[:, 1]]) & (chosen[pairs] >= 0).all(axis=1)
     share = float(length[apart].sum() / max(float(length.sum()), 1e-9))
     return Choice(best.view, best.quality, chosen), round(share, 4)
@@ -146,11 +146,11 @@ def with_whole_signs(choice: Choice, mesh: Mesh, pixel: Sequence[float]) -> Choi
     import numpy as np
 
     from scan2sim.pipeline.classes import CODE
-    from scan2sim.texturing.labels import adjacent
+    from scan2sim.texturing.mrf import adjacent
 
     if mesh.classification is None or not (mesh.classification == CODE["road_sign"]).any():
         return choice
-    view, quality, label = choice.view.copy(), choice.quality.copy(), choice.label.copy()
+    view, quality, detail_view = choice.view.copy(), choice.quality.copy(), choice.detail_view.copy()
     faces = np.flatnonzero(mesh.classification == CODE["road_sign"])
     for side in _sides(mesh, faces, adjacent(mesh.faces[faces])[0]):
         shown, good = view[side], quality[side]
@@ -159,10 +159,10 @@ def with_whole_signs(choice: Choice, mesh: Mesh, pixel: Sequence[float]) -> Choi
         if len(whole):
             fineness = np.array([(good * area)[shown == v].sum() / pixel[v] ** 2 for v in whole])
             used = whole[np.argsort(-fineness, kind="stable")][: (fineness >= FINE_ENOUGH * fineness.max()).sum()]
-            view[side], quality[side], label[side] = -1, 0, used[0]
+            view[side], quality[side], detail_view[side] = -1, 0, used[0]
             for k, best in enumerate(used):
                 view[side, k], quality[side, k] = best, (good * (shown == best)).max(axis=1)
-    return Choice(view, quality, label)
+    return Choice(view, quality, detail_view)
 
 
 def _sides(mesh: Mesh, faces: npt.NDArray[np.int64], pairs: I32) -> list[npt.NDArray[np.int64]]:
@@ -182,7 +182,7 @@ def seams(mesh: Mesh, smoothness: float) -> tuple[I32, F32, F32]:
     """Neighbouring faces (E, 2), the lengths (E,) of their edges in metres, and what a seam there costs (E,)."""
     import numpy as np
 
-    from scan2sim.texturing.labels import adjacent
+    from scan2sim.texturing.mrf import adjacent
 
     pairs, edge = adjacent(mesh.faces)
     length = np.linalg.norm(mesh.vertices[edge[:, 0]] - mesh.vertices[edge[:, 1]], axis=1)

@@ -27,7 +27,7 @@ PATCH = 6
 """Coarse cells of the patches that are compared, each way."""
 NEAREST, FARTHEST = 6, 160
 """Coarse cells that a shift may span: nearer, everything is like itself; farther, another street."""
-ASKED = 20_000
+QUERIES = 20_000
 """Patches that are asked for one like them."""
 FEATURES = 12
 """Principal components that patches are compared by."""
@@ -75,7 +75,7 @@ def continued(rgb: F32, known: Bools, wanted: Bools, kind: I32 | None = None) ->
             break
         shift = choose(coarse, whole, hole, kind, shifts)
         tone = toned(coarse, whole, hole, shifts, shift)
-        filled = _paint(rgb, known, wanted, shifts, shift, tone)
+        filled = _copy(rgb, known, wanted, shifts, shift, tone)
         if not filled.any():
             break
         known, wanted = known | filled, wanted & ~filled
@@ -112,16 +112,16 @@ def offsets(coarse: F32, whole: Bools, hole: Bools) -> I32:
     row, column = np.nonzero(full)
     if len(row) < SHIFTS:
         return np.zeros((0, 2), np.int32)
-    every = max(1, len(row) // (2 * ASKED))
+    every = max(1, len(row) // (2 * QUERIES))
     row, column = row[::every], column[::every]
     reach = np.arange(PATCH)
     patches = coarse[row[:, None, None] + reach[:, None], column[:, None, None] + reach].reshape(len(row), -1)
     patches = patches - patches.mean(axis=0)
     spread = patches.T @ patches
     features = patches @ np.linalg.eigh(spread)[1][:, -FEATURES:]
-    asked = slice(None, None, max(1, len(row) // ASKED))
-    found = cKDTree(features).query(features[asked], k=min(24, len(row)), workers=-1)[1]
-    apart = np.stack([row[found] - row[asked][:, None], column[found] - column[asked][:, None]], axis=-1)
+    queries = slice(None, None, max(1, len(row) // QUERIES))
+    found = cKDTree(features).query(features[queries], k=min(24, len(row)), workers=-1)[1]
+    apart = np.stack([row[found] - row[queries][:, None], column[found] - column[queries][:, None]], axis=-1)
     far = np.abs(apart).max(axis=-1)
     good = (far >= NEAREST) & (far <= FARTHEST)
     first = np.argmax(good, axis=1)  # the most similar one that isn't the patch itself
@@ -142,9 +142,9 @@ def choose(coarse: F32, whole: Bools, hole: Bools, kind: I32, shifts: I32) -> I3
     cells = np.argwhere(hole).astype(np.int32)
     number[hole] = np.arange(len(cells))
     shown, cost = _shown(coarse, whole, hole, kind, shifts)
-    label = _pass_messages(number, cells, shown, cost, SWEEPS)
+    chosen = _pass_messages(number, cells, shown, cost, SWEEPS)
     out = np.full(hole.shape, -1, np.int32)
-    out[hole] = label
+    out[hole] = chosen
     return out
 
 
@@ -178,7 +178,7 @@ def _pass_messages(number, cells, shown, cost, sweeps):  # type: ignore[no-untyp
     """The label of each cell after so many sweeps (min-sum, in raster order and back); -1 where all are impossible."""
     height, width = number.shape
     n, count = cost.shape
-    told = np.zeros((n, 4, count), np.float32)  # by the neighbour in each direction
+    message = np.zeros((n, 4, count), np.float32)  # by the neighbour in each direction
     belief = np.empty(count, np.float32)
     for sweep in range(2 * sweeps):
         first = 0 if sweep % 2 == 0 else 2
@@ -191,9 +191,9 @@ def _pass_messages(number, cells, shown, cost, sweeps):  # type: ignore[no-untyp
                     continue
                 j, back = number[q, r], (direction + 2) % 4
                 for a in range(count):
-                    belief[a] = cost[i, a] - told[i, direction, a]
+                    belief[a] = cost[i, a] - message[i, direction, a]
                     for other in range(4):
-                        belief[a] += told[i, other, a]
+                        belief[a] += message[i, other, a]
                 least = belief.min()
                 for b in range(count):
                     best = belief[b]
@@ -205,17 +205,17 @@ def _pass_messages(number, cells, shown, cost, sweeps):  # type: ignore[no-untyp
                             here, there = shown[i, a, c] - shown[i, b, c], shown[j, a, c] - shown[j, b, c]
                             seam += here * here + there * there
                         best = min(best, belief[a] + seam)
-                    told[j, back, b] = best - least
-    label = np.full(n, -1, np.int32)
+                    message[j, back, b] = best - least
+    chosen = np.full(n, -1, np.int32)
     for i in range(n):
         best = np.float32(NEVER)
         for a in range(count):
             total = cost[i, a]
             for other in range(4):
-                total += told[i, other, a]
-            if cost[i, a] < NEVER and (label[i] < 0 or total < best):
-                label[i], best = a, total
-    return label
+                total += message[i, other, a]
+            if cost[i, a] < NEVER and (chosen[i] < 0 or total < best):
+                chosen[i], best = a, total
+    return chosen
 
 
 def toned(coarse: F32, whole: Bools, hole: Bools, shifts: I32, shift: I32) -> F32:
@@ -271,7 +271,7 @@ def _beyond(coarse: F32, whole: Bools, q: npt.NDArray[Any], r: npt.NDArray[Any],
     return np.where(there[:, None], coarse[u, v] - copied, 0.0)
 
 
-def _paint(rgb: F32, known: Bools, wanted: Bools, shifts: I32, shift: I32, tone: F32) -> Bools:
+def _copy(rgb: F32, known: Bools, wanted: Bools, shifts: I32, shift: I32, tone: F32) -> Bools:
     """Copy into `rgb`, in place; returns (H, W) which cells were filled."""
     import cv2
 

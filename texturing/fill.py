@@ -114,31 +114,33 @@ def pad(rgb: U8, seen: U8, reach: int) -> None:
     """
     import cv2
 
-    painted = seen > 0
-    if not painted.any():
+    coloured = seen > 0
+    if not coloured.any():
         rgb[:] = 128
         return
-    distance, label = cv2.distanceTransformWithLabels(
-        (~painted).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    distance, nearest = cv2.distanceTransformWithLabels(
+        (~coloured).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
     )
-    mean = rgb[::97, ::97][painted[::97, ::97]].mean(axis=0) if painted[::97, ::97].any() else np.full(3, 128.0)
-    _carry(rgb, painted, distance, label, reach, np.round(mean).astype(np.uint8))
+    mean = rgb[::97, ::97][coloured[::97, ::97]].mean(axis=0) if coloured[::97, ::97].any() else np.full(3, 128.0)
+    _carry(rgb, coloured, distance, nearest, reach, np.round(mean).astype(np.uint8))
 
 
 @njit(cache=True, parallel=True)
-def _carry(rgb, painted, distance, label, reach, beyond):  # type: ignore[no-untyped-def]
-    height, width = painted.shape
-    row, column = np.zeros(label.max() + 1, np.int32), np.zeros(label.max() + 1, np.int32)
+def _carry(rgb, coloured, distance, nearest, reach, beyond):  # type: ignore[no-untyped-def]
+    height, width = coloured.shape
+    row, column = np.zeros(nearest.max() + 1, np.int32), np.zeros(nearest.max() + 1, np.int32)
     for y in prange(height):
         for x in range(width):
-            if painted[y, x]:  # every painted texel has a label of its own
-                row[label[y, x]], column[label[y, x]] = y, x
+            if coloured[y, x]:  # every coloured texel has a number of its own
+                row[nearest[y, x]], column[nearest[y, x]] = y, x
     for y in prange(height):
         for x in range(width):
-            if painted[y, x]:
+            if coloured[y, x]:
                 continue
             for k in range(3):
-                rgb[y, x, k] = rgb[row[label[y, x]], column[label[y, x]], k] if distance[y, x] <= reach else beyond[k]
+                rgb[y, x, k] = (
+                    rgb[row[nearest[y, x]], column[nearest[y, x]], k] if distance[y, x] <= reach else beyond[k]
+                )
 
 
 @njit(cache=True, parallel=True)

@@ -44,21 +44,21 @@ class Charts:
     size: npt.NDArray[np.int64]
 
 
-def cut(mesh: Mesh, label: I32, centres: F64, texel: float, largest: int) -> Charts:
+def cut(mesh: Mesh, view: I32, centres: F64, texel: float, largest: int) -> Charts:
     """Charts of connected faces of one label; faces that can't be laid so are left out.
 
     Args:
         mesh: to be cut.
-        label: (F,) view of every face, -1 for none.
+        view: (F,) view of every face, -1 for none.
         centres: (V, 3) camera centres, local metres.
         texel: metres a texel spans.
         largest: side of a chart, texels, that it must not exceed.
     """
-    part = _components(mesh, label, largest * texel / CELLS)
+    part = _components(mesh, view, largest * texel / CELLS)
     face = np.flatnonzero(part >= 0)
     chart = part[face]
     corners = mesh.corners[face].astype(np.float64)
-    eye = centres[label[face]]
+    eye = centres[view[face]]
     normal, area = mesh.face_normal[face].astype(np.float64), mesh.face_area[face].astype(np.float64)
     count = int(chart.max()) + 1 if len(chart) else 0
 
@@ -147,21 +147,21 @@ def overlapping(flat: F32, page: Index, pages: list[tuple[int, int]]) -> npt.NDA
     return covered
 
 
-def _components(mesh: Mesh, label: I32, cell: float) -> Index:
+def _components(mesh: Mesh, view: I32, cell: float) -> Index:
     """(F,) connected faces of one label within one cell of a grid (metres); -1 without a label."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    from scan2sim.texturing.labels import adjacent
+    from scan2sim.texturing.mrf import adjacent
 
     pairs, _ = adjacent(mesh.faces)
     place = np.floor(mesh.corners.mean(axis=1) / cell).astype(np.int64)
-    same = (label[pairs[:, 0]] == label[pairs[:, 1]]) & (place[pairs[:, 0]] == place[pairs[:, 1]]).all(axis=1)
-    p = pairs[same & (label[pairs[:, 0]] >= 0)]
+    same = (view[pairs[:, 0]] == view[pairs[:, 1]]) & (place[pairs[:, 0]] == place[pairs[:, 1]]).all(axis=1)
+    p = pairs[same & (view[pairs[:, 0]] >= 0)]
     links = coo_array((np.ones(len(p), np.int8), (p[:, 0], p[:, 1])), shape=(len(mesh), len(mesh)))
     _, part = connected_components(links, directed=False)
     out = np.full(len(mesh), -1, np.int64)
-    seen = label >= 0
+    seen = view >= 0
     out[seen] = np.unique(part[seen], return_inverse=True)[1]
     return out
 

@@ -103,7 +103,7 @@ class Continued:
     def __init__(self, plan: Plan, picture: U8, filled: Bools) -> None:
         self._plan, self._picture, self._filled = plan, picture, filled
 
-    def paint(self, page: Page) -> None:
+    def fill(self, page: Page) -> None:
         """Colour the texels that are marked filled, in place, where the ground was continued."""
         height = len(page.owner)
         for first in range(0, height, 1024):

@@ -1,10 +1,10 @@
-"""Texture: every triangle painted from several photos, warped to its place on the page (D3.2, section 4.2).
+"""Texture: every triangle baked from several photos, warped to its place on the page (D3.2, section 4.2).
 
 Low frequencies are blended from all candidates of a face, weighted by distance (nearer counts more) and angle;
 what is finer comes from the one chosen photo, faded into its neighbour's over the triangles along a seam. Colour
 is a function of the place on the surface alone, so charts meet without seams. What no photo saw is coloured from
 the cloud's points; where they don't tell either, the ground goes on in its pattern (`plan.py`) and all else takes the
-mean colour around; both are marked. Pages are painted in bands of rows and photos read when needed,
+mean colour around; both are marked. Pages are baked in bands of rows and photos read when needed,
 so memory is bounded by a band and a few photos.
 """
 
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from scan2sim.pipeline.types import F32, U8, Mesh
+    from scan2sim.texturing.baker import Baker
     from scan2sim.texturing.fill import Colours, Page
-    from scan2sim.texturing.painter import Painter
     from scan2sim.texturing.plan import Plan
 
 NEIGHBOUR_STEP = 8
@@ -64,7 +64,7 @@ class TextureParams(Params):
 
 
 def texture(inputs: Inputs, params: TextureParams, out: Path, report: Report) -> Done:
-    """Paint the pages of an unwrapped mesh.
+    """Bake the pages of an unwrapped mesh.
 
     Inputs: `mesh` (with uv and page), `pages` (their sizes), `choice`, `views`, `depth` (folder of a depth map for
     every view), `exposures`, `agreement`, `cloud.*` (coloured points; that of the classes left out, `cloud.rest`,
@@ -88,14 +88,14 @@ def texture(inputs: Inputs, params: TextureParams, out: Path, report: Report) ->
         return Done({"textured": folder}, {"area_m2": 0.0, "seen_m2": 0.0, "coverage": 0.0, "pages": 0})
     assert mesh.page is not None
     sizes = json.loads(inputs["pages"].read_text(encoding="utf-8"))
-    painter = _painter(mesh, inputs, params)
+    baker = _baker(mesh, inputs, params)
     plan = _plan(mesh, sizes, inputs) if params.continued else None
     (colours, own), made = colours_of(inputs, plan), made_colours(inputs)
     counts = np.zeros((len(mesh), 4), np.int64)
     writer = Writer()
     for k, size in enumerate(sizes):
         faces = np.flatnonzero(mesh.page == k)
-        page = painter.paint(
+        page = baker.bake(
             faces, size["width"], size["height"],
             lambda f, m="", k=k: report((k + f) / len(sizes), f"page {k + 1} of {len(sizes)} {m}"),
         )  # fmt: skip
@@ -113,21 +113,21 @@ def texture(inputs: Inputs, params: TextureParams, out: Path, report: Report) ->
     if plan is not None and counts[:, 3].any():
         report(1.0, "ground goes on")
         _go_on(plan, folder, mesh, counts[:, 3] > 0, params)
-    skipped = sorted(painter.photos.skipped.values())
+    skipped = sorted(baker.photos.skipped.values())
     warnings = [f"{reason}: not used for texture, other photos stand in" for reason in skipped]
-    return Done({"textured": folder}, _facts(mesh, counts, sizes, painter), warnings)
+    return Done({"textured": folder}, _facts(mesh, counts, sizes, baker), warnings)
 
 
-def _painter(mesh: Mesh, inputs: Inputs, params: TextureParams) -> Painter:
-    """What paints the mesh's pages, with what the steps before have found."""
+def _baker(mesh: Mesh, inputs: Inputs, params: TextureParams) -> Baker:
+    """What bakes the mesh's pages, with what the steps before have found."""
     from scan2sim.pipeline.io import views as views_io
     from scan2sim.texturing.agreement import Agreement
+    from scan2sim.texturing.baker import Baker, best_device
     from scan2sim.texturing.blend import Weighing
     from scan2sim.texturing.choose import Choice
-    from scan2sim.texturing.painter import Painter, best_device
     from scan2sim.texturing.photos import Exposures
 
-    return Painter(
+    return Baker(
         mesh,
         views_io.load(inputs["views"]),
         Choice.load(inputs["choice"]),
@@ -183,7 +183,7 @@ def _go_on(plan: Plan, folder: Path, mesh: Mesh, wanting: npt.NDArray[np.bool_],
         flat = texels.corners(mesh.uv[faces], seen.shape[1], seen.shape[0])
         page = fill.Page(rgb, seen, texels.owners(flat, seen.shape[1], seen.shape[0]), flat, mesh.corners[faces])
         if ground is not None:
-            ground.paint(page)
+            ground.fill(page)
         fill.pad(page.rgb, page.seen, params.padding)
         writer.write(path, page)
     writer.finish()
@@ -219,9 +219,7 @@ def _filled(
     return np.asarray(texels.count(page.owner, page.seen, page.flat))
 
 
-def _facts(
-    mesh: Mesh, texels: npt.NDArray[np.int64], sizes: Sequence[dict[str, int]], painter: Painter
-) -> dict[str, Any]:
+def _facts(mesh: Mesh, texels: npt.NDArray[np.int64], sizes: Sequence[dict[str, int]], baker: Baker) -> dict[str, Any]:
     """Figures of a texture: areas (m2) by where their colour came from, photos and what each gave."""
     import numpy as np
 
@@ -238,9 +236,9 @@ def _facts(
         "coverage": round(seen / total, 4) if total else 0.0,
         "pages": len(sizes),
         "texels": int(texels[:, 0].sum()),
-        "photos": len(painter.used),
-        "texels_by_photo": {painter.name(i): n for i, n in sorted(painter.used.items())},
-        "skipped": sorted(painter.photos.skipped.values()),
+        "photos": len(baker.used),
+        "texels_by_photo": {baker.name(i): n for i, n in sorted(baker.used.items())},
+        "skipped": sorted(baker.photos.skipped.values()),
     }
 
 

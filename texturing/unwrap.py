@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from scan2sim.pipeline.types import Mesh, View
-    from scan2sim.texturing.atlas import Backend, Chartered
+    from scan2sim.texturing.atlas import Backend, Unwrapped
 
     Index = npt.NDArray[np.int64]
 
@@ -86,22 +86,22 @@ def unwrap(inputs: Inputs, params: UnwrapParams, out: Path, report: Report) -> D
     laid = Laid(np.zeros((len(mesh), 3, 2), np.float32), np.full(len(mesh), -1, np.int16), [], 0, 0)
     if len(mesh):
         if params.backend == "photo":
-            label, centres, pixel = _photos(inputs)
-            own = np.append(pixel, 0.0)[label]
+            detail_view, centres, pixel = _photos(inputs)
+            own = np.append(pixel, 0.0)[detail_view]
             coarse = params.model_copy(update={"texel": params.texel * params.unseen})
             draped = params.model_copy(update={"texel": max(params.texel, PER_PIXEL * float(own.max()))})
             finer = params.model_copy(update={"texel": params.texel / params.signs})
             sign = (
                 np.zeros(len(mesh), bool) if mesh.classification is None else mesh.classification == CODE["road_sign"]
             )
-            by_distance = (label >= 0) & (own == 0)
-            parts = [(by_distance & ~sign, params), ((label >= 0) & (own > 0), draped)]
+            by_distance = (detail_view >= 0) & (own == 0)
+            parts = [(by_distance & ~sign, params), ((detail_view >= 0) & (own > 0), draped)]
             parts += [(by_distance & sign, finer)] if sign.any() else []
             texel = np.select([faces for faces, _ in parts], [fine.texel for _, fine in parts], coarse.texel)
             check_size(float((mesh.face_area / texel**2).sum(dtype=np.float64)), params)
             for faces, fine in parts:
-                laid = lay_by_photo(mesh, laid, np.where(faces, label, -1), centres, fine)
-            for faces, fine in (*parts, (label < 0, coarse)):
+                laid = lay_by_photo(mesh, laid, np.where(faces, detail_view, -1), centres, fine)
+            for faces, fine in (*parts, (detail_view < 0, coarse)):
                 laid = lay(mesh, laid, np.flatnonzero((laid.page < 0) & faces), fine, report)
         else:
             check_size(float(mesh.face_area.sum(dtype=np.float64)) / params.texel**2, params)
@@ -158,7 +158,7 @@ def _photos(inputs: Inputs) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float
     views = views_io.load(inputs["views"])
     pixel = [1 / min(v.camera.fx, v.camera.fy) if v.camera.model == "orthographic" else 0.0 for v in views]
     centres = np.array([_eye(view) for view in views]).reshape(-1, 3)
-    return Choice.load(inputs["choice"]).label, centres, np.array(pixel, np.float64)
+    return Choice.load(inputs["choice"]).detail_view, centres, np.array(pixel, np.float64)
 
 
 def _eye(view: View) -> npt.NDArray[np.float64]:
@@ -172,12 +172,12 @@ def _eye(view: View) -> npt.NDArray[np.float64]:
 
 
 def lay_by_photo(
-    mesh: Mesh, laid: Laid, label: npt.NDArray[np.int32], centres: npt.NDArray[np.float64], params: UnwrapParams
+    mesh: Mesh, laid: Laid, detail_view: npt.NDArray[np.int32], centres: npt.NDArray[np.float64], params: UnwrapParams
 ) -> Laid:
     """Charts as the chosen photos see them, on pages after those that are there; faces that can't be laid so get none.
 
     Args:
-        label: (F,) the photo of every face, -1 for those that are not to be laid.
+        detail_view: (F,) the photo of every face, -1 for those that are not to be laid.
         centres: (V, 3) of the cameras.
     """
     import numpy as np
@@ -185,7 +185,7 @@ def lay_by_photo(
     from scan2sim.texturing import photo_charts
 
     uv, page = laid.uv.copy(), laid.page.copy()
-    charts = photo_charts.cut(mesh, label, centres, params.texel, params.page_size - 2 * params.gutter)
+    charts = photo_charts.cut(mesh, detail_view, centres, params.texel, params.page_size - 2 * params.gutter)
     place, of, pages = photo_charts.pack(charts.size, params.page_size, params.gutter)
     flat = charts.flat + place[charts.chart][:, None].astype(np.float32)
     good = ~photo_charts.overlapping(flat, of[charts.chart], pages)
@@ -252,7 +252,7 @@ def halves(mesh: Mesh, block: Index) -> list[Index]:
     return [np.sort(block[order[:middle]]), np.sort(block[order[middle:]])]
 
 
-def _unwrap_all(mesh: Mesh, blocks: list[Index], params: UnwrapParams) -> list[Chartered]:
+def _unwrap_all(mesh: Mesh, blocks: list[Index], params: UnwrapParams) -> list[Unwrapped]:
     """Unwrap blocks on all cores, a child process a core; what fails is tried alone, then by the other backend."""
     from concurrent.futures import ThreadPoolExecutor
 
@@ -283,7 +283,7 @@ def _unwrap_all(mesh: Mesh, blocks: list[Index], params: UnwrapParams) -> list[C
 CHILD = "child process: "
 
 
-def _in_child(mesh: Mesh, blocks: list[Index], backend: Backend, params: UnwrapParams) -> list[Chartered | str]:
+def _in_child(mesh: Mesh, blocks: list[Index], backend: Backend, params: UnwrapParams) -> list[Unwrapped | str]:
     """Unwrap blocks in one child process; a reason for each that failed."""
     import numpy as np
 

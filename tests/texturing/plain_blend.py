@@ -21,25 +21,25 @@ def accumulate(
     laid: blend.Laid,
     faces: npt.NDArray[np.int64],
     share: F32,
-    look: blend.Look,
+    source: blend.Source,
     weighing: blend.Weighing,
     camera: Camera,
 ) -> npt.NDArray[np.int64]:
     """Add what a photo says of `faces` to `sums`; returns the (N, 2) row and column of the texels that it sees.
 
     Args:
-        sums, laid, faces, share, look, weighing: of `blend.accumulate` and `blend.Rows.add`.
+        sums, laid, faces, share, source, weighing: of `blend.accumulate` and `blend.Rows.add`.
         camera: the photo's.
     """
-    shown, hides = look.shown, look.hides
+    picture, occlusion = source.picture, source.occlusion
     row, column = np.nonzero(np.isin(laid.owner, faces))
     face = laid.owner[row, column]
     share = share[np.argsort(faces)[np.searchsorted(np.sort(faces), face)]]
 
     # where the texels are, in the camera's axes
     part = barycentric(laid.flat[face].astype(float), column, row)
-    place = np.einsum("nc,nck->nk", part, laid.corners[face]) @ look.eye.T[:3, :3].T + look.eye.T[:3, 3]
-    normal = laid.normals[face] @ look.eye.T[:3, :3].T
+    place = np.einsum("nc,nck->nk", part, laid.corners[face]) @ source.eye.T[:3, :3].T + source.eye.T[:3, 3]
+    normal = laid.normals[face] @ source.eye.T[:3, :3].T
     uv, ok = project_exactly(camera, place)
 
     # how they are seen: from what distance, how squarely, and how many pixels wide
@@ -54,22 +54,22 @@ def accumulate(
 
     # which of them it sees
     slope = np.minimum(np.tan(np.arccos(np.clip(np.abs(cos), 1e-6, 1))), MAX_SLOPE)
-    lean = slope * hides.pixel * (1 if camera.model == "orthographic" else distance)
+    lean = slope * occlusion.pixel * (1 if camera.model == "orthographic" else distance)
     ok &= inside(camera, uv) & (cos >= 0.5 * weighing.min_cos)
-    if shown.mask.size:
-        ok &= nearest(shown.mask, uv, camera) > 0
-    ok &= distance <= nearest(hides.first, uv, camera) + weighing.bias + SLOPE_SHARE * lean
+    if picture.mask.size:
+        ok &= nearest(picture.mask, uv, camera) > 0
+    ok &= distance <= nearest(occlusion.first, uv, camera) + weighing.bias + SLOPE_SHARE * lean
     row, column, part, share, uv = row[ok], column[ok], part[ok], share[ok], uv[ok]
     distance, away, cos, wide, lean = (a[ok] for a in (distance, away, cos, wide, lean))
 
     # what it shows there
     at = uv
-    if shown.warp.size:
-        at = uv + bilinear(shown.warp, uv, camera)
+    if picture.warp.size:
+        at = uv + bilinear(picture.warp, uv, camera)
     chosen = share.sum(axis=1) > 0
-    rgb = np.where((wide < 3.2)[:, None], bilinear(shown.half, at, camera), bilinear(shown.quarter, at, camera))
+    rgb = np.where((wide < 3.2)[:, None], bilinear(picture.half, at, camera), bilinear(picture.quarter, at, camera))
     sharp = chosen | (weighing.band < 0)
-    finest = np.where(sharp[:, None], bicubic(shown.whole, at, camera), bilinear(shown.whole, at, camera))
+    finest = np.where(sharp[:, None], bicubic(picture.whole, at, camera), bilinear(picture.whole, at, camera))
     rgb = np.where((wide < 1.6)[:, None], finest, rgb)
 
     # how much that counts
@@ -77,16 +77,16 @@ def accumulate(
     inwards = np.min(border[:2] if camera.model == "equirectangular" else border, axis=0)
     worth = (cos / away) ** (2 * weighing.power) * (0.02 + 0.98 * np.minimum(1, inwards / weighing.feather))
     worth = np.where(rgb.max(axis=1) > WHITE, EDGE, 1) * worth
-    beside = distance > nearest(hides.apart, uv, camera) + weighing.bias + (hides.reach + 0.5) * lean
+    beside = distance > nearest(occlusion.apart, uv, camera) + weighing.bias + (occlusion.reach + 0.5) * lean
     low = np.where(beside, EDGE, 1) * worth
-    beside = distance > nearest(hides.near, uv, camera) + weighing.bias + 1.5 * lean
+    beside = distance > nearest(occlusion.near, uv, camera) + weighing.bias + 1.5 * lean
     detail = np.where(beside, EDGE, 1) * (1e-4 * worth + np.maximum(0, np.einsum("nc,nc->n", part, share)))
 
     # exposure undone; low frequencies and what is finer, each to its sum
     middle = (np.array([camera.width, camera.height]) - 1) / 2
     q = ((uv - middle) ** 2).sum(axis=1) / (middle**2).sum()
-    light = np.exp(shown.exposure[:3] + (shown.exposure[3] * q + shown.exposure[4] * q**2)[:, None])
-    coarse = {-1: rgb, 0: rgb}.get(weighing.band, bilinear(shown.low, at, camera))
+    light = np.exp(picture.exposure[:3] + (picture.exposure[3] * q + picture.exposure[4] * q**2)[:, None])
+    coarse = {-1: rgb, 0: rgb}.get(weighing.band, bilinear(picture.low, at, camera))
     base = (coarse + OFFSET) * light - OFFSET if weighing.band else np.zeros_like(rgb)
     fine = (rgb + OFFSET) * light - OFFSET - base
     sums.low[row, column] += low[:, None] * np.column_stack([base, np.ones(len(base))])

@@ -50,7 +50,7 @@ def scattered(rng: np.random.Generator, camera: Camera) -> blend.Laid:
     return blend.Laid(owner, on_page, in_space, np.repeat(facing, 2, axis=0).astype(np.float32))
 
 
-def taken(rng: np.random.Generator, camera: Camera, band: int) -> blend.Look:
+def taken(rng: np.random.Generator, camera: Camera, band: int) -> blend.Source:
     """A photo with all that can be about it: things before what it shows, a mask, a warp, exposure, white patches."""
 
     def patches(values: Any, size: int) -> Any:
@@ -62,10 +62,10 @@ def taken(rng: np.random.Generator, camera: Camera, band: int) -> blend.Look:
     half = shrunk(whole, 2)
     first = patches([np.inf, 9.0, 6.0, 4.0], 8)
     wider = camera.resized(first.shape[1], first.shape[0])
-    shown = blend.Shown(
+    picture = blend.Picture(
         whole, half, shrunk(half, 2), low_frequencies(whole, max(1, band)),
         rng.choice([0, 255, 255, 255], (24, 33)).astype(np.uint8), rng.normal(0, 2, (5, 7, 2)).astype(np.float32),
         np.array([0.1, -0.05, 0.02, 0.3, 0.2]),
     )  # fmt: skip
     near, apart = (np.asarray(cv2.erode(first, np.ones((n, n)))) for n in (3, 7))
-    return blend.Look(shown, eye(camera, np.eye(4)), blend.Hides(first, pixel_angle(wider), near, apart, 3))
+    return blend.Source(picture, eye(camera, np.eye(4)), blend.Occlusion(first, pixel_angle(wider), near, apart, 3))

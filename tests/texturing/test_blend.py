@@ -43,16 +43,16 @@ def test_texels_show_what_the_photo_shows_there(size: int, warp: tuple[float, fl
     assert (owner >= 0).all()
     gain, fall = np.array([0.1, -0.05, 0.0]), np.array([0.3, 0.2])
     everywhere = np.full((6, 8), np.inf, np.float32)
-    look = blend.Look(
-        blend.Shown(
+    source = blend.Source(
+        blend.Picture(
             whole, half, quarter, whole, np.zeros((0, 0), np.uint8), np.tile(np.array(warp, np.float32), (3, 4, 1)),
             np.concatenate([gain, fall]),
         ),
-        eye(CAMERA, POSE), blend.Hides(everywhere, pixel_angle(CAMERA), everywhere, everywhere, 1),
+        eye(CAMERA, POSE), blend.Occlusion(everywhere, pixel_angle(CAMERA), everywhere, everywhere, 1),
     )  # fmt: skip
     rows = blend.NumbaRows(blend.Laid(owner, flat, corners, np.tile(np.array([0, 0, 1], np.float32), (2, 1))))
     weighing = blend.Weighing(bias=0.1, power=1.0, feather=4.0, min_cos=0.1, band=-1)
-    rows.add(np.arange(2), np.zeros((2, 3), np.float32), look, weighing)
+    rows.add(np.arange(2), np.zeros((2, 3), np.float32), source, weighing)
     rgb, seen = np.zeros((size, size, 3), np.uint8), np.zeros((size, size), np.uint8)
     rows.resolve(rgb, seen)
     assert (seen == 255).all()
@@ -78,10 +78,10 @@ def test_photos_are_added_as_the_plain_words_have_it(name: str, band: int) -> No
     weighing = blend.Weighing(bias=0.05, power=1.5, feather=9.0, min_cos=0.5, band=band)
     seen = 0
     for _ in range(2):
-        look, faces = taken(rng, camera, band), rng.permutation(count)[: 3 * count // 4]
+        source, faces = taken(rng, camera, band), rng.permutation(count)[: 3 * count // 4]
         share = (rng.uniform(size=(len(faces), 3)) * rng.choice([0, 1], (len(faces), 1))).astype(np.float32)
-        texels = plain_blend.accumulate(plain, laid, faces, share, look, weighing, camera)
-        assert blend.accumulate(fast, laid, faces, share, *look, weighing) == len(texels)
+        texels = plain_blend.accumulate(plain, laid, faces, share, source, weighing, camera)
+        assert blend.accumulate(fast, laid, faces, share, *source, weighing) == len(texels)
         seen += len(texels)
     assert 0.1 < seen / (2 * (laid.owner >= 0).sum()) < 0.6  # many are seen, many are not
     for mine, theirs in zip(fast, plain, strict=True):

@@ -38,13 +38,13 @@ def test_torch_adds_the_same(name: str, band: int) -> None:
 
     camera, rng = scattered.CAMERAS[name], np.random.default_rng(7)
     laid = scattered.scattered(rng, camera)
-    look, faces = scattered.taken(rng, camera, band), np.arange(len(laid.flat))
+    source, faces = scattered.taken(rng, camera, band), np.arange(len(laid.flat))
     share = rng.choice([0, 1], (len(faces), 3)).astype(np.float32)
     weighing = blend.Weighing(bias=0.05, power=1.5, feather=9.0, min_cos=0.5, band=band)
     pages = []
     for rows in (blend.NumbaRows(laid), TorchRows(laid, "cpu")):
         rgb, seen = np.zeros((*laid.owner.shape, 3), np.uint8), np.zeros(laid.owner.shape, np.uint8)
-        texels = rows.add(faces, share, look, weighing)
+        texels = rows.add(faces, share, source, weighing)
         rows.resolve(rgb, seen)
         assert texels == (seen == 255).sum() > 500
         pages.append(rgb.astype(int))

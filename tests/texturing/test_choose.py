@@ -21,5 +21,5 @@ def test_a_plates_side_is_painted_from_the_photos_that_see_all_of_it_finely() ->
     view[front[0]], quality[front[0]] = [0, 1, 3, -1], [0.03, 0.02, 0.003, 0]  # photo 2 doesn't see this face
     found = with_whole_signs(Choice(view, quality, view[:, 0].copy()), mesh, [1e-3] * 4)
     assert (found.view[front] == [0, 1, -1, -1]).all()  # photo 3 is too coarse
-    assert (found.label[front] == 0).all()
-    assert (np.delete(found.label, front) == -1).all()
+    assert (found.detail_view[front] == 0).all()
+    assert (np.delete(found.detail_view, front) == -1).all()

@@ -16,10 +16,10 @@ from scan2sim.pipeline.io import image, textured
 from scan2sim.pipeline.step import silent
 from scan2sim.pipeline.types import F64, I32, Frame, Mesh
 from scan2sim.texturing import fill
+from scan2sim.texturing.borders.correspondences import rim, shared_border
 from scan2sim.texturing.borders.fading import changes, fade
 from scan2sim.texturing.borders.level import LevelParams, level
 from scan2sim.texturing.borders.measure import colour_step
-from scan2sim.texturing.borders.meeting import meet, rim
 from scan2sim.texturing.texels import corners as laid_flat
 from scan2sim.texturing.texels import owners
 from tests.present import present
@@ -175,7 +175,7 @@ def test_what_is_far_from_the_border_stays(pair: tuple[Path, Path]) -> None:
     one, two = pair
     levelled, _ = run(one, [two], reach=1.5)
     added, places = change(one, levelled)
-    border = meet([rim(Mesh.load(folder / "mesh.npz")) for folder in pair]).xyz
+    border = shared_border([rim(Mesh.load(folder / "mesh.npz")) for folder in pair]).xyz
     distance, _ = cKDTree(border).query(places)
     assert (added[distance > 1.55] == 0).all() and (distance > 1.55).mean() > 0.5
     assert (abs(added[distance < 0.3]).max(axis=1) > 3).mean() > 0.95

@@ -13,29 +13,29 @@ def both() -> tuple[Mesh, I32]:
     """Ground and box as one mesh; its left half belongs to the first camera, its right half to the second."""
     mesh = join((GROUND.vertices, GROUND.faces), (BOX.vertices, BOX.faces))
     middle = mesh.corners.mean(axis=1)
-    label = (middle[:, 1] > 0).astype(np.int32)
-    towards = CENTRES[label] - middle
-    label[np.einsum("ij,ij->i", towards, mesh.face_normal) <= 0] = -1
-    return mesh, label
+    view = (middle[:, 1] > 0).astype(np.int32)
+    towards = CENTRES[view] - middle
+    view[np.einsum("ij,ij->i", towards, mesh.face_normal) <= 0] = -1
+    return mesh, view
 
 
 def test_charts_are_metric_and_seen_faces_are_laid() -> None:
-    mesh, label = both()
-    charts = photo_charts.cut(mesh, label, CENTRES, 0.02, 2000)
-    assert len(charts.face) > 0.95 * (label >= 0).sum()
+    mesh, view = both()
+    charts = photo_charts.cut(mesh, view, CENTRES, 0.02, 2000)
+    assert len(charts.face) > 0.95 * (view >= 0).sum()
     a, b = charts.flat[:, 1] - charts.flat[:, 0], charts.flat[:, 2] - charts.flat[:, 0]
     drawn = (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2 * 0.02**2
     assert (drawn > 0).all()
     np.testing.assert_allclose(drawn.sum(), mesh.face_area[charts.face].sum(), rtol=0.02)
     assert (charts.flat >= 0).all() and (charts.flat.max(axis=1) <= charts.size[charts.chart]).all()
-    assert (label[charts.face] >= 0).all()
+    assert (view[charts.face] >= 0).all()
 
 
 def test_a_chart_belongs_to_one_photo() -> None:
-    mesh, label = both()
-    charts = photo_charts.cut(mesh, label, CENTRES, 0.02, 2000)
+    mesh, view = both()
+    charts = photo_charts.cut(mesh, view, CENTRES, 0.02, 2000)
     for k in np.unique(charts.chart):
-        assert len(np.unique(label[charts.face[charts.chart == k]])) == 1
+        assert len(np.unique(view[charts.face[charts.chart == k]])) == 1
 
 
 def test_rectangles_never_meet_and_stay_on_their_page() -> None:
@@ -62,7 +62,7 @@ def test_faces_under_others_are_told() -> None:
 
 
 def test_no_seen_face_no_chart() -> None:
-    mesh, label = both()
-    charts = photo_charts.cut(mesh, np.full_like(label, -1), CENTRES, 0.02, 2000)
+    mesh, view = both()
+    charts = photo_charts.cut(mesh, np.full_like(view, -1), CENTRES, 0.02, 2000)
     assert len(charts.face) == 0 and photo_charts.pack(charts.size, 256, 3)[2] == []
     assert isinstance(mesh, Mesh)

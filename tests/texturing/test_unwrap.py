@@ -137,8 +137,8 @@ def test_what_an_orthophoto_drapes_is_laid_flat_at_half_its_pixels(tmp_path: Pat
     down[:3, 3] = 0, 6, 12
     camera = Camera("orthographic", 30, 30, 5.0, 5.0, 0.0, 0.0)  # 20 cm a pixel
     views_io.save(tmp_path / "views.json", [View("map", camera, down, tmp_path / "map.png")])
-    label = np.zeros(len(mesh), np.int32)
-    Choice(label[:, None], np.ones((len(mesh), 1), np.float32), label).save(tmp_path / "choice.npz")
+    detail_view = np.zeros(len(mesh), np.int32)
+    Choice(detail_view[:, None], np.ones((len(mesh), 1), np.float32), detail_view).save(tmp_path / "choice.npz")
     mesh.save(tmp_path / "in.npz")
     inputs = {"mesh": tmp_path / "in.npz", "views": tmp_path / "views.json", "choice": tmp_path / "choice.npz"}
     done = unwrap(inputs, UnwrapParams(texel=0.01), tmp_path, silent)

@@ -12,8 +12,8 @@ import numpy as np
 from numba import njit, prange
 
 from scan2sim.pipeline.types import F32, F64, I32, U8
-from scan2sim.texturing.borders.meeting import SOFT, Index
-from scan2sim.texturing.borders.showing import taps
+from scan2sim.texturing.borders.correspondences import SOFT, Index
+from scan2sim.texturing.borders.sampling import taps
 from scan2sim.texturing.texels import box, frame
 
 LEAF = 8
@@ -205,11 +205,11 @@ def sources(owner: I32) -> I32:
     import cv2
 
     empty = (owner < 0).astype(np.uint8)
-    _, label = cv2.distanceTransformWithLabels(empty, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
-    texel = np.zeros(label.max() + 1, np.int32)
-    painted = np.flatnonzero(empty == 0)
-    texel[label.ravel()[painted]] = painted
-    return texel[label]
+    _, nearest = cv2.distanceTransformWithLabels(empty, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    texel = np.zeros(nearest.max() + 1, np.int32)
+    owned = np.flatnonzero(empty == 0)
+    texel[nearest.ravel()[owned]] = owned
+    return texel[nearest]
 
 
 def settle(page: U8, source: I32, uv: F32, wanted: F32) -> None:

@@ -23,7 +23,7 @@ from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 if TYPE_CHECKING:
     from scan2sim.pipeline.io.textured import Textured
     from scan2sim.pipeline.types import F32
-    from scan2sim.texturing.borders.meeting import Border
+    from scan2sim.texturing.borders.correspondences import Border
 
 NEIGHBOUR = "neighbour."
 
@@ -51,7 +51,7 @@ def level(inputs: Inputs, params: LevelParams, out: Path, report: Report) -> Don
     import numpy as np
 
     from scan2sim.pipeline.io import textured
-    from scan2sim.texturing.borders import meeting, showing
+    from scan2sim.texturing.borders import correspondences, sampling
 
     folder = out / "textured"
     folder.mkdir()
@@ -61,11 +61,11 @@ def level(inputs: Inputs, params: LevelParams, out: Path, report: Report) -> Don
     facts: dict[str, Any] = {"border_m": 0.0, "step_before": 0.0, "step_after": 0.0, "step_p95_after": 0.0}
     if own is not None and others:
         tiles = (own, *others.values())
-        border = meeting.meet([meeting.rim(tile.mesh) for tile in tiles])
-        if len(border.looks[0].place):
-            looked = zip(border.looks, tiles, strict=True)
-            shown = np.stack([showing.colours(looks, tile.pages, len(border)) for looks, tile in looked])
-            target = showing.targets(border.xyz, shown, params.reach)
+        border = correspondences.shared_border([correspondences.rim(tile.mesh) for tile in tiles])
+        if len(border.samples[0].place):
+            pairs = zip(border.samples, tiles, strict=True)
+            shown = np.stack([sampling.colours(samples, tile.pages, len(border)) for samples, tile in pairs])
+            target = sampling.targets(border.xyz, shown, params.reach)
             after = _level_pages(own, border, shown[0], target, params.reach, folder, report)
             facts = _facts(border, list(others), shown, target, after)
     _link_others(inputs["textured"], folder)
@@ -84,31 +84,31 @@ def _level_pages(
 
     from scan2sim.pipeline.io import image
     from scan2sim.texturing import texels
-    from scan2sim.texturing.borders import fading, showing
+    from scan2sim.texturing.borders import fading, sampling
 
-    mesh, looks = own.mesh, border.looks[0]
+    mesh, samples = own.mesh, border.samples[0]
     assert mesh.uv is not None and mesh.page is not None
     mine = np.isfinite(shown[:, 0])
     places = border.xyz[mine] - np.asarray(mesh.frame.origin)
     corners, tree = mesh.corners, fading.changes(places, border.metres[mine], (target - shown)[mine])
     near = fading.within(tree, corners, reach)
-    after = np.empty((len(looks.place), 3), np.float32)
+    after = np.empty((len(samples.place), 3), np.float32)
     pages = np.unique(mesh.page[near]).tolist()
     for i, k in enumerate(pages):
         report(i / len(pages), f"page {i + 1} of {len(pages)}")
         faces = np.flatnonzero(mesh.page == k)
-        here = looks.page == k
+        here = samples.page == k
         before = image.read_rgb(own.pages[k])
         page, (height, width) = before.copy(), before.shape[:2]
         flat = texels.corners(mesh.uv[faces], width, height)
         owner = texels.owners(flat, width, height)
         source = fading.sources(owner)
         fading.fade(page, owner, flat, corners[faces], near[faces], tree, reach)
-        fading.settle(page, source, looks.uv[here], target[looks.place[here]])
+        fading.settle(page, source, samples.uv[here], target[samples.place[here]])
         fading.follow(before, page, owner, source)
-        after[here] = showing.looked_up(page, looks.uv[here])
+        after[here] = sampling.sampled(page, samples.uv[here])
         image.write(folder / f"page_{k}.png", page)
-    return showing.by_place(looks.place, after, len(border))
+    return sampling.by_place(samples.place, after, len(border))
 
 
 def _facts(border: Border, names: Sequence[str], shown: F32, target: F32, after: F32) -> dict[str, Any]:

@@ -61,13 +61,13 @@ def colour_step(a: Textured, b: Textured) -> tuple[float, float, float]:
     """
     import numpy as np
 
-    from scan2sim.texturing.borders.meeting import meet, rim
-    from scan2sim.texturing.borders.showing import colours
+    from scan2sim.texturing.borders.correspondences import rim, shared_border
+    from scan2sim.texturing.borders.sampling import colours
 
-    border = meet([rim(a.mesh), rim(b.mesh)], SPACING)
+    border = shared_border([rim(a.mesh), rim(b.mesh)], SPACING)
     if not len(border):
         return 0.0, 0.0, 0.0
-    one, two = (colours(looks, t.pages, len(border)) for looks, t in zip(border.looks, (a, b), strict=True))
+    one, two = (colours(samples, t.pages, len(border)) for samples, t in zip(border.samples, (a, b), strict=True))
     step = np.abs(one - two)
     return float(step.mean()), float(np.percentile(step, 95)), border.length[0]
 

@@ -2,7 +2,7 @@
 
 Energy: how much worse a photo is than the best one that sees the face, and a price for every edge between
 faces of different photos, by its length (Waechter et al. 2014, "Let There Be Color!"). Minimised by sequential
-tree-reweighted message passing (Kolmogorov 2006, TRW-S): it also tells a bound that no labelling can be below, so
+tree-reweighted message passing (Kolmogorov 2006, TRW-S): it also proves a bound that no choice can be below, so
 the work ends where nothing is left to gain. Time and memory grow with faces times candidates, not with the number
 of photos; nothing depends on the number of threads. Import late: it loads numba.
 """
@@ -32,7 +32,7 @@ def adjacent(faces: I32) -> tuple[I32, I32]:
     return np.stack([a // 3, b // 3], axis=1).astype(np.int32), np.stack([start[a], end[a]], axis=1).astype(np.int32)
 
 
-def label(view: I32, quality: F32, pairs: I32, price: F32) -> I32:
+def detail_views(view: I32, quality: F32, pairs: I32, price: F32) -> I32:
     """The view (F,) that each face takes its detail from; -1 where none sees it.
 
     Args:
@@ -41,7 +41,7 @@ def label(view: I32, quality: F32, pairs: I32, price: F32) -> I32:
         pairs: (E, 2) neighbouring faces.
         price: (E,) of different views on both sides, against a cost of 1 for a useless view.
     """
-    return solve(view, costs(view, quality), pairs, price).label
+    return solve(view, costs(view, quality), pairs, price).view
 
 
 def costs(view: I32, quality: F32) -> F32:
@@ -52,15 +52,15 @@ def costs(view: I32, quality: F32) -> F32:
 
 @dataclass(frozen=True)
 class Solution:
-    """A labelling, and how good it is.
+    """A choice of views, and how good it is.
 
     Attributes:
-        label: (F,) int32 views, -1 for faces without candidates.
+        view: (F,) int32 views, -1 for faces without candidates.
         energy: costs and prices together.
-        bound: no labelling has less.
+        bound: no choice has less.
     """
 
-    label: I32
+    view: I32
     energy: float
     bound: float
 
@@ -125,33 +125,33 @@ def _sweep(view, cost, count, start, other, edge, price, message, pick, forward)
         pick: (F,) of candidates; changed.
         forward: through the faces in their order, or backwards.
     """
-    told, known = np.empty(cost.shape[1]), np.empty(cost.shape[1])
+    belief, conditional = np.empty(cost.shape[1]), np.empty(cost.shape[1])
     bound = 0.0
     for turn in range(len(count)):
         f = turn if forward else len(count) - 1 - turn
         if count[f] == 0:
             continue
         for i in range(count[f]):
-            told[i] = cost[f, i]  # what each candidate costs, as all neighbours tell
-            known[i] = cost[f, i]  # likewise, but those that had their turn have picked
+            belief[i] = cost[f, i]  # what each candidate costs, by the messages of all neighbours
+            conditional[i] = cost[f, i]  # likewise, but those that had their turn have picked
         before = after = 0
         for k in range(start[f], start[f + 1]):
             e, g = edge[k], other[k]
             for i in range(count[f]):
-                told[i] += message[e, i]
+                belief[i] += message[e, i]
             if (g > f) == forward:
                 after += 1
                 for i in range(count[f]):
-                    known[i] += message[e, i]
+                    conditional[i] += message[e, i]
             else:
                 before += 1
                 taken = view[g, pick[g]]
                 for i in range(count[f]):
-                    known[i] += 0.0 if view[f, i] == taken else price[e]
-        pick[f], least = 0, told[0]
+                    conditional[i] += 0.0 if view[f, i] == taken else price[e]
+        pick[f], least = 0, belief[0]
         for i in range(1, count[f]):
-            least = min(least, told[i])
-            if known[i] < known[pick[f]]:
+            least = min(least, belief[i])
+            if conditional[i] < conditional[pick[f]]:
                 pick[f] = i
         bound += least
         share = 1.0 / max(before, after, 1)
@@ -160,14 +160,14 @@ def _sweep(view, cost, count, start, other, edge, price, message, pick, forward)
             if (g > f) == forward:
                 dearest = np.inf
                 for i in range(count[f]):
-                    known[i] = share * (told[i] - least) - message[e, i]
-                    dearest = min(dearest, known[i] + price[e])
+                    conditional[i] = share * (belief[i] - least) - message[e, i]
+                    dearest = min(dearest, conditional[i] + price[e])
                 low = np.inf
                 for j in range(count[g]):
                     there = dearest
                     for i in range(count[f]):
                         if view[f, i] == view[g, j]:
-                            there = min(there, known[i])
+                            there = min(there, conditional[i])
                     message[e, j] = there
                     low = min(low, there)
                 for j in range(count[g]):

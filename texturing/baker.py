@@ -1,4 +1,4 @@
-"""Photos onto pages, band by band: memory is bounded by a band and a few photos. Import late: it loads numba."""
+"""Photos baked onto pages, band by band: memory is bounded by a band and a few photos. Import late: it loads numba."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from scan2sim.pipeline.types import F32, I32, Mesh, View
 from scan2sim.pipeline.visibility import load_depth_map
 from scan2sim.texturing import texels
 from scan2sim.texturing.agreement import Agreement
-from scan2sim.texturing.blend import Hides, Laid, Look, NumbaRows, Rows, Shown, Weighing
+from scan2sim.texturing.blend import Laid, NumbaRows, Occlusion, Picture, Rows, Source, Weighing
 from scan2sim.texturing.choose import Choice
 from scan2sim.texturing.fill import Page
 from scan2sim.texturing.photos import Exposures, Photos
@@ -28,13 +28,13 @@ from scan2sim.texturing.photos import Exposures, Photos
 Index = npt.NDArray[np.int64]
 
 BAND = 6_000_000
-"""Texels of a page that are painted at a time, in whole rows."""
+"""Texels of a page that are baked at a time, in whole rows."""
 KEPT = 8
 """Depth maps kept in memory."""
 
 
-class Painter:
-    """Photos onto pages, band by band.
+class Baker:
+    """Bakes photos onto pages, band by band.
 
     Args:
         mesh: with uv and page.
@@ -45,7 +45,7 @@ class Painter:
         agreement: where photos may be used, and how they are displaced.
         weighing: of photos; its feather is a share of a photo's width here.
         fade: let photos fade into each other over the triangles along a seam.
-        device: what paints, "numba" or a device of torch.
+        device: what bakes, "numba" or a device of torch.
 
     Attributes:
         used: index of a view to the number of texels that it contributed to.
@@ -70,16 +70,16 @@ class Painter:
         self._corners, self._normals = mesh.corners, mesh.face_normal
         self._choice, self._depth_file, self._exposures = choice, depth_file, exposures
         self._mask, self._warp = agreement.mask, agreement.warp
-        self._share = shares(mesh.faces, choice.label, len(mesh.vertices), len(views))
+        self._share = shares(mesh.faces, choice.detail_view, len(mesh.vertices), len(views))
         classification = mesh.classification
         self._sign = np.zeros(len(mesh), bool) if classification is None else classification == CODE["road_sign"]
         self._backwards = True
-        self._hides = lru_cache(maxsize=KEPT)(self._read_hides)
+        self._occlusion = lru_cache(maxsize=KEPT)(self._read_occlusion)
         self.photos = Photos(views, max(1, weighing.band))
         self.used: dict[int, int] = {}
 
-    def paint(self, faces: Index, width: int, height: int, report: Report) -> Page:
-        """A page painted from photos alone; texels that none saw stay black and unmarked.
+    def bake(self, faces: Index, width: int, height: int, report: Report) -> Page:
+        """A page baked from photos alone; texels that none saw stay black and unmarked.
 
         Args:
             faces: (N,) those on the page.
@@ -100,11 +100,11 @@ class Painter:
             rows = slice(first, min(height, first + band))
             here = np.flatnonzero((high >= rows.start) & (low <= rows.stop))
             if len(here):
-                self._paint_rows(page, rows, here, faces)
+                self._bake_rows(page, rows, here, faces)
         return page
 
-    def _paint_rows(self, page: Page, rows: slice, here: Index, faces: Index) -> None:
-        """Paint the rows of a page; `here` are its faces (indices into `faces`) that reach into them."""
+    def _bake_rows(self, page: Page, rows: slice, here: Index, faces: Index) -> None:
+        """Bake the rows of a page; `here` are its faces (indices into `faces`) that reach into them."""
         flat = page.flat - np.array([0, rows.start], np.float32)
         band = self._rows(Laid(page.owner[rows], flat, page.corners, self._normals[faces]))
         candidates = self._choice.view[faces[here]]
@@ -112,20 +112,20 @@ class Painter:
         self._backwards = not self._backwards  # what the last rows read last is still in memory
         for i in reversed(order) if self._backwards else order:
             mine = here[(candidates == i).any(axis=1)]
-            seen = self._look(i, band, mine, faces[mine])
+            seen = self._add_photo(i, band, mine, faces[mine])
             if seen:
                 self.used[i] = self.used.get(i, 0) + seen
         band.resolve(page.rgb[rows], page.seen[rows])
 
     def _rows(self, laid: Laid) -> Rows:
-        """What paints, on this machine's GPU or its processors."""
+        """What bakes, on this machine's GPU or its processors."""
         if self._device == "numba":
             return NumbaRows(laid)
         from scan2sim.texturing.blend_torch import TorchRows
 
         return TorchRows(laid, self._device)
 
-    def _look(self, i: int, rows: Rows, mine: Index, faces: Index) -> int:
+    def _add_photo(self, i: int, rows: Rows, mine: Index, faces: Index) -> int:
         """Add what photo `i` says of the page's faces `mine`, the mesh's `faces`; returns the texels it sees."""
         photo = self.photos.get(i)
         if photo is None:
@@ -133,19 +133,19 @@ class Painter:
         view = self._views[i]
         share = self._share(i)[self._mesh.faces[faces]] if self._fade else self._alone(i, faces)
         share[self._sign[faces]] = 1.0  # photos of a plate have been chosen to agree: all give its detail
-        shown = Shown(*photo.levels, photo.low, self._mask(i, view), self._warp(i), self._exposures.of(view))
-        look = Look(shown, eye(view.camera, view.T_world_cam), self._hides(i))
+        picture = Picture(*photo.levels, photo.low, self._mask(i, view), self._warp(i), self._exposures.of(view))
+        source = Source(picture, eye(view.camera, view.T_world_cam), self._occlusion(i))
         weighing = self._weighing._replace(feather=self._weighing.feather * view.camera.width)
-        return rows.add(mine, np.ascontiguousarray(share, np.float32), look, weighing)
+        return rows.add(mine, np.ascontiguousarray(share, np.float32), source, weighing)
 
     def name(self, i: int) -> str:
         """Of view `i`."""
         return self._views[i].name
 
     def _alone(self, i: int, faces: Index) -> F32:
-        return np.repeat((self._choice.label[faces] == i).astype(np.float32)[:, None], 3, axis=1)
+        return np.repeat((self._choice.detail_view[faces] == i).astype(np.float32)[:, None], 3, axis=1)
 
-    def _read_hides(self, i: int) -> Hides:
+    def _read_occlusion(self, i: int) -> Occlusion:
         """A view's depth map, and the least ranges around its pixels."""
         view, band = self._views[i], self._weighing.band
         depth = load_depth_map(self._depth_file(i), view.camera, view.T_world_cam)
@@ -155,7 +155,7 @@ class Painter:
             return np.asarray(cv2.erode(depth.range, np.ones((2 * pixels + 1, 2 * pixels + 1))), np.float32)
 
         near = least(1)
-        return Hides(*depth.ranges, near, near if reach == 1 else least(reach), reach)
+        return Occlusion(*depth.ranges, near, near if reach == 1 else least(reach), reach)
 
 
 def best_device() -> str:
@@ -167,14 +167,14 @@ def best_device() -> str:
     return "cuda" if torch.cuda.is_available() else "numba"
 
 
-def shares(faces: I32, label: I32, vertices: int, views: int) -> Callable[[int], F32]:
+def shares(faces: I32, detail_view: I32, vertices: int, views: int) -> Callable[[int], F32]:
     """How much of the detail a view is to give at every vertex: its share of the labelled faces around.
 
     Returns:
         view index to (V,) float32.
     """
-    labelled = np.flatnonzero(label >= 0)
-    at, of = faces[labelled].ravel(), np.repeat(label[labelled], 3)
+    seen = np.flatnonzero(detail_view >= 0)
+    at, of = faces[seen].ravel(), np.repeat(detail_view[seen], 3)
     count = sp.csc_array((np.ones(len(at), np.float32), (at, of)), shape=(vertices, views))
     valence = np.maximum(np.bincount(at, minlength=vertices), 1).astype(np.float32)
 

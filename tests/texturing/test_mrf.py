@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 
 from scan2sim.pipeline.types import F32, I32
-from scan2sim.texturing.labels import adjacent, costs, label, solve
+from scan2sim.texturing.mrf import adjacent, costs, detail_views, solve
 
 
-def energy(labels: Sequence[int] | I32, view: I32, cost: F32, pairs: I32, price: F32) -> float:
-    """What a labelling costs: photos worse than the best, and seams."""
-    own = sum(cost[i, list(view[i]).index(labels[i])] for i in range(len(labels)))
-    return own + sum(price[k] for k, (a, b) in enumerate(pairs) if labels[a] != labels[b])
+def energy(chosen: Sequence[int] | I32, view: I32, cost: F32, pairs: I32, price: F32) -> float:
+    """What a choice costs: photos worse than the best, and seams."""
+    own = sum(cost[i, list(view[i]).index(chosen[i])] for i in range(len(chosen)))
+    return own + sum(price[k] for k, (a, b) in enumerate(pairs) if chosen[a] != chosen[b])
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_no_labelling_is_much_better(seed: int) -> None:
+def test_no_choice_is_much_better(seed: int) -> None:
     rng = np.random.default_rng(seed)
     view = np.array([rng.choice(4, 3, replace=False) for _ in range(7)], np.int32)
     quality = (rng.random((7, 3)) + 0.01).astype(np.float32)
@@ -27,7 +27,7 @@ def test_no_labelling_is_much_better(seed: int) -> None:
     solution = solve(view, cost, pairs, price)
     best = min(energy(x, view, cost, pairs, price) for x in itertools.product(*view))
     assert solution.bound <= best + 1e-5  # that nothing is below the bound is what it says
-    assert solution.energy == pytest.approx(energy(solution.label, view, cost, pairs, price), abs=1e-5)
+    assert solution.energy == pytest.approx(energy(solution.view, view, cost, pairs, price), abs=1e-5)
     assert solution.energy <= 1.002 * best + 1e-5
 
 
@@ -39,8 +39,8 @@ def test_seams_that_cost_are_fewer() -> None:
     pairs = np.column_stack([np.arange(n - 1), np.arange(1, n)]).astype(np.int32)
 
     def seams(price: float) -> int:
-        labels = label(view, quality, pairs, np.full(n - 1, price, np.float32))
-        return int((labels[1:] != labels[:-1]).sum())
+        chosen = detail_views(view, quality, pairs, np.full(n - 1, price, np.float32))
+        return int((chosen[1:] != chosen[:-1]).sum())
 
     assert seams(0.0) > 100 and seams(0.02) < seams(0.0) / 2 and seams(10.0) == 0
 
@@ -49,7 +49,7 @@ def test_unseen_faces_have_no_photo_and_bind_nobody() -> None:
     view = np.array([[0, 1], [-1, -1], [1, -1]], np.int32)
     quality = np.array([[1, 0.9], [0, 0], [1, 0]], np.float32)
     pairs = np.array([[0, 1], [1, 2]], np.int32)
-    assert label(view, quality, pairs, np.array([9, 9], np.float32)).tolist() == [0, -1, 1]
+    assert detail_views(view, quality, pairs, np.array([9, 9], np.float32)).tolist() == [0, -1, 1]
 
 
 def test_neighbours_share_an_edge() -> None:

@@ -1,4 +1,4 @@
-"""What meshes show at places: colours looked up on their pages, as a renderer does, and those wanted instead."""
+"""Colours that meshes show at places, sampled from their pages as a renderer does, and those wanted instead."""
 
 from __future__ import annotations
 
@@ -9,45 +9,45 @@ import numpy as np
 
 from scan2sim.pipeline.io import image
 from scan2sim.pipeline.types import F32, F64, U8
-from scan2sim.texturing.borders.meeting import SOFT, Index, Looks
+from scan2sim.texturing.borders.correspondences import SOFT, Index, Samples
 
 BLUR = 0.1
 """Share of `reach` by which colours are averaged where more than two tiles meet (a Gaussian's sigma)."""
 
 
-def colours(looks: Looks, pages: Sequence[Path], places: int) -> F32:
-    """(P, 3) grey levels that a mesh shows at the places, as a renderer looks them up; NaN where it has no such place.
+def colours(samples: Samples, pages: Sequence[Path], places: int) -> F32:
+    """(P, 3) grey levels that a mesh shows at the places, as a renderer samples them; NaN where it has no such place.
 
     Args:
-        looks: of the mesh.
+        samples: of the mesh.
         pages: image file of every page; one is in memory at a time.
         places: P.
 
     Raises:
         InputError: a page can't be read.
     """
-    shown = np.empty((len(looks.place), 3), np.float32)
-    for k in np.unique(looks.page).tolist():
-        here = looks.page == k
-        shown[here] = looked_up(image.read_rgb(pages[k]), looks.uv[here])
-    return by_place(looks.place, shown, places)
+    shown = np.empty((len(samples.place), 3), np.float32)
+    for k in np.unique(samples.page).tolist():
+        here = samples.page == k
+        shown[here] = sampled(image.read_rgb(pages[k]), samples.uv[here])
+    return by_place(samples.place, shown, places)
 
 
 def by_place(place: Index, shown: F32, places: int) -> F32:
-    """(P, 3) means of what the looks (L, 3) at a place show; NaN where there is none."""
+    """(P, 3) means of the samples (L, 3) at a place; NaN where there is none."""
     total = np.stack([np.bincount(place, shown[:, k], places) for k in range(3)], axis=1)
     count = np.bincount(place, minlength=places)[:, None]
     return np.divide(total, count, out=np.full((places, 3), np.nan), where=count > 0).astype(np.float32)
 
 
-def looked_up(page: U8, uv: F32) -> F32:
+def sampled(page: U8, uv: F32) -> F32:
     """(L, 3) bilinear grey levels of a page at uv (L, 2)."""
     texel, weight = taps(uv, page.shape[1], page.shape[0])
     return np.einsum("lt,ltc->lc", weight, page.reshape(-1, 3)[texel].astype(np.float32))
 
 
 def taps(uv: F32, width: int, height: int) -> tuple[Index, F32]:
-    """(L, 4) texels of a bilinear lookup, counted along the rows of a page, and (L, 4) their weights."""
+    """(L, 4) texels of a bilinear sample, counted along the rows of a page, and (L, 4) their weights."""
     x, y = uv[:, 0] * width - 0.5, (1 - uv[:, 1]) * height - 0.5
     x0, y0 = np.floor(x), np.floor(y)
     fx, fy = (x - x0).astype(np.float32), (y - y0).astype(np.float32)

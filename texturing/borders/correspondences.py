@@ -1,4 +1,4 @@
-"""Where textured meshes meet: the places that they share, and where on its pages each shows them."""
+"""Corresponding places of textured meshes: those they share along a border, and where each has them on its pages."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ class Rim:
 
 
 @dataclass(frozen=True)
-class Looks:
-    """Where on its pages a mesh shows places; those at vertices are shown by several faces.
+class Samples:
+    """Where on its pages a mesh is sampled at places; those at vertices are on several faces.
 
     Attributes:
         place: (L,) index of the place.
@@ -56,13 +56,13 @@ class Border:
     Attributes:
         xyz: (P, 3) float64, world metres.
         metres: (P,) of the border that each place stands for.
-        looks: of every mesh.
+        samples: of every mesh.
         length: metres of the first mesh's border edges that each other one shares, at their ends at least.
     """
 
     xyz: F64
     metres: F64
-    looks: tuple[Looks, ...]
+    samples: tuple[Samples, ...]
     length: tuple[float, ...]
 
     def __len__(self) -> int:
@@ -81,7 +81,7 @@ def rim(mesh: Mesh) -> Rim:
     return Rim(place[np.stack([a[edge], b[edge]], axis=1)], uv, mesh.page[face])
 
 
-def meet(rims: Sequence[Rim], spacing: float = SPACING) -> Border:
+def shared_border(rims: Sequence[Rim], spacing: float = SPACING) -> Border:
     """Places where any two meshes meet: shared vertices, and along shared edges every `spacing` metres.
 
     All tiles that share a place find the same one: an edge is walked from its lesser end.
@@ -96,14 +96,14 @@ def meet(rims: Sequence[Rim], spacing: float = SPACING) -> Border:
     which, part = _along(parts)
     share = (part + 0.5) / parts[which]
     xyz = np.concatenate([vertex[corners] * GRID, start[which] + share[:, None] * (end - start)[which]])
-    looks = tuple(_looks(*of, corners, edges, parts) for of in zip(rims, numbers, codes, strict=True))
+    samples = tuple(_samples(*of, corners, edges, parts) for of in zip(rims, numbers, codes, strict=True))
     long = np.linalg.norm(np.diff(rims[0].ends, axis=1)[:, 0] * GRID, axis=1)
     length = tuple(float(long[np.isin(numbers[0], other).all(axis=1)].sum()) for other in numbers[1:])
     # what is shared at its ends alone is stood for by these
     half = np.where(np.isin(numbers[0], corners).all(axis=1) & ~np.isin(codes[0], edges), long / 2, 0)
     at_ends = np.bincount(numbers[0].ravel(), np.repeat(half, 2), len(vertex))[corners]
     along = (np.linalg.norm(end - start, axis=1) / parts)[which]
-    return Border(xyz, np.concatenate([np.maximum(at_ends, SPACING / 2), along]), looks, length)
+    return Border(xyz, np.concatenate([np.maximum(at_ends, SPACING / 2), along]), samples, length)
 
 
 def _shared(names: Sequence[Index]) -> Index:
@@ -118,8 +118,8 @@ def _along(parts: Index) -> tuple[Index, Index]:
     return which, np.arange(len(which)) - np.repeat(np.cumsum(parts) - parts, parts)
 
 
-def _looks(rim: Rim, number: Index, code: Index, corners: Index, edges: Index, parts: Index) -> Looks:
-    """Where a mesh shows the places of `meet`: `corners` come first, then each of `edges` in `parts` (N,)."""
+def _samples(rim: Rim, number: Index, code: Index, corners: Index, edges: Index, parts: Index) -> Samples:
+    """Where a mesh shows the places of `shared_border`: `corners` come first, then each of `edges` in `parts` (N,)."""
     at = np.flatnonzero(np.isin(number, corners))
     rows = np.flatnonzero(np.isin(code, edges))
     edge = np.searchsorted(edges, code[rows])
@@ -127,7 +127,7 @@ def _looks(rim: Rim, number: Index, code: Index, corners: Index, edges: Index, p
     place = (len(corners) + np.cumsum(parts) - parts)[edge][which] + part
     row, share = rows[which], ((part + 0.5) / parts[edge][which]).astype(np.float32)
     share = np.where(number[row, 0] <= number[row, 1], share, 1 - share)[:, None]
-    return Looks(
+    return Samples(
         np.concatenate([np.searchsorted(corners, number.ravel()[at]), place]),
         np.concatenate([rim.page[at // 2], rim.page[row]]),
         np.concatenate([rim.uv.reshape(-1, 2)[at], (1 - share) * rim.uv[row, 0] + share * rim.uv[row, 1]]),
