@@ -252,7 +252,7 @@ def compare(
     for j in others:
         other = photos.get(j)
         if other is not None:
-            predictor.ask(other, views[j].camera, views[j].T_world_cam, depth(j), exposures.of(views[j]))
+            predictor.add(other, views[j].camera, views[j].T_world_cam, depth(j), exposures.of(views[j]))
     there = np.isfinite(shows.points[..., 0])
     burnt = float(np.all(own[there] >= WHITE, axis=1).mean()) if there.any() else 0.0
     figures: dict[str, Any] = {"overexposed": round(burnt, 3)}
@@ -264,8 +264,8 @@ def compare(
     ghosts = ghost_mask(mine, predicted, own >= WHITE)
     figures["ghost_share"] = round(float(ghosts.mean()), 4)
     displaced = ghosts[sure].mean() > HAUNTED
-    told, warp = _shift(mine, predicted, sure if displaced else sure & ~ghosts, camera.width / small.width)
-    return Compared(figures | told, ghosts, warp)
+    displacement, warp = _shift(mine, predicted, sure if displaced else sure & ~ghosts, camera.width / small.width)
+    return Compared(figures | displacement, ghosts, warp)
 
 
 def _shift(

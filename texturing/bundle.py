@@ -24,7 +24,7 @@ from scan2sim.texturing.matches import Matches
 
 OUTLIER = 1.0
 """Pixels (of the compared size) beyond which an observation's say falls (Cauchy); twice the median if that is more."""
-TOLD = 0.5
+SIGMA = 0.5
 """Pixels: standard deviation of an observation: a match's own, and the surface's part in it."""
 ON_SURFACE, ALONG_SURFACE = 0.02, 0.5
 """Metres by which a place may leave the surface (the scanner's noise) and slide along it."""
@@ -116,7 +116,7 @@ def solve(
         residual, by_place, by_pose = _linearised(whole, place, cameras, at)
         off = np.linalg.norm(residual, axis=1)
         loose = max(OUTLIER, 2 * float(np.median(off[: len(found.of)]))) if len(found.of) else OUTLIER
-        weight = 1 / (1 + (off / loose) ** 2) / TOLD**2
+        weight = 1 / (1 + (off / loose) ** 2) / SIGMA**2
         S, g, Hinv, e, cross = _reduced(
             residual, by_place, by_pose, weight, whole.of, whole.view, stiff, place - found.place, pairs, block, count
         )

@@ -90,24 +90,24 @@ class Predictor:
         self._rgb = np.zeros((count, h, w, 3), np.uint8)
         self._weight = np.zeros((count, h, w), np.float32)
         self._limits = (max_distance, min_cos, bias)
-        self._asked = 0
+        self._added = 0
 
-    def ask(self, photo: Photo, camera: Camera, T_world_cam: F64, depth: DepthMap, exposure: F64) -> None:
+    def add(self, photo: Photo, camera: Camera, T_world_cam: F64, depth: DepthMap, exposure: F64) -> None:
         """Add what one photo shows; `exposure` (5,) of `Exposures.of`."""
         s, (max_distance, min_cos, bias) = self._surface, self._limits
-        _look(
-            self._rgb[self._asked], self._weight[self._asked], s.points, s.normals, pixel_angle(s.camera),
+        _sample(
+            self._rgb[self._added], self._weight[self._added], s.points, s.normals, pixel_angle(s.camera),
             photo.levels, photo.mask, eye(camera, T_world_cam, s.T_world_cam), depth.ranges, exposure,
             max_distance, min_cos, bias,
         )  # fmt: skip
-        self._asked += 1
+        self._added += 1
 
     def result(self) -> Prediction:
         """What those asked agree on."""
         h, w = self._weight.shape[1:]
         rgb = np.zeros((h, w, 3), np.float32)
         support, others = np.zeros((h, w), np.uint8), np.zeros((h, w), np.uint8)
-        _agree(self._rgb[: self._asked], self._weight[: self._asked], rgb, support, others, ALIKE)
+        _agree(self._rgb[: self._added], self._weight[: self._added], rgb, support, others, ALIKE)
         return Prediction(rgb, support, others)
 
 
@@ -152,7 +152,7 @@ def _normals(points):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, parallel=True)
-def _look(  # type: ignore[no-untyped-def]
+def _sample(  # type: ignore[no-untyped-def]
     rgb, weight, points, normals, own_pixel, levels, mask, eye, ranges, exposure, max_distance, min_cos, bias
 ):  # fmt: skip
     height, width = weight.shape

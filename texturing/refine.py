@@ -125,7 +125,7 @@ def refine(inputs: Inputs, params: RefineParams, out: Path, report: Report) -> D
         facts |= {"displaced_px": round(_median(first[1]), 3)}
     if moved:
         facts |= {"displaced_after_px": round(_median(left), 3)}
-        facts |= _told(now, names, photos, *_by_photo(first, (found, left), photos, cameras))
+        facts |= _figures(now, names, photos, *_by_photo(first, (found, left), photos, cameras))
     return Done({"views": out / "views.json"}, facts, warnings if moved else [])
 
 
@@ -247,9 +247,9 @@ def _believed(
     warnings = []
     for names, rows, bad, prefix in ((cameras, found.camera, lens, "camera_"), (photos, found.photo, own, "")):
         for k in np.flatnonzero(bad).tolist():
-            told = _row(rows[k])
+            row = _row(rows[k])
             warnings.append(
-                f"{names[k]}: photos ask for {told['shift_cm']:.0f} cm and {told['turn_mrad']:.0f} mrad, more than is "
+                f"{names[k]}: photos ask for {row['shift_cm']:.0f} cm and {row['turn_mrad']:.0f} mrad, more than is "
                 f"believed: not moved by it; check its pose (`refine.{prefix}shift`, `refine.{prefix}turn`)"
             )
     return Corrections(np.where(own[:, None], 0.0, found.photo), np.where(lens[:, None], 0.0, found.camera)), warnings
@@ -277,7 +277,7 @@ def _row(correction: F64) -> dict[str, float]:
     }
 
 
-def _told(
+def _figures(
     by: Corrections,
     cameras: Sequence[str],
     photos: Sequence[View],

@@ -182,10 +182,10 @@ def _seen_from_near(inputs: Inputs, places: F32, normals: F32, near: float) -> n
     for i, (view, held) in enumerate(
         zip(views_io.load(inputs["views"]), views_io.load_held_out(inputs["views"]), strict=True)
     ):
-        asked = np.flatnonzero(~seen & (np.linalg.norm(places - view.centre, axis=1) <= near))
-        if len(asked) and not held:
+        unseen = np.flatnonzero(~seen & (np.linalg.norm(places - view.centre, axis=1) <= near))
+        if len(unseen) and not held:
             depth = load_depth_map(inputs["depth"] / f"{i}.npy", view.camera, view.T_world_cam)
-            seen[asked] = visible(depth, places[asked], normals[asked])
+            seen[unseen] = visible(depth, places[unseen], normals[unseen])
     return seen
 
 
