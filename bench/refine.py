@@ -30,7 +30,7 @@ from bench import street
 from bench.texture_scenes import Scene, fresh, make
 from scan2sim.pipeline.cameras import unproject
 from scan2sim.pipeline.io import views as views_io
-from scan2sim.pipeline.looking import pixels
+from scan2sim.pipeline.projection import pixels
 from scan2sim.pipeline.step import silent
 from scan2sim.pipeline.types import F64, Mesh, PointCloud, View
 from scan2sim.pipeline.visibility import DepthMap, depth_map, scene, visible

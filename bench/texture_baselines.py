@@ -15,7 +15,7 @@ from numba import njit, prange
 from bench.texture_scenes import Scene
 from scan2sim.pipeline.cameras import EQUIRECTANGULAR
 from scan2sim.pipeline.io import image
-from scan2sim.pipeline.looking import eye, is_seen, pixel_of, sighted, to_camera, turned
+from scan2sim.pipeline.projection import eye, incidence, is_visible, pixel_of, to_camera, turned
 from scan2sim.pipeline.sampling import bilinear
 from scan2sim.pipeline.types import U8, Mesh
 from scan2sim.pipeline.visibility import BIAS, load_depth_map
@@ -139,11 +139,11 @@ def _add(  # type: ignore[no-untyped-def]
         place, normal = places[i], normals[face[i]]
         x, y, z = to_camera(eye.T, place[0], place[1], place[2])
         nx, ny, nz = turned(eye.T, normal[0], normal[1], normal[2])
-        r, cos = sighted(eye, x, y, z, nx, ny, nz)
+        r, cos = incidence(eye, x, y, z, nx, ny, nz)
         if r > max_distance or cos < min_cos:
             continue
         u, v, ok = pixel_of(eye, x, y, z)
-        if not ok or not is_seen(eye, ranges, u, v, r, cos, bias):
+        if not ok or not is_visible(eye, ranges, u, v, r, cos, bias):
             continue
         w = 1.0 / (r * r)
         if only_nearest:

@@ -15,7 +15,7 @@ from scan2sim.pipeline.classes import CODE
 from scan2sim.pipeline.io import image
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.pipeline.looking import pixels
+from scan2sim.pipeline.projection import pixels
 from scan2sim.pipeline.render import Body, Renderer, textured
 from scan2sim.pipeline.types import F32, U8, Mesh, PointCloud, View
 from scan2sim.pipeline.visibility import load_depth_map, visible

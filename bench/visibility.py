@@ -40,7 +40,7 @@ from scan2sim.flows.recipes.tile import recipe
 from scan2sim.pipeline import visibility
 from scan2sim.pipeline.classes import CLASSES, GROUPS
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.pipeline.looking import pixels
+from scan2sim.pipeline.projection import pixels
 from scan2sim.pipeline.steps.visibility import VisibilityParams
 from scan2sim.pipeline.store import Store
 from scan2sim.pipeline.types import F32, F64, U8, Frame, Mesh, PointCloud, Tile, View

@@ -125,7 +125,7 @@ def members(xy: F64, places: F64, buffer: float) -> tuple[I64, I64, I64]:
 
 def sees(view: View, xyz: F64) -> bool:
     """Whether a photo shows enough of points (N, 3), local coordinates; what hides them is not asked."""
-    from scan2sim.pipeline.looking import pixels
+    from scan2sim.pipeline.projection import pixels
 
     xyz = xyz[np.linalg.norm(xyz - view.centre, axis=1) <= SIGHT]
     if len(xyz) == 0:

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from scan2sim.pipeline.cameras import pixel_angle
 from scan2sim.pipeline.facades import Wall
-from scan2sim.pipeline.looking import pixels
+from scan2sim.pipeline.projection import pixels
 from scan2sim.pipeline.types import F32, I32, U8, View
 from scan2sim.pipeline.visibility import DepthMap, visible
 

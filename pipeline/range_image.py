@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit, prange
 
 from scan2sim.pipeline.cameras import EQUIRECTANGULAR, FISHEYE, ORTHOGRAPHIC, project_point
-from scan2sim.pipeline.looking import Eye, to_camera, turned
+from scan2sim.pipeline.projection import Eye, to_camera, turned
 from scan2sim.pipeline.types import F32
 
 BAND = 32

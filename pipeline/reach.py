@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
-from scan2sim.pipeline.looking import eye, is_seen, pixel_of, sighted, to_camera, turned
+from scan2sim.pipeline.projection import eye, incidence, is_visible, pixel_of, to_camera, turned
 from scan2sim.pipeline.step import Report, silent
 from scan2sim.pipeline.types import F32, F64, PointCloud, View
 from scan2sim.pipeline.visibility import depth_map, scene
@@ -59,9 +59,9 @@ def _refine(patch, xyz, normals, eye, ranges, bias, coarsest):  # type: ignore[n
         if not ok:
             continue
         nx, ny, nz = turned(eye.T, normals[i, 0], normals[i, 1], normals[i, 2])
-        r, cos = sighted(eye, x, y, z, nx, ny, nz)
+        r, cos = incidence(eye, x, y, z, nx, ny, nz)
         side = eye.pixel * r / math.sqrt(max(abs(cos), LEAST_COS))
-        if side < patch[i] and is_seen(eye, ranges, u, v, r, cos, bias):
+        if side < patch[i] and is_visible(eye, ranges, u, v, r, cos, bias):
             patch[i] = side
 
 

@@ -27,7 +27,7 @@ from scan2sim.pipeline.classes import CODE
 from scan2sim.pipeline.types import F32, F64, Camera, Mesh, PointCloud
 
 if TYPE_CHECKING:
-    from scan2sim.pipeline.looking import Ranges
+    from scan2sim.pipeline.projection import Ranges
 
 BIAS = 0.04
 """Metres that a point may lie behind what the range image shows and still count as seen."""
@@ -98,7 +98,7 @@ class DepthMap:
     def ranges(self) -> Ranges:
         """As kernels take it."""
         from scan2sim.pipeline.cameras import pixel_angle
-        from scan2sim.pipeline.looking import Ranges
+        from scan2sim.pipeline.projection import Ranges
 
         return Ranges(self.range, pixel_angle(self.camera))
 
@@ -235,7 +235,7 @@ def depth_map(
     """
     from scan2sim.pipeline import range_image
     from scan2sim.pipeline.cameras import pixel_rays, ray_origins
-    from scan2sim.pipeline.looking import eye
+    from scan2sim.pipeline.projection import eye
 
     camera = camera.scaled(min(ENLARGED, math.sqrt(pixels / (camera.width * camera.height))))
     rays = pixel_rays(camera)
@@ -251,8 +251,8 @@ def depth_map(
             v, u = np.mgrid[: camera.height, : camera.width]
             begin = ray_origins(camera, np.column_stack([u.ravel(), v.ravel()])).reshape(*u.shape, 3)
             cast[..., :3] += begin @ T_world_cam[:3, :3].T
-        met = hides.casting.cast_rays(cast)["t_hit"].numpy()
-        depth = np.where(np.isfinite(rays[..., 0]), met, np.inf).astype(np.float32)
+        hit = hides.casting.cast_rays(cast)["t_hit"].numpy()
+        depth = np.where(np.isfinite(rays[..., 0]), hit, np.inf).astype(np.float32)
     there = np.ones(len(hides.centres), bool)
     if time is not None:
         there = np.isnan(hides.spans[:, 0]) | ((time > hides.spans[:, 0]) & (time < hides.spans[:, 1]))
@@ -280,8 +280,8 @@ def visible(
         normals: (N, 3) unit, of the surface at the points; either side; None: seen head-on.
         bias: metres allowed behind the range image, before the slope's share.
     """
-    from scan2sim.pipeline.looking import eye, places_seen
+    from scan2sim.pipeline.projection import eye, visible_places
 
     points = np.ascontiguousarray(points, np.float64).reshape(-1, 3)
     facing = np.zeros((0, 3)) if normals is None else np.ascontiguousarray(normals, np.float64).reshape(-1, 3)
-    return places_seen(eye(depth.camera, depth.T_world_cam), depth.ranges, points, facing, bias)
+    return visible_places(eye(depth.camera, depth.T_world_cam), depth.ranges, points, facing, bias)

@@ -73,7 +73,7 @@ def _along(ray: F64, own: int, views: Sequence[View], shown: Mapping[int, U8]) -
 
 def _told(view: View, sign: U8, places: F64) -> npt.NDArray[np.float32]:
     """(N,) how surely a photo shows a sign at places (N, 3), of 255; NaN where it doesn't show them."""
-    from scan2sim.pipeline.looking import pixels
+    from scan2sim.pipeline.projection import pixels
 
     uv, valid = pixels(view.camera, view.T_world_cam, places)
     uv = np.where(valid[:, None], uv, 0)

@@ -13,7 +13,7 @@ from numba import njit
 
 from scan2sim.pipeline.cameras import EQUIRECTANGULAR, project_point
 from scan2sim.pipeline.channels import FAR, FRACTION, coded, level
-from scan2sim.pipeline.looking import eye, to_camera
+from scan2sim.pipeline.projection import eye, to_camera
 from scan2sim.pipeline.types import F32, I32, U8, Camera, PointCloud, View
 
 NEIGHBOURS = 12

@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit, prange
 
 from scan2sim.pipeline.cameras import EQUIRECTANGULAR
-from scan2sim.pipeline.looking import eye, is_seen, pixel_of, sighted, to_camera, turned
+from scan2sim.pipeline.projection import eye, incidence, is_visible, pixel_of, to_camera, turned
 from scan2sim.pipeline.sampling import allows, mixed, rescaled, taps
 from scan2sim.pipeline.step import Report, silent
 from scan2sim.pipeline.types import F32, PointCloud, View
@@ -101,8 +101,8 @@ def _ask(score, weight, xyz, normals, eye, ranges, labels, mask):  # type: ignor
         if not ok or not allows(mask, eye.p, u, v):
             continue
         nx, ny, nz = turned(eye.T, normals[i, 0], normals[i, 1], normals[i, 2])
-        distance, cos = sighted(eye, x, y, z, nx, ny, nz)
-        if not is_seen(eye, ranges, u, v, distance, cos, BIAS):
+        distance, cos = incidence(eye, x, y, z, nx, ny, nz)
+        if not is_visible(eye, ranges, u, v, distance, cos, BIAS):
             continue
         w = (0.2 + 0.8 * abs(cos)) / (1 + d2 / (NEAR * NEAR))
         s, t = rescaled(eye.p, u, v, labels)

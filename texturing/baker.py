@@ -14,7 +14,7 @@ import scipy.sparse as sp
 
 from scan2sim.pipeline.classes import CODE
 from scan2sim.pipeline.extras import missing
-from scan2sim.pipeline.looking import eye
+from scan2sim.pipeline.projection import eye
 from scan2sim.pipeline.step import Report
 from scan2sim.pipeline.types import F32, I32, Mesh, View
 from scan2sim.pipeline.visibility import load_depth_map

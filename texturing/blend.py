@@ -10,7 +10,16 @@ import numpy.typing as npt
 from numba import njit, prange
 
 from scan2sim.pipeline.cameras import ALIKE, EQUIRECTANGULAR, ORTHOGRAPHIC
-from scan2sim.pipeline.looking import SLOPE_SHARE, Eye, is_behind, met, pixel_of, sighted, to_camera, turned
+from scan2sim.pipeline.projection import (
+    SLOPE_SHARE,
+    Eye,
+    incidence,
+    is_behind,
+    pixel_of,
+    range_pixel,
+    to_camera,
+    turned,
+)
 from scan2sim.pipeline.sampling import allows, bicubic, halving, mixed, read, rescaled, taps
 from scan2sim.pipeline.types import F32, F64, I32, U8
 from scan2sim.texturing.photos import OFFSET
@@ -42,10 +51,10 @@ class Picture(NamedTuple):
 
 
 class Occlusion(NamedTuple):
-    """What a photo's view sees first, as `looking.Ranges`, and around it.
+    """What a photo's view sees first, as `projection.Ranges`, and around it.
 
     Attributes:
-        first, pixel: of `looking.Ranges`.
+        first, pixel: of `projection.Ranges`.
         near, apart: the least range around every pixel of `first`, closely and as far as low frequencies reach;
             beside something nearer the photo's own pixels mix both, and its weight falls to `EDGE`.
         reach: pixels of the range image around which `apart` was taken.
@@ -197,10 +206,10 @@ def _add_face(sums, laid, f, share, picture, eye, occlusion, weighing):  # type:
             u, v, ok = pixel_of(eye, x, y, z)
             if not ok or not allows(mask, p, u, v):
                 continue
-            r, cos = sighted(eye, x, y, z, n[0], n[1], n[2])
+            r, cos = incidence(eye, x, y, z, n[0], n[1], n[2])
             if cos < 0.5 * weighing.min_cos:  # the face as a whole passed; its far end may be a little flatter
                 continue
-            row, column, lean = met(eye, occlusion, u, v, r, cos)
+            row, column, lean = range_pixel(eye, occlusion, u, v, r, cos)
             if is_behind(r, first[row, column], lean, SLOPE_SHARE, bias):
                 continue
             used += 1

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from scan2sim.pipeline.cameras import ALIKE, EQUIRECTANGULAR, FISHEYE, OPENCV, ORTHOGRAPHIC
 from scan2sim.pipeline.errors import SettingError
-from scan2sim.pipeline.looking import MAX_SLOPE, SLOPE_SHARE
+from scan2sim.pipeline.projection import MAX_SLOPE, SLOPE_SHARE
 from scan2sim.texturing.blend import EDGE, WHITE
 from scan2sim.texturing.photos import OFFSET
 
@@ -241,7 +241,7 @@ def _frames(flat: Tensor, corners: Tensor) -> tuple[Tensor, Tensor, Tensor, Tens
 
 
 def _slope(cos: Tensor) -> Tensor:
-    """The slope in `looking.met`."""
+    """The slope in `projection.range_pixel`."""
     c = cos.clamp(max=1.0)
     return ((1 - c * c).sqrt() / c.clamp(min=1e-6)).clamp(max=MAX_SLOPE)
 

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit, prange
 
 from scan2sim.pipeline.cameras import ALIKE, ORTHOGRAPHIC
-from scan2sim.pipeline.looking import eye, is_seen, pixel_of, sighted, to_camera, turned
+from scan2sim.pipeline.projection import eye, incidence, is_visible, pixel_of, to_camera, turned
 from scan2sim.pipeline.types import F32, U8
 from scan2sim.pipeline.visibility import DepthMap
 
@@ -79,7 +79,7 @@ def _rate(corners, normals, eye, ranges, bias, max_distance, min_cos, samples): 
                 wy += samples[s, k] * corners[f, k, 1]
                 wz += samples[s, k] * corners[f, k, 2]
             x, y, z = to_camera(eye.T, wx, wy, wz)
-            r, cos = sighted(eye, x, y, z, nx, ny, nz)
+            r, cos = incidence(eye, x, y, z, nx, ny, nz)
             if eye.model == ORTHOGRAPHIC:  # how far away it is says nothing of how large its pixels are
                 d2, flattest = (ALIKE / min(eye.p[0], eye.p[1])) ** 2, max(min_cos, DRAPED)
             else:
@@ -89,7 +89,7 @@ def _rate(corners, normals, eye, ranges, bias, max_distance, min_cos, samples): 
             if cos < flattest:
                 continue
             u, v, ok = pixel_of(eye, x, y, z)
-            if ok and is_seen(eye, ranges, u, v, r, cos, bias):
+            if ok and is_visible(eye, ranges, u, v, r, cos, bias):
                 total += cos * cos / d2
         quality[f] = total / len(samples)
     return quality

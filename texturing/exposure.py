@@ -165,7 +165,7 @@ def _look_up(
     import cv2
     import numpy as np
 
-    from scan2sim.pipeline.looking import pixels
+    from scan2sim.pipeline.projection import pixels
     from scan2sim.pipeline.visibility import DepthMap as Map
     from scan2sim.pipeline.visibility import visible
     from scan2sim.texturing.photos import OFFSET

@@ -22,7 +22,7 @@ from scan2sim.pipeline.cameras import (
     unproject,
     unproject_pixel,
 )
-from scan2sim.pipeline.looking import eye, to_camera
+from scan2sim.pipeline.projection import eye, to_camera
 from scan2sim.pipeline.sampling import mixed, taps
 from scan2sim.pipeline.types import F64, U8, Camera, View
 from scan2sim.pipeline.visibility import DepthMap, visible

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from numba import njit, prange
 
 from scan2sim.pipeline.cameras import EQUIRECTANGULAR, pixel_angle, pixel_rays
-from scan2sim.pipeline.looking import eye, is_seen, pixel_of, sighted, to_camera, turned
+from scan2sim.pipeline.projection import eye, incidence, is_visible, pixel_of, to_camera, turned
 from scan2sim.pipeline.sampling import allows, halving, read
 from scan2sim.pipeline.types import F32, F64, U8, Camera
 from scan2sim.pipeline.visibility import DepthMap
@@ -172,10 +172,10 @@ def _sample(  # type: ignore[no-untyped-def]
             if not ok:
                 continue
             nx, ny, nz = turned(eye.T, n[0], n[1], n[2])
-            distance, cos = sighted(eye, x, y, z, nx, ny, nz)
+            distance, cos = incidence(eye, x, y, z, nx, ny, nz)
             if cos < min_cos or not allows(mask, eye.p, u, v):
                 continue
-            if not is_seen(eye, ranges, u, v, distance, cos, bias):
+            if not is_visible(eye, ranges, u, v, distance, cos, bias):
                 continue
             ratio = math.sqrt(r2) * own_pixel / (distance * eye.pixel)
             share = min(ratio, 1.0)

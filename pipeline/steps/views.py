@@ -104,7 +104,7 @@ def _cut(view: View, points: F32, folder: Path, index: int) -> View:
     import numpy as np
 
     from scan2sim.pipeline.io import image
-    from scan2sim.pipeline.looking import pixels
+    from scan2sim.pipeline.projection import pixels
 
     camera = view.camera
     uv, _ = pixels(camera, view.T_world_cam, points)
@@ -163,7 +163,7 @@ def _sees(view: View, points: F32) -> bool:
     """Whether any of the points (N, 3) is inside the image and within reach."""
     import numpy as np
 
-    from scan2sim.pipeline.looking import pixels
+    from scan2sim.pipeline.projection import pixels
 
     if view.camera.model != "orthographic":
         points = points[np.linalg.norm(points - view.centre, axis=1) < REACH]

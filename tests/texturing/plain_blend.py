@@ -9,7 +9,7 @@ import numpy.typing as npt
 from scipy.ndimage import map_coordinates
 
 from scan2sim.pipeline.cameras import ALIKE, inside, project_exactly
-from scan2sim.pipeline.looking import MAX_SLOPE, SLOPE_SHARE
+from scan2sim.pipeline.projection import MAX_SLOPE, SLOPE_SHARE
 from scan2sim.pipeline.types import F32, F64, Camera
 from scan2sim.texturing import blend
 from scan2sim.texturing.blend import EDGE, WHITE

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from scan2sim.pipeline.cameras import pixel_angle, unproject
-from scan2sim.pipeline.looking import eye
+from scan2sim.pipeline.projection import eye
 from scan2sim.pipeline.types import F32, Camera
 from scan2sim.texturing import blend, texels
 from scan2sim.texturing.photos import low_frequencies, shrunk

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from scan2sim.pipeline.cameras import pixel_angle, project
-from scan2sim.pipeline.looking import eye
+from scan2sim.pipeline.projection import eye
 from scan2sim.pipeline.render import look_at
 from scan2sim.pipeline.types import U8, Camera
 from scan2sim.texturing import blend, texels

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from scan2sim.pipeline.cameras import inside, parameters, project
-from scan2sim.pipeline.looking import pixels
+from scan2sim.pipeline.projection import pixels
 from scan2sim.pipeline.render import look_at
 from scan2sim.pipeline.sampling import allows, read, rescaled
 from scan2sim.pipeline.types import Camera

@@ -1,4 +1,4 @@
-"""How a photo looks at places, written once: into the camera's axes, into the image, past what hides.
+"""Places projected into posed cameras, written once: into the camera's axes, into the image, and the visibility test.
 
 Kernels take scalars, one place at a time; votes, reach, choice, prediction, range images and blending are put together
 of them (how a picture is read at a pixel: `pipeline.sampling`). `pixels` does it for arrays. Import late: loads numba.
@@ -24,7 +24,7 @@ MAX_SLOPE = 30.0
 
 
 class Eye(NamedTuple):
-    """A camera where it stands, as kernels take it.
+    """A posed camera, as kernels take it.
 
     Attributes:
         model, p: of the camera (`cameras.MODEL_ID`, `cameras.parameters`).
@@ -42,7 +42,7 @@ class Ranges(NamedTuple):
     """What an eye sees first, as kernels take it.
 
     Attributes:
-        first: (H, W) float32 metres along the rays to what is met first; of any size, covering the eye's image.
+        first: (H, W) float32 metres along the rays to the first hit; of any size, covering the eye's image.
         pixel: radians that its pixels span.
     """
 
@@ -105,7 +105,7 @@ def pixel_of(eye, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, inline="always")
-def sighted(eye, x, y, z, nx, ny, nz):  # type: ignore[no-untyped-def]
+def incidence(eye, x, y, z, nx, ny, nz):  # type: ignore[no-untyped-def]
     """(range, cos) of a place and its unit normal, camera axes: metres along the ray, and cosine of the incidence.
 
     The cosine is above 0 for what is seen from the side that the normal is on.
@@ -117,7 +117,7 @@ def sighted(eye, x, y, z, nx, ny, nz):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, inline="always")
-def met(eye, ranges, u, v, r, cos):  # type: ignore[no-untyped-def]
+def range_pixel(eye, ranges, u, v, r, cos):  # type: ignore[no-untyped-def]
     """(row, column, lean): the pixel of the range image that a place seen at (range, cos) is in.
 
     And the metres by which the range changes across it, on a surface that is so inclined.
@@ -130,34 +130,34 @@ def met(eye, ranges, u, v, r, cos):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, inline="always")
 def is_behind(r, first, lean, pixels, bias):  # type: ignore[no-untyped-def]
-    """Whether a place is hidden by what is met `first`; every test of visibility is this one.
+    """Whether a place is hidden by the `first` hit; every test of visibility is this one.
 
     Args:
-        r, lean: metres along the ray to it, and of `met`.
-        first: metres to what is met first, in the range image's pixel or in some pixels around.
-        pixels: by which the surface may lean; from the middle of one, or as far as is looked around.
+        r, lean: metres along the ray to it, and of `range_pixel`.
+        first: metres to the first hit, in the range image's pixel or in some pixels around.
+        pixels: by which the surface may lean; from the middle of one, or as far around as `first` is the least of.
         bias: metres that it may lie behind `first`, see `pipeline.visibility.BIAS`.
     """
     return r > first + bias + pixels * lean
 
 
 @njit(cache=True)
-def is_seen(eye, ranges, u, v, r, cos, bias):  # type: ignore[no-untyped-def]
+def is_visible(eye, ranges, u, v, r, cos, bias):  # type: ignore[no-untyped-def]
     """Whether nothing hides what is at a pixel within the image.
 
     Args:
         eye, ranges: of the view.
         u, v: `pixel_of` the place.
-        r, cos: of it (`sighted`); cos 1: it is taken for seen head-on.
+        r, cos: of it (`incidence`); cos 1: it is taken for seen head-on.
         bias: of `is_behind`.
     """
-    row, column, lean = met(eye, ranges, u, v, r, cos)
+    row, column, lean = range_pixel(eye, ranges, u, v, r, cos)
     return not is_behind(r, ranges.first[row, column], lean, SLOPE_SHARE, bias)
 
 
 @njit(cache=True, parallel=True)
-def places_seen(eye, ranges, places, normals, bias):  # type: ignore[no-untyped-def]
-    """(N,) bool: `is_seen` for places (N, 3) and normals (N, 3), or (0, 3): all head-on."""
+def visible_places(eye, ranges, places, normals, bias):  # type: ignore[no-untyped-def]
+    """(N,) bool: `is_visible` for places (N, 3) and normals (N, 3), or (0, 3): all head-on."""
     seen = np.zeros(len(places), np.bool_)
     for i in prange(len(places)):
         x, y, z = to_camera(eye.T, places[i, 0], places[i, 1], places[i, 2])
@@ -167,8 +167,8 @@ def places_seen(eye, ranges, places, normals, bias):  # type: ignore[no-untyped-
         nx = ny = nz = 0.0
         if len(normals) > 0:
             nx, ny, nz = turned(eye.T, normals[i, 0], normals[i, 1], normals[i, 2])
-        r, cos = sighted(eye, x, y, z, nx, ny, nz)
-        seen[i] = is_seen(eye, ranges, u, v, r, cos if len(normals) > 0 else 1.0, bias)
+        r, cos = incidence(eye, x, y, z, nx, ny, nz)
+        seen[i] = is_visible(eye, ranges, u, v, r, cos if len(normals) > 0 else 1.0, bias)
     return seen
 
 
