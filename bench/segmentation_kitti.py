@@ -24,7 +24,7 @@ from scan2sim.pipeline.types import U8, PointCloud, View
 from scan2sim.segmentation.backends import load
 from scan2sim.segmentation.drawn import Drawn
 from scan2sim.segmentation.labels import CLASSES, code_of_index, index_of_code
-from scan2sim.segmentation.photos import Labeller, labels_of
+from scan2sim.segmentation.photos import Classifier, class_map
 from scan2sim.segmentation.score import Confusion, confusion
 
 POLYGONS = Path(__file__).resolve().parent.parent / "tests" / "segmentation" / "kitti_polygons.json"
@@ -68,13 +68,13 @@ def _told(name: str, folder: Path) -> Iterator[tuple[View, dict[str, U8]]]:
     standing = next((folder / "told" / "steps" / "things").rglob("cloud.npz"))  # without what moved, which is elsewhere
     cloud = sample(PointCloud.load(standing), VOXEL)
     assert cloud.classification is not None
-    scan, labeller = Drawn(cloud, VOXEL), Labeller(load("street", None), "street")
+    scan, classifier = Drawn(cloud, VOXEL), Classifier(load("street", None), "street")
     for view in tile.views:
         if view.photo.name not in _polygons():
             continue
         rgb = image.read_rgb(view.photo)
         size = view.camera.width, view.camera.height
-        alone = code_of_index()[labels_of(labeller.probabilities(rgb, view.camera), size[::-1])[0]]
+        alone = code_of_index()[class_map(classifier.probabilities(rgb, view.camera), size[::-1])[0]]
         pixels = cv2.imread(str(folder / "told" / "labels" / f"{Path(view.name).stem}.png"), cv2.IMREAD_GRAYSCALE)
         nearest, _ = scan.nearest(view, size)
         points = np.where(nearest >= 0, cloud.classification[nearest], NONE).astype(np.uint8)

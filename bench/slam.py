@@ -173,7 +173,7 @@ def pano() -> None:
     """
     import cv2
 
-    from scan2sim.slam.charts import Charts
+    from scan2sim.slam.facets import Facets
     from scan2sim.slam.geometry import log_so3, relative_pose
     from scan2sim.slam.relocalise import describe, matches
     from scan2sim.slam.trackers import named
@@ -188,14 +188,14 @@ def pano() -> None:
         cv2.resize(cv2.imread(str(f), cv2.IMREAD_GRAYSCALE), None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
         for f in sorted(folder.glob("2019*.jpg"))
     )
-    charts, rng = Charts(Camera("equirectangular", 1024, 512)), np.random.default_rng(0)
-    a, b = (describe(charts, charts.pictures(grey)) for grey in (first, second))
+    facets, rng = Facets(Camera("equirectangular", 1024, 512)), np.random.default_rng(0)
+    a, b = (describe(facets, facets.pictures(grey)) for grey in (first, second))
     pairs = matches(a.descriptor, b.descriptor)
-    tracker = named("corners", charts, None, 600)
-    tracker.look(first)
+    tracker = named("corners", facets, None, 600)
+    tracker.track(first)
     tracker.refill()
     before = tracker.tracks
-    tracker.look(second)
+    tracker.track(second)
     followed = np.searchsorted(before.ids, tracker.tracks.ids)
     for kind, there, now in (
         ("ORB", a.bearing[pairs[:, 0]], b.bearing[pairs[:, 1]]),

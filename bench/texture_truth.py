@@ -191,7 +191,7 @@ class Road:
         high[0] = self._low[0] + width * TEXEL
         return Renderer([body]).above(self._low, high, width=width)
 
-    def _look(self, folder: Path) -> tuple[F32, Bools]:
+    def _read(self, folder: Path) -> tuple[F32, Bools]:
         body = textured(folder)
         picture = self._above(replace(body, mesh=body.mesh.moved_to(self._frame).keep(self._faces)))
         return picture.rgb[self._at].astype(np.float32), picture.seen[self._at] == 255
@@ -205,7 +205,7 @@ class Road:
         """
         import cv2
 
-        (before, has_before), (after, has_after) = self._look(clean), self._look(hard)
+        (before, has_before), (after, has_after) = self._read(clean), self._read(hard)
         painted = has_before & has_after
         undisturbed = painted & ~self._car
         after = np.clip(after * gain(after[undisturbed], before[undisturbed]), 0, 255)

@@ -99,13 +99,13 @@ class Panorama:
         h, w, seen = self.height, self.width, self._seen
         rows = np.broadcast_to(poses, (h, 4, 4))[:seen]
         self._gather(rows[len(rows) // 2, :2, 3])
-        look = self._looker(rows, time)
-        rgb, distance, moved = look(np.arange(seen * w), 0.0, 0.0)
+        trace = self._tracer(rows, time)
+        rgb, distance, moved = trace(np.arange(seen * w), 0.0, 0.0)
         if self.samples > 1:
             at = np.flatnonzero(tracing.rough(rgb.reshape(seen, w, 3), ROUGH))
             total = rgb[at].astype(np.uint16)
             for right, down in spread(self.samples - 1):
-                total += look(at, right, down)[0]
+                total += trace(at, right, down)[0]
             rgb[at] = (total + self.samples // 2) // self.samples
         image, depth, moving = (
             np.zeros((h, w, 3), np.uint8),
@@ -119,7 +119,7 @@ class Panorama:
         image[low][own], depth[low][own], moving[low][own] = self._own[low][own], np.nan, False
         return Picture(image, depth, moving, self.gain(time))
 
-    def _looker(self, rows: F64, time: float) -> Callable[[Index, float, float], tuple[U8, F32, Index]]:
+    def _tracer(self, rows: F64, time: float) -> Callable[[Index, float, float], tuple[U8, F32, Index]]:
         """What gives rgb (N, 3), distance (N,) and whether a vehicle is there (N,), for pixels and a place in them."""
         origins = (rows[:, :3, 3] - [*self._centre, 0]).astype(np.float32)
         turns = np.ascontiguousarray(rows[:, :3, :3], np.float32)
@@ -131,7 +131,7 @@ class Panorama:
         ground = (g.distance, g.nearest, g.line, g.origin - self._centre, CELL, KERB, g.line[:, :2] - self._centre)
         sun, gain = self.town.sun.astype(np.float32), self.gain(time)
 
-        def look(index: Index, right: float, down: float) -> tuple[U8, F32, Index]:
+        def trace(index: Index, right: float, down: float) -> tuple[U8, F32, Index]:
             rays = tracing.rays(turns, origins, self.width, self.height, index, right, down)
             distance, face, uv = _cast(self._caster, rays)
             moved = np.zeros(len(rays), bool)
@@ -141,7 +141,7 @@ class Panorama:
                 closer = near < distance[at]
                 at = at[closer]
                 distance[at], face[at], uv[at], moved[at] = near[closer], near_face[closer], near_uv[closer], True
-            kind, normal, shadow = tracing.meet(rays, distance, face, uv, moved, self._static, other, ground, sun)
+            kind, normal, shadow = tracing.hit_ground(rays, distance, face, uv, moved, self._static, other, ground, sun)
             dark = self._caster.test_occlusions(_tensor(shadow)).numpy()
             rgb = shader.paint(
                 rays, distance, face, uv, moved, kind, normal, dark, self._static, other, ground, boxes, sun, self._sky,
@@ -149,7 +149,7 @@ class Panorama:
             )  # fmt: skip
             return rgb, distance, moved
 
-        return look
+        return trace
 
     def _gather(self, centre: F64) -> None:
         """Make the triangles around a place, unless those there are will do."""

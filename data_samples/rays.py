@@ -118,7 +118,7 @@ def _ground(
 
 
 @njit(cache=True, error_model="numpy", parallel=True)
-def meet(
+def hit_ground(
     ray: Array, distance: Array, face: Array, uv: Array, moved: Array, static: Any, other: Any, ground: Any, sun: Array
 ) -> tuple[Array, Array, Array]:
     """Let rays that miss all things, or meet them underground, meet the ground; `distance` (N,) is updated.

@@ -65,17 +65,17 @@ class Traffic:
         for gap in (rng.uniform(22, 34), -rng.uniform(14, 22)):
             vehicles.append(_vehicle(rng, partial(_keeping, gap, rng.uniform(3, 8), rng.uniform(0, 6))))
         overtaking = np.arange(first + rng.uniform(6, 14), end, rng.uniform(28, 36))
-        vehicles += [_vehicle(rng, partial(_passing, meet), ONCOMING) for meet in overtaking.tolist()]
-        meet = first + rng.uniform(1, 4)
-        while meet < end + 10:
-            if np.abs(overtaking - meet).min(initial=99) > 9:
-                vehicles.append(_vehicle(rng, partial(self._meeting, meet, rng.uniform(8, 13)), ONCOMING, True))
-            meet += rng.uniform(3, 9)
+        vehicles += [_vehicle(rng, partial(_passing, moment), ONCOMING) for moment in overtaking.tolist()]
+        moment = first + rng.uniform(1, 4)
+        while moment < end + 10:
+            if np.abs(overtaking - moment).min(initial=99) > 9:
+                vehicles.append(_vehicle(rng, partial(self._oncoming, moment, rng.uniform(8, 13)), ONCOMING, True))
+            moment += rng.uniform(3, 9)
         return vehicles
 
-    def _meeting(self, meet: float, speed: float, time: float) -> float:
-        """Lead of a car that comes towards the camera and meets it at `meet`."""
-        return float(self._where(meet) - speed * (time - meet) - self._where(time))
+    def _oncoming(self, moment: float, speed: float, time: float) -> float:
+        """Lead of a car that comes towards the camera and meets it at `moment`."""
+        return float(self._where(moment) - speed * (time - moment) - self._where(time))
 
     def _where(self, time: float) -> float:
         """The camera's chainage; beyond the drive's end it stands."""
@@ -109,9 +109,9 @@ def _keeping(gap: float, change: float, phase: float, time: float) -> float:
     return gap + change * float(np.sin(time / 7.0 + phase))
 
 
-def _passing(meet: float, time: float) -> float:
-    """Lead of a car that overtakes at `meet`."""
-    return 4.5 * (time - meet)
+def _passing(moment: float, time: float) -> float:
+    """Lead of a car that overtakes at `moment`."""
+    return 4.5 * (time - moment)
 
 
 def _hemming(begin: float, end: float, place: float, phase: float, time: float) -> float:

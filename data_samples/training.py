@@ -181,7 +181,7 @@ def street(out: Path, seed: int, images: int) -> int:
         )
         cv2.imwrite(str(out / "images" / f"{name}.jpg"), image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])
         cv2.imwrite(str(out / "channels" / f"{name}.png"), scanned(scene, drive, ground, camera, pose, time, rng))
-        cv2.imwrite(str(out / "labels" / f"{name}.png"), told(seen, camera, pose))
+        cv2.imwrite(str(out / "labels" / f"{name}.png"), class_map(seen, camera, pose))
     return seed
 
 
@@ -213,12 +213,12 @@ def scanned(
     corners = scene.surface.vertices[scene.surface.faces[hits.face]]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     up = np.abs(normal[:, 2]) / np.maximum(np.linalg.norm(normal, axis=1), 1e-9)
-    met = np.where(hits.hit, hits.distance, 0)[:, None] * rays + origins
-    codes = coded(ground.above(met.astype(np.float32)), hits.distance, up.astype(np.float32))
+    hit_place = np.where(hits.hit, hits.distance, 0)[:, None] * rays + origins
+    codes = coded(ground.above(hit_place.astype(np.float32)), hits.distance, up.astype(np.float32))
     return codes.reshape(small.height, small.width, -1)
 
 
-def told(seen: Rendering, camera: Camera, pose: F64) -> U8:
+def class_map(seen: Rendering, camera: Camera, pose: F64) -> U8:
     """Labels (H, W) to learn from: 255, not to be learnt, where a ray leaves the street below the hills."""
     v, u = np.mgrid[: camera.height, : camera.width]
     up = directions(camera, np.stack([u, v], axis=-1)) @ pose[2, :3]

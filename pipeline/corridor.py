@@ -197,8 +197,8 @@ def _spread(
             f"({', '.join(dropped[:5])}{' ...' if len(few) > 5 else ''}): their points go to the nearest ones"
         )
         places = {key: seed for key, seed in places.items() if key not in dropped}
-    for told in strange:
-        warn(told)
+    for warning in strange:
+        warn(warning)
     if spool.lost:
         warn(f"{spool.lost:,} points with NaN coordinates left out")
     if far > sum(corridor.counts) / 2:
@@ -238,8 +238,8 @@ def _assign(corridor: Corridor, places: F64, options: CutParams, spool: Spool, r
                     chosen = rows[points[some]]
                     chosen["own"] = some < len(xy)
                     spool.add(int(tiles[some[0]]), chosen, part)
-        told = strangers(count, table)
-        strange += [f"{cloud.name}: {told}"] if told else []
+        warning = strangers(count, table)
+        strange += [f"{cloud.name}: {warning}"] if warning else []
     return far, strange
 
 

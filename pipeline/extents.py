@@ -174,9 +174,9 @@ def sides(xyz: F32, own: I32, planes: Planes, voxel: float) -> Sides:
     if not rows:
         none = np.zeros((0, 3))
         return Sides(np.zeros(0, np.int32), none, none, none, np.zeros(0, bool), np.zeros(0, bool))
-    of, starts, ends, out, told, holes = zip(*rows, strict=True)
+    of, starts, ends, out, fits, holes = zip(*rows, strict=True)
     return Sides(
-        np.array(of, np.int32), np.array(starts), np.array(ends), np.array(out), np.array(told), np.array(holes)
+        np.array(of, np.int32), np.array(starts), np.array(ends), np.array(out), np.array(fits), np.array(holes)
     )
 
 
@@ -430,15 +430,15 @@ def _without_chamfers(ring: F64, lines: list[Line], voxel: float) -> tuple[F64, 
         before, after = lines[k - 1], lines[(k + 1) % count]
         if lines[k][2] or not (before[2] and after[2]) or length[k] > 2 * BRIDGED * voxel or len(kept) <= 3:
             continue
-        met = _met(before, after)
+        crossing = _intersection(before, after)
         middle = (ring[k] + ring[(k + 1) % count]) / 2
-        if met is not None and np.linalg.norm(met - middle) < BRIDGED * voxel:
+        if crossing is not None and np.linalg.norm(crossing - middle) < BRIDGED * voxel:
             kept.remove(k)
-            places[(k + 1) % count] = met
+            places[(k + 1) % count] = crossing
     return places[kept], [lines[k] for k in kept]
 
 
-def _met(before: Line, after: Line) -> F64 | None:
+def _intersection(before: Line, after: Line) -> F64 | None:
     """Where two lines meet, None where they hardly do."""
     (p, d, _), (q, e, _) = before, after
     cross = d[0] * e[1] - d[1] * e[0]
@@ -448,9 +448,9 @@ def _met(before: Line, after: Line) -> F64 | None:
 def _corner(before: Line, after: Line, place: F64, voxel: float) -> F64:
     """Where two sides meet near `place`; else the foot of `place` on the one that was fitted."""
     (p, d, one), (q, e, two) = before, after
-    met = _met(before, after)
-    if met is not None and np.linalg.norm(met - place) < 3 * voxel:
-        return met
+    crossing = _intersection(before, after)
+    if crossing is not None and np.linalg.norm(crossing - place) < 3 * voxel:
+        return crossing
     if one or not two:
         return p + ((place - p) @ d) * d
     return q + ((place - q) @ e) * e

@@ -228,9 +228,9 @@ def _cross(out, origin, end, corner, normal, up, along, deep):  # type: ignore[n
         share = before / (before - behind)
         row, column = 0.0, 0.0
         for k in range(3):
-            met = origin[i, k] + share * (end[i, k] - origin[i, k]) - corner[k]
-            row += met * up[k]
-            column += met * along[k]
+            beyond = origin[i, k] + share * (end[i, k] - origin[i, k]) - corner[k]
+            row += beyond * up[k]
+            column += beyond * along[k]
         row, column = np.rint(row), np.rint(column)
         if 0 <= row < rows and 0 <= column < columns:
             out[int(row), int(column)] = True

@@ -66,27 +66,27 @@ def in_free_space(
     first = np.flatnonzero(np.diff(windows, prepend=windows[:1] - 1))
     again = np.append(False, np.diff(windows[first]) > PAUSE)
     starts = np.append(first, len(xyz))
-    asked = (xyz[:, 2] > low) & (xyz[:, 2] < high)
+    candidates = (xyz[:, 2] > low) & (xyz[:, 2] < high)
     path = origins[np.isfinite(origins[:, 0])]
     if not len(path):
         return np.zeros(len(xyz), bool), 0.0
     corner, far = path.min(axis=0) - reach, path.max(axis=0) + reach
-    asked &= ((xyz > corner) & (xyz < far)).all(axis=1)
-    if not asked.any():
-        return asked, 0.0
-    boxes = _boxes(xyz[asked])
-    said = _in_free_space(xyz, origins, asked, starts, again, boxes, voxel, reach, votes)
-    return _with_outer_layer(xyz, windows, said, LAYER * voxel), float((said[asked] > 0).mean())
+    candidates &= ((xyz > corner) & (xyz < far)).all(axis=1)
+    if not candidates.any():
+        return candidates, 0.0
+    boxes = _boxes(xyz[candidates])
+    verdict = _in_free_space(xyz, origins, candidates, starts, again, boxes, voxel, reach, votes)
+    return _with_outer_layer(xyz, windows, verdict, LAYER * voxel), float((verdict[candidates] > 0).mean())
 
 
 def _with_outer_layer(
-    xyz: F32, windows: npt.NDArray[np.int64], said: npt.NDArray[np.uint8], reach: float
+    xyz: F32, windows: npt.NDArray[np.int64], verdict: npt.NDArray[np.uint8], reach: float
 ) -> npt.NDArray[np.bool_]:
     """(N,) the points in free space, and those in the open that lie within `reach` of one of the same window."""
     from scipy.spatial import cKDTree
 
-    free = said == FREE
-    index = np.flatnonzero((said == OPEN) & np.isin(windows, windows[free]))
+    free = verdict == FREE
+    index = np.flatnonzero((verdict == OPEN) & np.isin(windows, windows[free]))
     if not len(index):
         return free
     apart = 2 * reach  # a fourth axis, on which windows are no neighbours
@@ -109,14 +109,14 @@ def _boxes(xyz: F32) -> F64:
 
 
 @njit(cache=True, parallel=True)
-def _in_free_space(xyz, origins, asked, starts, again, boxes, voxel, reach, votes):  # type: ignore[no-untyped-def]
+def _in_free_space(xyz, origins, candidates, starts, again, boxes, voxel, reach, votes):  # type: ignore[no-untyped-def]
     ends, spans = np.empty((len(starts) - 1, 6), np.float64), np.empty((len(starts) - 1, 6), np.float64)
     for w in prange(len(spans)):
         ends[w] = _span(xyz, starts[w], starts[w + 1], 0.0)
         spans[w] = _span(origins, starts[w], starts[w + 1], reach)
     out = np.zeros(len(xyz), np.uint8)
     for b in prange(len(boxes)):
-        _carve(xyz, origins, asked, starts, again, ends, spans, boxes[b], voxel, reach, votes, out)
+        _carve(xyz, origins, candidates, starts, again, ends, spans, boxes[b], voxel, reach, votes, out)
     return out
 
 
@@ -133,7 +133,7 @@ def _span(places, first, end, reach):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _carve(xyz, origins, asked, starts, again, ends, spans, box, voxel, reach, votes, out):  # type: ignore[no-untyped-def]
+def _carve(xyz, origins, candidates, starts, again, ends, spans, box, voxel, reach, votes, out):  # type: ignore[no-untyped-def]
     """Say in `out` which of the points that are asked about, and lie in the box, are `FREE` or `OPEN`."""
     corner = box[:3] - HALO * voxel
     shape = np.empty(3, np.int64)
@@ -147,21 +147,21 @@ def _carve(xyz, origins, asked, starts, again, ends, spans, box, voxel, reach, v
     rays = np.zeros(size, np.int32)  # through the voxel, counted on from `RAYS` + 1 times the window
     for w in range(len(spans)):
         if again[w]:
-            _say(xyz, asked, box, corner, shape, voxel, votes, passes, hits, through, inside, out)
+            _vote(xyz, candidates, box, corner, shape, voxel, votes, passes, hits, through, inside, out)
             for counts in (passes, hits, through, inside):
                 counts[:] = 0
-        for i in range(starts[w], starts[w + 1] if _meet(ends[w], corner, far) else starts[w]):
+        for i in range(starts[w], starts[w + 1] if _overlap(ends[w], corner, far) else starts[w]):
             _hit(xyz, i, corner, far, shape, voxel, w, hit_in, hits, inside_in, inside)
-        for i in range(starts[w], starts[w + 1] if _meet(spans[w], corner, far) else starts[w]):
+        for i in range(starts[w], starts[w + 1] if _overlap(spans[w], corner, far) else starts[w]):
             _pass(xyz, origins, i, corner, far, shape, voxel, reach, w, hit_in, rays, passes, through)
-    _say(xyz, asked, box, corner, shape, voxel, votes, passes, hits, through, inside, out)
+    _vote(xyz, candidates, box, corner, shape, voxel, votes, passes, hits, through, inside, out)
 
 
 @njit(cache=True)
-def _say(xyz, asked, box, corner, shape, voxel, votes, passes, hits, through, inside, out):  # type: ignore[no-untyped-def]
+def _vote(xyz, candidates, box, corner, shape, voxel, votes, passes, hits, through, inside, out):  # type: ignore[no-untyped-def]
     """What the counts say of each point in the box, kept in `out` if it is more than was said before."""
     for i in range(len(xyz)):
-        if not asked[i] or out[i] == FREE or xyz[i, 0] < box[0] or xyz[i, 1] < box[1] or xyz[i, 2] < box[2]:
+        if not candidates[i] or out[i] == FREE or xyz[i, 0] < box[0] or xyz[i, 1] < box[1] or xyz[i, 2] < box[2]:
             continue
         if xyz[i, 0] >= box[3] or xyz[i, 1] >= box[4] or xyz[i, 2] >= box[5]:
             continue
@@ -186,7 +186,7 @@ def _voxel(xyz, i, corner, voxel):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _meet(span, corner, far):  # type: ignore[no-untyped-def]
+def _overlap(span, corner, far):  # type: ignore[no-untyped-def]
     """Whether two boxes meet."""
     apart = False
     for k in range(3):

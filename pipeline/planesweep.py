@@ -58,7 +58,7 @@ UNSEEN = -0.1
 
 
 @dataclass(frozen=True)
-class Looked:
+class Photo:
     """A photo to compare.
 
     Attributes:
@@ -85,7 +85,7 @@ class Patch:
     sky: F32
 
 
-def looked_at(wall: Wall, photo: Looked, offset: float = 0.0, texels: float = TEXELS) -> Patch:
+def rectified(wall: Wall, photo: Photo, offset: float = 0.0, texels: float = TEXELS) -> Patch:
     """What a photo shows of a wall's plane, moved back by `offset` metres.
 
     Args:
@@ -125,23 +125,23 @@ def looked_at(wall: Wall, photo: Looked, offset: float = 0.0, texels: float = TE
     return Patch(sampled(photo.levels[level]), seen, sky)
 
 
-def evidence(wall: Wall, photos: Sequence[Looked]) -> tuple[F32, F32]:
+def evidence(wall: Wall, photos: Sequence[Photo]) -> tuple[F32, F32]:
     """What photos say of each cell.
 
     Returns:
         (R, C) above 0 for the wall, below 0 for something else, about -1 to 1; and (R, C) from 0 to 1 how sharply the
         picture changes at the cell's upper side, as it does where a wall ends.
     """
-    chosen = [photo for photo in photos if looked_at(wall, photo, 0.0, GLANCE).seen.any()]
+    chosen = [photo for photo in photos if rectified(wall, photo, 0.0, GLANCE).seen.any()]
     chosen = [chosen[round(k)] for k in np.linspace(0, len(chosen) - 1, min(VIEWS, len(chosen)))]
     if len(chosen) < 2:
         return np.full(wall.known.shape, UNSEEN, np.float32), np.zeros(wall.known.shape, np.float32)
     window = 2 * round(WINDOW / 2 / wall.cell * TEXELS) + 1
-    own = [looked_at(wall, photo) for photo in chosen]
+    own = [rectified(wall, photo) for photo in chosen]
     alike, deep, count = agreement(_alike_bright(own, wall), window)
     elsewhere = np.full_like(alike, -1.0)
     for offset in OFFSETS:
-        there, _, many = agreement([looked_at(wall, photo, offset) for photo in chosen], window)
+        there, _, many = agreement([rectified(wall, photo, offset) for photo in chosen], window)
         elsewhere = np.maximum(elsewhere, np.where(many >= 2, there, -1.0))
     light = _mean([p.grey for p in _alike_bright(own, wall)], [p.seen for p in own])
     sky = _mean([p.sky for p in own], [p.seen for p in own])

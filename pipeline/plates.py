@@ -214,8 +214,8 @@ def _filled() -> dict[Shape, tuple[F64, F64, F64]]:
     """Of each outline: places evenly over it (N, 2), and (2,) below which 1 % of them lie, and above which."""
     grid = np.stack(np.meshgrid(*(np.linspace(-1, 1, 41),) * 2, indexing="ij"), axis=-1).reshape(-1, 2)
     # points can't tell an octagon from a disc
-    told = {shape: corners for shape, corners in OUTLINES.items() if shape != "octagon"}
-    within = {shape: grid[inside(grid, corners, 1e-9)] for shape, corners in told.items()}
+    candidates = {shape: corners for shape, corners in OUTLINES.items() if shape != "octagon"}
+    within = {shape: grid[inside(grid, corners, 1e-9)] for shape, corners in candidates.items()}
     return {shape: (places[::3], *np.percentile(places, [1, 99], axis=0)) for shape, places in within.items()}
 
 

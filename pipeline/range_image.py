@@ -109,13 +109,13 @@ def _fill(depth, rays, eye, discs, boxes, start, index):  # type: ignore[no-unty
                     x0 = y0 = 0.0  # where the ray begins
                     if eye.model == ORTHOGRAPHIC:
                         x0, y0 = (u - p[2]) / p[0], (v - p[3]) / p[1]
-                    t = _meet_disc(ray, s, x0, y0)
+                    t = _intersect_disc(ray, s, x0, y0)
                     if 0 < t < depth[v, u]:  # a NaN ray meets nothing
                         depth[v, u] = t
 
 
 @njit(cache=True, inline="always")
-def _meet_disc(d, s, x0, y0):  # type: ignore[no-untyped-def]
+def _intersect_disc(d, s, x0, y0):  # type: ignore[no-untyped-def]
     """Range at which the unit ray d from (x0, y0, 0) meets the disc s: centre, normal, radius; -1 if it does not."""
     along = d[0] * s[1, 0] + d[1] * s[1, 1] + d[2] * s[1, 2]
     if abs(along) < 0.05:  # seen edge-on

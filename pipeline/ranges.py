@@ -69,25 +69,25 @@ FileName = Annotated[str, AfterValidator(_no_nul)]
 File = Annotated[Path, AfterValidator(_no_nul)]
 
 
-def told(field: FieldInfo) -> str:
+def described(field: FieldInfo) -> str:
     """What a parameter may be: "0.005 to 100"."""
     extra = field.json_schema_extra
     if isinstance(extra, dict) and "range" in extra:
         return str(extra["range"])
-    return _told(field.annotation, field.metadata)
+    return _described(field.annotation, field.metadata)
 
 
-def _told(kind: Any, limits: Sequence[Any]) -> str:
+def _described(kind: Any, limits: Sequence[Any]) -> str:
     origin, arguments = get_origin(kind), get_args(kind)
     if origin is Annotated:
         inner = [m for a in arguments[1:] for m in (a.metadata if isinstance(a, FieldInfo) else [a])]
-        return _told(arguments[0], [*inner, *limits])
+        return _described(arguments[0], [*inner, *limits])
     if origin in (Union, types.UnionType):
-        return ", or ".join("left out" if a is type(None) else _told(a, limits) for a in arguments)
+        return ", or ".join("left out" if a is type(None) else _described(a, limits) for a in arguments)
     if origin is Literal:
         return _either([str(a) for a in arguments])
     if origin is tuple:
-        each = [_told(a, limits) for a in arguments if a is not Ellipsis]
+        each = [_described(a, limits) for a in arguments if a is not Ellipsis]
         return f"{len(each)} numbers, {each[0]}" if Ellipsis not in arguments else f"numbers, {each[0]}"
     if kind is bool:
         return "true or false"

@@ -72,7 +72,7 @@ def textured(folder: Path) -> Body:
     return Body(mesh, tuple(folder / f"page_{i}.png" for i in range(count)))
 
 
-class _Met(NamedTuple):
+class _Hits(NamedTuple):
     """What N rays meet first: arrays (N,) as in `Image`."""
 
     face: I32
@@ -207,15 +207,15 @@ class Renderer:
             here = slice(first, min(n, first + step))
             row, column = np.divmod(np.arange(here.start, here.stop, dtype=np.float64), width)
             origin, direction = rays(column, row)
-            met = self._meet(origin, direction)
-            face[here], which[here], distance[here], barycentric[here] = met
-            colour, seen[here] = self._paint(met, direction, shaded, wireframe)
-            hit = met.body >= 0
+            hits = self._intersect(origin, direction)
+            face[here], which[here], distance[here], barycentric[here] = hits
+            colour, seen[here] = self._shade_hits(hits, direction, shaded, wireframe)
+            hit = hits.body >= 0
             colour = colour[hit]
             if samples > 1:
                 origin, direction = rays((column[hit, None] + across).ravel(), (row[hit, None] + down).ravel())
-                fine = self._meet(origin, direction)
-                colours, _ = self._paint(fine, direction, shaded, wireframe)
+                fine = self._intersect(origin, direction)
+                colours, _ = self._shade_hits(fine, direction, shaded, wireframe)
                 colour = _mean(colours, fine.body >= 0, colour)
             rgb[here][hit] = colour
         return Image(
@@ -223,7 +223,7 @@ class Renderer:
             which.reshape(shape), distance.reshape(shape), barycentric.reshape(*shape, 2),
         )  # fmt: skip
 
-    def _meet(self, origin: F64, direction: F64) -> _Met:
+    def _intersect(self, origin: F64, direction: F64) -> _Hits:
         """What rays from origins along directions (N, 3) meet first; a direction of NaN meets nothing."""
         cast, known = np.concatenate([origin, direction], axis=1, dtype=np.float32), np.isfinite(direction).all(axis=1)
         cast[~known] = 0
@@ -236,22 +236,22 @@ class Renderer:
         face[hit] = answer["primitive_ids"].numpy()[hit].astype(np.int32)
         body[hit] = lookup[answer["geometry_ids"].numpy()[hit]]
         barycentric = np.where(hit[:, None], answer["primitive_uvs"].numpy(), 0).astype(np.float32)
-        return _Met(face, body, np.where(hit, t, np.inf).astype(np.float32), barycentric)
+        return _Hits(face, body, np.where(hit, t, np.inf).astype(np.float32), barycentric)
 
-    def _paint(self, met: _Met, direction: F64, shaded: bool, wireframe: bool) -> tuple[U8, U8]:
+    def _shade_hits(self, hits: _Hits, direction: F64, shaded: bool, wireframe: bool) -> tuple[U8, U8]:
         """Colours (N, 3) and masks (N,) of what rays met, black and 0 where that is nothing."""
-        rgb, seen = np.zeros((len(met.body), 3), np.uint8), np.zeros(len(met.body), np.uint8)
+        rgb, seen = np.zeros((len(hits.body), 3), np.uint8), np.zeros(len(hits.body), np.uint8)
         for i, body in enumerate(self.bodies):
-            at = np.flatnonzero(met.body == i)
+            at = np.flatnonzero(hits.body == i)
             if len(at):
-                rgb[at], seen[at] = self._colour(body, met.face[at], met.barycentric[at])
+                rgb[at], seen[at] = self._colour(body, hits.face[at], hits.barycentric[at])
                 if shaded:
-                    rgb[at] = _shade(body.mesh, met.face[at], direction[at], rgb[at])
+                    rgb[at] = _shade(body.mesh, hits.face[at], direction[at], rgb[at])
         if wireframe:
-            at = np.flatnonzero(met.body >= 0)
+            at = np.flatnonzero(hits.body >= 0)
             size = np.linalg.norm(direction[at], axis=1)
-            width = 0.0012 * met.range[at] * size + 0.002
-            edge = self._edge_distance(met.body[at], met.face[at], met.barycentric[at]) < width
+            width = 0.0012 * hits.range[at] * size + 0.002
+            edge = self._edge_distance(hits.body[at], hits.face[at], hits.barycentric[at]) < width
             rgb[at[edge]] = (rgb[at[edge]] * 0.35).astype(np.uint8)
         return rgb, seen
 
@@ -270,7 +270,7 @@ class Renderer:
         for k in np.unique(page).tolist():
             on = np.flatnonzero(page == k)
             texture, mask = self._pixels(body.pages[k])
-            rgb[on], seen[on] = _look_up(texture, mask, uv[on])
+            rgb[on], seen[on] = _sample(texture, mask, uv[on])
         return rgb, seen
 
     def _edge_distance(self, which: npt.NDArray[np.int16], face: I32, barycentric: F32) -> F32:
@@ -320,7 +320,7 @@ def _read(path: Path) -> tuple[U8, U8 | None]:
     return np.ascontiguousarray(page[..., ::-1]).astype(np.uint8, copy=False), mask
 
 
-def _look_up(page: U8, mask: U8 | None, uv: F32) -> tuple[U8, U8]:
+def _sample(page: U8, mask: U8 | None, uv: F32) -> tuple[U8, U8]:
     """Bilinear colours (N, 3) of a page, and the nearest value (N,) of its mask, at uv (N, 2), origin lower left."""
     height, width = page.shape[:2]
     x = np.clip(uv[:, 0] * width - 0.5, 0, width - 1)

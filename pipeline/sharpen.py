@@ -95,14 +95,14 @@ def sharpen(
     a, b = own[pairs[:, 0]], own[pairs[:, 1]]
     middle = vertices[pairs].mean(axis=1)
     crossing = np.flatnonzero((a >= 0) & (b >= 0) & (a != b))
-    place, far = meet(middle[crossing], planes, np.stack([a, b], axis=1)[crossing])
+    place, far = intersect(middle[crossing], planes, np.stack([a, b], axis=1)[crossing])
     sharp = far <= ROUNDED * voxel
     crossing, place = crossing[sharp], place[sharp]
     new = np.full(len(pairs), -1)
     new[crossing] = len(vertices) + np.arange(len(crossing))
     split, parent, corner = _split(faces, new[of_face], len(vertices) + len(crossing))
     three = own[faces[corner]]
-    place3, far3 = meet(vertices[faces[corner]].mean(axis=1), planes, three)
+    place3, far3 = intersect(vertices[faces[corner]].mean(axis=1), planes, three)
     around = np.concatenate([moved, place])[new[of_face[corner]]].mean(axis=1) if len(corner) else place3
     place3 = np.where((far3 <= ROUNDED * voxel)[:, None], place3, around)
     first = np.concatenate([vertices, middle[crossing], vertices[faces[corner]].mean(axis=1)])
@@ -151,7 +151,7 @@ def vertex_normals(mesh: Mesh) -> F64:
     return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-20)
 
 
-def meet(places: F64, planes: Planes, which: npt.NDArray[np.integer]) -> tuple[F64, F64]:
+def intersect(places: F64, planes: Planes, which: npt.NDArray[np.integer]) -> tuple[F64, F64]:
     """The places (N, 3) on all of the planes `which` (N, K), K = 2 or 3, that are nearest to `places`.
 
     And metres (N,) to them, infinite where planes hardly meet.

@@ -13,7 +13,7 @@ from typing import Any, Protocol, Self
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from scan2sim.pipeline.errors import SettingError
-from scan2sim.pipeline.ranges import told
+from scan2sim.pipeline.ranges import described
 
 
 class Params(BaseModel):
@@ -41,7 +41,7 @@ class Params(BaseModel):
             if name not in values:
                 raise SettingError(f"{where}.{name}", "is missing", remedy) from None
             value = f"{values[name]!r:.60}"
-            cause = f"must be {told(cls.model_fields[name])} (got {value})"
+            cause = f"must be {described(cls.model_fields[name])} (got {value})"
             raise SettingError(f"{where}.{name}" if where else f"--{name.replace('_', '-')}", cause, remedy) from None
 
 

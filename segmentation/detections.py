@@ -58,20 +58,20 @@ def _along(ray: F64, own: int, views: Sequence[View], shown: Mapping[int, U8]) -
     """The place along a photo's ray that most others show as a sign, after how surely; None where too few do."""
     distance = 1 / np.linspace(1 / NEAR, 1 / FAR, STEPS)
     places = views[own].centre + distance[:, None] * ray
-    votes, asked = np.zeros(STEPS), np.zeros(STEPS)
+    votes, seeing = np.zeros(STEPS), np.zeros(STEPS)
     for j, sign in shown.items():
         if j != own:
-            told = _told(views[j], sign, places)
+            probability = _sampled(views[j], sign, places)
             near = np.linalg.norm(places - views[j].centre, axis=1) < FARTHER * distance
-            counts = np.isfinite(told) & near
-            votes += np.where(counts, told > SURE, 0)
-            asked += counts
-    share = np.where(votes >= OTHERS, votes / np.maximum(asked, 1), 0)
+            counts = np.isfinite(probability) & near
+            votes += np.where(counts, probability > SURE, 0)
+            seeing += counts
+    share = np.where(votes >= OTHERS, votes / np.maximum(seeing, 1), 0)
     best = np.flatnonzero(share == share.max())
     return (float(share.max()), places[best[len(best) // 2]]) if share.max() > 0.5 else None
 
 
-def _told(view: View, sign: U8, places: F64) -> npt.NDArray[np.float32]:
+def _sampled(view: View, sign: U8, places: F64) -> npt.NDArray[np.float32]:
     """(N,) how surely a photo shows a sign at places (N, 3), of 255; NaN where it doesn't show them."""
     from scan2sim.pipeline.projection import pixels
 

@@ -176,10 +176,10 @@ def vehicles(scan: Scan) -> list[Thing]:
     """All vehicles, the surest first; no point is of two."""
     tree = cKDTree(scan.xyz[:, :2])
     above = ~scan.ground & (scan.height > FEET) & (scan.height < TALLEST)
-    told = above & (scan.classification == CODE["vehicle"])
+    classified = above & (scan.classification == CODE["vehicle"])
     offered = [
         thing
-        for member in (told & _between(scan.height, BAND), above & _between(scan.height, DOORS))
+        for member in (classified & _between(scan.height, BAND), above & _between(scan.height, DOORS))
         for cluster in clusters(scan.xyz, member)
         if (thing := _vehicle(scan, tree, above, cluster)) is not None
     ]
@@ -199,14 +199,14 @@ def no_vehicles(scan: Scan, found: Sequence[Thing]) -> Ints:
 
     What is told so below the vehicles that were `found` is theirs: wheels and sills.
     """
-    told = scan.classification == CODE["vehicle"]
+    classified = scan.classification == CODE["vehicle"]
     if found:
         tree = cKDTree(scan.xyz[:, :2])
         for thing in found:
             near = np.array(tree.query_ball_point(thing.centre[:2], thing.length / 2 + 1.5), np.int64)
-            told[near[thing.box.inside(scan.xyz[near, :2], SKIN)]] = False
-    wrong = told & (scan.ground | (scan.height < FEET))
-    for cluster in clusters(scan.xyz, told & ~wrong):
+            classified[near[thing.box.inside(scan.xyz[near, :2], SKIN)]] = False
+    wrong = classified & (scan.ground | (scan.height < FEET))
+    for cluster in clusters(scan.xyz, classified & ~wrong):
         box = rectangle(scan.xyz[cluster, :2])
         if (box.width < THIN and box.length > LONG) or box.width > WIDEST:
             wrong[cluster] = True
@@ -236,12 +236,12 @@ def people(scan: Scan) -> list[Thing]:
 
 def no_people(scan: Scan) -> Ints:
     """Indices of points that are told to be persons', in things of their size that most votes take for another."""
-    told = np.flatnonzero(scan.classification == CODE["person"])
-    wrong = np.zeros(len(told), bool)
+    classified = np.flatnonzero(scan.classification == CODE["person"])
+    wrong = np.zeros(len(classified), bool)
     for thing in _of_a_persons_size(scan):
         if not _is_person(scan, thing):
-            wrong |= thing.box.inside(scan.xyz[told, :2], SKIN) & (scan.height[told] < thing.height + 0.1)
-    return told[wrong]
+            wrong |= thing.box.inside(scan.xyz[classified, :2], SKIN) & (scan.height[classified] < thing.height + 0.1)
+    return classified[wrong]
 
 
 def _is_person(scan: Scan, thing: Thing) -> bool:
@@ -288,8 +288,8 @@ def _vehicle(scan: Scan, tree: cKDTree, above: Bools, cluster: Ints) -> Thing | 
     odds += PRIOR + WITNESSES * word + _freedom(scan, near, box, top)
     if odds <= 0:
         return None
-    told = near[(scan.classification[near] == CODE["vehicle"]) & box.inside(scan.xyz[near, :2], MIRROR)]
-    own = np.union1d(inside, told[scan.height[told] < top + GAP])
+    classified = near[(scan.classification[near] == CODE["vehicle"]) & box.inside(scan.xyz[near, :2], MIRROR)]
+    own = np.union1d(inside, classified[scan.height[classified] < top + GAP])
     moved = float(scan.moved[own].mean()) > CARVED
     centre = np.array([box.x, box.y, _floor(scan, own)])
     return Thing(kind, centre, box.heading, box.length, box.width, top, odds, moved, own)

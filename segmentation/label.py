@@ -52,7 +52,7 @@ def label(inputs: Inputs, params: LabelParams, out: Path, report: Report) -> Don
     from scan2sim.pipeline.io import views as views_io
     from scan2sim.pipeline.types import PointCloud
     from scan2sim.segmentation.backends import load
-    from scan2sim.segmentation.photos import Labeller
+    from scan2sim.segmentation.photos import Classifier
 
     folder = out / "labels"
     folder.mkdir()
@@ -62,8 +62,8 @@ def label(inputs: Inputs, params: LabelParams, out: Path, report: Report) -> Don
     if kept or not views or not params.photos:
         return Done({"labels": folder}, {"photos": 0, "why": "the cloud has classes" if kept else "none is asked"})
     network = load(params.network, params.weights, params.device)
-    labeller = Labeller(network, str(params.weights or network.facts.name))
-    scan = scanned(cloud, params.size, report) if labeller.takes_channels else None
+    classifier = Classifier(network, str(params.weights or network.facts.name))
+    scan = scanned(cloud, params.size, report) if classifier.takes_channels else None
     warnings = []
     for i, view in enumerate(views):
         report(0.2 + 0.8 * i / len(views), view.name)
@@ -74,14 +74,14 @@ def label(inputs: Inputs, params: LabelParams, out: Path, report: Report) -> Don
         except InputError as error:
             warnings.append(f"{view.photo} {error.cause}: it tells no classes")
             continue
-        channels = scan.into(view, labeller.size(view.camera)) if scan else None
-        np.save(folder / f"{i}.npy", labeller.probabilities(rgb, view.camera, channels))
+        channels = scan.into(view, classifier.size(view.camera)) if scan else None
+        np.save(folder / f"{i}.npy", classifier.probabilities(rgb, view.camera, channels))
     facts = network.facts
-    told = {"network": facts.name, "sha256": facts.sha256, "licence": facts.licence, "tells": labeller.tells}
-    (folder / "network.json").write_text(json.dumps(told, indent=1), encoding="utf-8")
+    about = {"network": facts.name, "sha256": facts.sha256, "licence": facts.licence, "tells": classifier.classes}
+    (folder / "network.json").write_text(json.dumps(about, indent=1), encoding="utf-8")
     return Done(
         {"labels": folder},
-        {"photos": len(views) - len(warnings), **told},
+        {"photos": len(views) - len(warnings), **about},
         warnings,
     )
 

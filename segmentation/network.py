@@ -90,10 +90,10 @@ class StreetNet(nn.Module):
         Outside of training, the mean of what it says of them and of their mirror image.
         """
         if self.training:
-            return self._look(seen)
-        return (self._look(seen) + self._look(seen.flip(3)).flip(3)) / 2
+            return self._classify(seen)
+        return (self._classify(seen) + self._classify(seen.flip(3)).flip(3)) / 2
 
-    def _look(self, seen: Tensor) -> Tensor:
+    def _classify(self, seen: Tensor) -> Tensor:
         rgb, codes, there = seen[:, :3], seen[:, 3:-1], seen[:, -1:]
         codes = (codes - CODE_MEAN) / CODE_SPREAD * there
         x = self.stem(torch.cat([(rgb - self.mean) / self.spread, codes, there], dim=1))

@@ -334,13 +334,13 @@ def _clear(pictures, project, focal, plates, flat, out, rim, off, noise):  # typ
     rated = np.zeros((len(plates), 3))
     seen, mean, edge = np.empty((len(pictures), len(flat), 3)), np.empty((len(flat), 3)), np.empty(rim)
     for n in range(len(plates)):
-        if _look(pictures, project, focal, plates, n, flat, out, rim, off, seen):
+        if _sample_photos(pictures, project, focal, plates, n, flat, out, rim, off, seen):
             rated[n, 0], rated[n, 1], rated[n, 2] = _rate(seen, mean, edge, noise)
     return rated
 
 
 @njit(cache=True, nogil=True)
-def _look(pictures, project, focal, plates, n, flat, out, rim, off, seen):  # type: ignore[no-untyped-def]
+def _sample_photos(pictures, project, focal, plates, n, flat, out, rim, off, seen):  # type: ignore[no-untyped-def]
     """Colours (J, S, 3) into `seen` at `_samples` of a plate (6,), its rim's `off` pixels in and out.
 
     False where a picture doesn't show them all.
@@ -386,7 +386,7 @@ def _rate(seen, mean, edge, noise):  # type: ignore[no-untyped-def]
     """
     count, places, _ = seen.shape
     rim = len(edge)
-    told, apart = 0.0, 0.0
+    within, apart = 0.0, 0.0
     for k in range(3):
         whole = 0.0
         for i in range(places):
@@ -397,7 +397,7 @@ def _rate(seen, mean, edge, noise):  # type: ignore[no-untyped-def]
             if i >= 2 * rim:
                 whole += mean[i, k] / (places - 2 * rim)
         for i in range(2 * rim, places):
-            told += (mean[i, k] - whole) ** 2 + noise**2
+            within += (mean[i, k] - whole) ** 2 + noise**2
             for j in range(count):
                 apart += (seen[j, i, k] - mean[i, k]) ** 2 / count
     for i in range(rim):
@@ -411,4 +411,4 @@ def _rate(seen, mean, edge, noise):  # type: ignore[no-untyped-def]
             spread += own / count
         edge[i] = contrast / (contrast + math.sqrt(spread) + 3 * noise)
     edge.sort()
-    return edge.mean(), edge[: rim // 4].mean(), told / (told + apart)
+    return edge.mean(), edge[: rim // 4].mean(), within / (within + apart)

@@ -23,7 +23,7 @@ ENLARGED = 1.6
 """Photos are enlarged at most so many times."""
 
 
-class Labeller:
+class Classifier:
     """A network, asked for the classes of photos.
 
     Args:
@@ -40,7 +40,7 @@ class Labeller:
         to = mapped(network.facts.labels, where)
         self._merge = np.zeros((len(CLASSES), len(to)), np.float32)
         self._merge[to[to != IGNORED], np.flatnonzero(to != IGNORED)] = 1
-        self.tells = tuple(name for name, row in zip(CLASSES, self._merge, strict=True) if row.any())
+        self.classes = tuple(name for name, row in zip(CLASSES, self._merge, strict=True) if row.any())
         self.takes_channels = network.facts.channels
         self.tile = TILE
 
@@ -121,11 +121,11 @@ def _ramp(n: int) -> F32:
     return np.minimum(1.0, np.minimum(at, n - at) / (OVERLAP / STRIDE / 2)).astype(np.float32)
 
 
-def labels_of(probabilities: U8, size: tuple[int, int]) -> tuple[U8, U8]:
+def class_map(probabilities: U8, size: tuple[int, int]) -> tuple[U8, U8]:
     """Index of the likeliest class, and its probability (255 for 1), of every pixel: (H, W) each.
 
     Args:
-        probabilities: (h, w, C) of `Labeller.probabilities`.
+        probabilities: (h, w, C) of `Classifier.probabilities`.
         size: (H, W) of the photo.
     """
     import cv2

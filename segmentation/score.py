@@ -57,15 +57,15 @@ class Confusion:
         return "\n".join(lines)
 
 
-def confusion(known: U8, told: U8) -> Confusion:
+def confusion(known: U8, predicted: U8) -> Confusion:
     """Of LAS codes (N,); points whose class isn't known, or is noise, don't count, middle vegetation is low."""
-    known, told = _merged(known), _merged(told)
+    known, predicted = _merged(known), _merged(predicted)
     some = ~np.isin(known, (*UNKNOWN, 7, 18))
-    known, told = known[some], told[some]
-    codes = np.union1d(known, told)
+    known, predicted = known[some], predicted[some]
+    codes = np.union1d(known, predicted)
     at = np.zeros(256, np.int64)
     at[codes] = np.arange(len(codes))
-    count = np.bincount(at[known] * len(codes) + at[told], minlength=len(codes) ** 2).reshape(len(codes), -1)
+    count = np.bincount(at[known] * len(codes) + at[predicted], minlength=len(codes) ** 2).reshape(len(codes), -1)
     return Confusion(tuple(int(c) for c in codes), count)
 
 

@@ -55,23 +55,23 @@ def segment(inputs: Inputs, params: SegmentParams, out: Path, report: Report) ->
     cloud = PointCloud.load(inputs["cloud"])
     file, beside = out / "cloud.npz", out / "confidence.npz"
     own = classified(cloud.classification)
-    told: dict[str, Any] = {}
+    evidence: dict[str, Any] = {}
     if cloud.classification is not None and own >= params.min_classified and not params.overwrite:
         pass_on(inputs["cloud"], file)
         classification, source = cloud.classification, "cloud"
         kinds, sure = np.full(len(cloud), OWN, np.uint8), np.full(len(cloud), 255, np.uint8)
     else:
-        classification, sure, kinds, told = tell(cloud, inputs, params, report)
+        classification, sure, kinds, evidence = classify_points(cloud, inputs, params, report)
         report(0.95, "writing")
         replace(cloud, classification=classification).save(file)
-        source = "photos and shape" if told else "shape"
+        source = "photos and shape" if evidence else "shape"
     np.savez(beside, confidence=sure, source=kinds)
     count = np.bincount(classification, minlength=256)
     facts = {
         "source": source,
         "own_classes": round(own, 4),
         "points": {name_of(code): int(count[code]) for code in np.flatnonzero(count).tolist()},
-    } | told
+    } | evidence
     warnings = []
     if source == "shape":
         why = "they were told anew" if own else "The cloud has none of its own: they were told"
@@ -80,9 +80,9 @@ def segment(inputs: Inputs, params: SegmentParams, out: Path, report: Report) ->
         warnings.append(
             "the cloud classifies neither buildings nor vegetation; --set segment.overwrite=true finds them"
         )
-    elif told and told["sky_share"] > SKY_LIMIT:
+    elif evidence and evidence["sky_share"] > SKY_LIMIT:
         warnings.append(
-            f"{told['sky_share']:.0%} of the sightings take points for sky: are poses and clocks of photos right?"
+            f"{evidence['sky_share']:.0%} of the sightings take points for sky: are poses and clocks of photos right?"
         )
     return Done({"cloud": file, "confidence": beside}, facts, warnings)
 
@@ -91,7 +91,9 @@ SKY_LIMIT = 0.15
 """Share of sightings that say sky above which a run warns."""
 
 
-def tell(cloud: PointCloud, inputs: Inputs, params: SegmentParams, report: Report) -> tuple[U8, U8, U8, dict[str, Any]]:
+def classify_points(
+    cloud: PointCloud, inputs: Inputs, params: SegmentParams, report: Report
+) -> tuple[U8, U8, U8, dict[str, Any]]:
     """LAS codes, confidence (255: sure) and source of every point (N,), and facts where photos told something."""
     import numpy as np
 
@@ -103,8 +105,8 @@ def tell(cloud: PointCloud, inputs: Inputs, params: SegmentParams, report: Repor
 
     n = len(cloud)
     views = views_io.load(inputs["views"]) if "views" in inputs else ()
-    asked = params.photos and "labels" in inputs and any(inputs["labels"].glob("*.npy"))
-    if not asked:
+    by_photos = params.photos and "labels" in inputs and any(inputs["labels"].glob("*.npy"))
+    if not by_photos:
         classification = classify(cloud, lambda f, m="": report(0.05 + 0.85 * f, m), voxel=params.voxel)
         return classification, np.full(n, 128, np.uint8), np.full(n, SHAPE, np.uint8), {}
     report(0.05, "thinning")
@@ -117,8 +119,8 @@ def tell(cloud: PointCloud, inputs: Inputs, params: SegmentParams, report: Repor
     report(0.25, "shape")
     shape = classify(thin, lambda f, m="": report(0.25 + 0.25 * f, m), voxel=params.voxel)
     moving = PointCloud.load(inputs["moving"]) if "moving" in inputs else None
-    code, sure, seen, told = _from_photos(thin, shape, views, inputs["labels"], moving, params, report)
-    return code[voxel], sure[voxel], np.where(seen, PHOTO, SHAPE).astype(np.uint8)[voxel], told
+    code, sure, seen, evidence = _from_photos(thin, shape, views, inputs["labels"], moving, params, report)
+    return code[voxel], sure[voxel], np.where(seen, PHOTO, SHAPE).astype(np.uint8)[voxel], evidence
 
 
 def _from_photos(
@@ -149,11 +151,11 @@ def _from_photos(
     tells = json.loads((labels / "network.json").read_text(encoding="utf-8"))["tells"]
     height, ground = split_ground(thin.xyz)
     moved = moving(thin, height, ground)
-    best, sure = decide(votes, shape, height, moved, thin, low_told="low_vegetation" in tells)
+    best, sure = decide(votes, shape, height, moved, thin, knows_low_vegetation="low_vegetation" in tells)
     seen = votes.weight > 0
-    told = {"seen_share": round(float(seen.mean()), 4), "sky_share": round(votes.sky, 4)}
-    told["moving_share"] = round(float(moved.mean()), 4)
-    return code_of_index()[best], np.round(255 * sure).astype(np.uint8), seen.astype(np.uint8), told
+    evidence = {"seen_share": round(float(seen.mean()), 4), "sky_share": round(votes.sky, 4)}
+    evidence["moving_share"] = round(float(moved.mean()), 4)
+    return code_of_index()[best], np.round(255 * sure).astype(np.uint8), seen.astype(np.uint8), evidence
 
 
 SEGMENT = Step("segment", 8, segment, SegmentParams, memory=(0.5, 6))

@@ -76,7 +76,7 @@ def signs(inputs: Inputs, params: SignsParams, out: Path, report: Report) -> Don
         building, moved = behind(without(building, replaced), found)
         meshes["building"] = with_plates(cleared(building, found), found)
         meshes |= {group: cleared(meshes[group], found) for group in groups if group == "vegetation"}
-        rows = _told(rows, found, moved, meshes["terrain"])
+        rows = _listed(rows, found, moved, meshes["terrain"])
     files = {group: out / f"{group}.npz" for group in groups if group != "terrain"}
     for group, file in files.items():
         meshes[group].save(file)
@@ -143,7 +143,7 @@ def _found(
     return found
 
 
-def _told(
+def _listed(
     rows: Sequence[Mapping[str, Any]], plates: Sequence[Plate], moved: Sequence[F64], terrain: Mesh
 ) -> list[dict[str, Any]]:
     """The list's rows with the plates: those of the pole that each hangs on, or of a sign whose pole isn't known."""

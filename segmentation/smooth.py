@@ -51,7 +51,14 @@ LIKELY: dict[str, dict[str, float]] = {
 
 
 def decide(
-    votes: Votes, shape: U8, height: F32, moved: Bools, cloud: PointCloud, *, low_told: bool, normal_pull: float = 4.0
+    votes: Votes,
+    shape: U8,
+    height: F32,
+    moved: Bools,
+    cloud: PointCloud,
+    *,
+    knows_low_vegetation: bool,
+    normal_pull: float = 4.0,
 ) -> tuple[U8, F32]:
     """Index into `CLASSES` (N,), and its probability (N,).
 
@@ -61,12 +68,12 @@ def decide(
         height: (N,) metres above ground.
         moved: (N,) which points are of moving things (`segmentation.moving`).
         cloud: the points, with normals; colours are used where there are any.
-        low_told: whether the network tells low from high vegetation; else height does.
+        knows_low_vegetation: whether the network tells low from high vegetation; else height does.
         normal_pull: sharpness by which neighbours with other normals count less.
     """
     from scipy.spatial import cKDTree
 
-    unary = evidence(votes, shape, height, moved, low_told=low_told)
+    unary = evidence(votes, shape, height, moved, knows_low_vegetation=knows_low_vegetation)
     k = min(NEIGHBOURS, len(cloud) - 1)
     tree = cKDTree(cloud.xyz)
     _borrow(unary, votes.weight, shape, cloud.xyz)
@@ -96,13 +103,13 @@ def likelihood(shape: U8) -> F32:
     return table[shape]
 
 
-def evidence(votes: Votes, shape: U8, height: F32, moved: Bools, *, low_told: bool) -> F32:
+def evidence(votes: Votes, shape: U8, height: F32, moved: Bools, *, knows_low_vegetation: bool) -> F32:
     """(N, C) logarithms of what photos and shape say of each point, by itself."""
     seen = np.minimum(1.0, votes.weight / ENOUGH)[:, None]
     share = votes.score / np.maximum(votes.weight, 1e-9)[:, None]
     flat = 1.0 / (len(CLASSES) - 1)
     photos = seen * share + (1 - seen) * flat
-    if not low_told:  # a network that knows vegetation alone: height parts it
+    if not knows_low_vegetation:  # a network that knows vegetation alone: height parts it
         low, high = CLASSES.index("low_vegetation"), CLASSES.index("high_vegetation")
         both = photos[:, low] + photos[:, high]
         tall = 1 / (1 + np.exp(-(height - 1.5) / 0.4))

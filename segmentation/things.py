@@ -97,8 +97,8 @@ def decide(
     from scan2sim.segmentation.segment import OWN
 
     assert cloud.classification is not None
-    with np.load(inputs["confidence"]) as told:
-        sure, source = told["confidence"], told["source"]
+    with np.load(inputs["confidence"]) as data:
+        sure, source = data["confidence"], data["source"]
     own = bool(len(source)) and bool((source == OWN).all())
     if own and not np.isin(cloud.classification, _movable()).any():
         return [], cloud.classification
@@ -111,7 +111,7 @@ def decide(
     if cloud.time is not None:
         ordered = cloud.time[order]
         moments = np.minimum.reduceat(ordered, starts), np.maximum.reduceat(ordered, starts)
-    scan = look(cloud.take(first), sure[first], source[first], moving, moments, path)
+    scan = scan_of(cloud.take(first), sure[first], source[first], moving, moments, path)
     report(0.5, "things")
     found = instances.vehicles(scan) + instances.people(scan)
     numbered = [(thing, int(count[thing.index].sum())) for thing in found]
@@ -130,7 +130,7 @@ def decide(
     return numbered, classification
 
 
-def look(thin: PointCloud, sure: U8, source: U8, moving: F32, moments: tuple[F64, F64] | None, path: F64) -> Scan:
+def scan_of(thin: PointCloud, sure: U8, source: U8, moving: F32, moments: tuple[F64, F64] | None, path: F64) -> Scan:
     """What is known of one point a voxel.
 
     Args:
@@ -200,7 +200,7 @@ def _write_list(path: Path, found: Sequence[tuple[Thing, int]], frame: Frame | N
         assert frame is not None
         ring = np.column_stack([thing.corners, np.full(4, thing.centre[2])])
         places = frame.to_crs(np.concatenate([ring, ring[:1]]))
-        told = {
+        properties = {
             "kind": thing.kind,
             "length_m": round(thing.length, 2),
             "width_m": round(thing.width, 2),
@@ -211,7 +211,7 @@ def _write_list(path: Path, found: Sequence[tuple[Thing, int]], frame: Frame | N
             "moved": thing.moved,
             "confidence": round(float(1 / (1 + np.exp(-thing.odds))), 3),
         }
-        features.append((places[:, :2].round(3).tolist(), told))
+        features.append((places[:, :2].round(3).tolist(), properties))
     geojson.write_polygons(path, frame.crs if frame else "local", features)
 
 

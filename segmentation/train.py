@@ -155,7 +155,7 @@ def evaluate(network: StreetNet, check: Sequence[tuple[Path, Path]]) -> dict[str
         seen = np.concatenate([rgb, codes], axis=2).astype(np.float32) / 255
         logits = network(torch.from_numpy(seen).permute(2, 0, 1)[None])
         found = F.interpolate(logits, size=truth.shape, mode="bilinear")[0].argmax(dim=0).numpy()
-        told = truth != IGNORED
-        confusion += np.bincount(truth[told].astype(np.int64) * n + found[told], minlength=n * n).reshape(n, n)
+        labelled = truth != IGNORED
+        confusion += np.bincount(truth[labelled].astype(np.int64) * n + found[labelled], minlength=n * n).reshape(n, n)
     both, either = np.diag(confusion), confusion.sum(axis=0) + confusion.sum(axis=1) - np.diag(confusion)
     return {name: round(float(both[i] / either[i]), 4) for i, name in enumerate(CLASSES) if confusion[i].any()}

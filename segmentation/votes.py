@@ -75,8 +75,8 @@ def vote(
             continue
         depth = depth_map(view.camera, view.T_world_cam, hides, time=view.time, pixels=PIXELS)
         sees = eye(view.camera, view.T_world_cam)
-        told = _ask(score, weight, cloud.xyz, cloud.normal, sees, depth.ranges, np.load(file), _mask(view))
-        seen, sky = seen + int(told[0]), sky + int(told[1])
+        counted = _vote(score, weight, cloud.xyz, cloud.normal, sees, depth.ranges, np.load(file), _mask(view))
+        seen, sky = seen + int(counted[0]), sky + int(counted[1])
     return Votes(score, weight, sky / seen if seen else 0.0)
 
 
@@ -88,7 +88,7 @@ def _mask(view: View) -> np.ndarray:
 
 
 @njit(cache=True, parallel=True)
-def _ask(score, weight, xyz, normals, eye, ranges, labels, mask):  # type: ignore[no-untyped-def]
+def _vote(score, weight, xyz, normals, eye, ranges, labels, mask):  # type: ignore[no-untyped-def]
     """Add a photo's votes in place; returns (points seen, those that it takes for sky)."""
     n, classes = score.shape
     kind = np.zeros(n, np.uint8)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from scan2sim.pipeline.types import F32, F64, U8
-from scan2sim.slam.charts import Charts
+from scan2sim.slam.facets import Facets
 from scan2sim.slam.geometry import exp_so3, inverse, log_so3
 from scan2sim.slam.mapped import Mapped
 from scan2sim.slam.relocalise import Remembered, Seen, describe, relocalise
@@ -35,15 +35,15 @@ LOOP = (0.1, 2e-3)
 class Places:
     """Remembers keyframes."""
 
-    def __init__(self, charts: Charts) -> None:
-        self.charts = charts
+    def __init__(self, facets: Facets) -> None:
+        self.facets = facets
         self.thumbnail: dict[int, F32] = {}
         self.seen: dict[int, Seen] = {}
 
     def __call__(self, keyframe: int, pictures: list[U8]) -> None:
-        """The charts of a keyframe."""
+        """The facets of a keyframe."""
         self.thumbnail[keyframe] = thumbnail(pictures[0])
-        self.seen[keyframe] = describe(self.charts, pictures)
+        self.seen[keyframe] = describe(self.facets, pictures)
 
 
 def thumbnail(picture: U8) -> F32:
@@ -82,7 +82,7 @@ def close(mapped: Mapped, places: Places) -> dict[str, float]:
 def _find(mapped: Mapped, places: Places, poses: F64, way: F64) -> list[tuple[int, int, F64]]:
     """(earlier keyframe, later keyframe, pose (4, 4) of the later in the earlier's axes)."""
     rng = np.random.default_rng(0)
-    around = not places.charts.whole
+    around = not places.facets.whole
     last = -10
     found = []
     for k in sorted(places.seen):

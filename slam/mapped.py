@@ -9,7 +9,7 @@ from typing import Any, Self
 
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.types import F64, Camera, Frame, GpsTrack
-from scan2sim.slam.charts import Charts
+from scan2sim.slam.facets import Facets
 from scan2sim.slam.localmap import Keyframe, Landmarks, LocalMap, MapParams
 from scan2sim.slam.odometry import Odometry, Placed
 from scan2sim.slam.state import WrongState, load, save
@@ -44,7 +44,7 @@ class Mapped:
     def map(self) -> LocalMap:
         """Empty at first: its camera and parameters are read before it."""
         params = MapParams.model_validate(self._params)
-        return LocalMap(self.camera, params, Charts(self.camera).pixel, gps=self.gps, backend=self._solver, keep=True)
+        return LocalMap(self.camera, params, Facets(self.camera).pixel, gps=self.gps, backend=self._solver, keep=True)
 
     @classmethod
     def of(cls, odometry: Odometry, names: Sequence[str]) -> Self:

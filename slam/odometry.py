@@ -18,7 +18,7 @@ from pydantic import Field
 from scan2sim.pipeline.ranges import Seed
 from scan2sim.pipeline.types import F64, U8, Camera, GpsTrack
 from scan2sim.slam import solvers
-from scan2sim.slam.charts import Charts
+from scan2sim.slam.facets import Facets
 from scan2sim.slam.geometry import angles, exp_so3, inverse, log_so3, relative_pose, rigid
 from scan2sim.slam.graph import Graph
 from scan2sim.slam.localmap import Keyframe, LocalMap, MapParams, gps_distance
@@ -97,20 +97,20 @@ class Odometry:
             warn: receives what went wrong, and when.
         """
         self.params, self.gps, self.warn = params, gps, warn
-        self.charts = Charts(camera)
-        self.tracker = tracker or tracker_named("corners", self.charts, mask, params.count)
-        self.map = LocalMap(camera, params, self.charts.pixel, gps=gps, backend=backend, keep=keep)
+        self.facets = Facets(camera)
+        self.tracker = tracker or tracker_named("corners", self.facets, mask, params.count)
+        self.map = LocalMap(camera, params, self.facets.pixel, gps=gps, backend=backend, keep=keep)
         self.placed: list[Placed] = []
         self._backend, self._rng = backend, np.random.default_rng(params.seed)
-        self._masks = None if mask is None else self.charts.pictures(mask)
+        self._masks = None if mask is None else self.facets.pictures(mask)
         self._pose, self._time = np.eye(4), 0.0
         self._velocity = np.zeros(6)
         self._started = self._blind = False
-        self._parallax = math.radians(params.parallax or (1.0 if self.charts.whole else 3.0))
+        self._parallax = math.radians(params.parallax or (1.0 if self.facets.whole else 3.0))
         self._waiting = 0  # frames since the first keyframe of a map, or since the car moved
         self._settled = 0
         self._lost_at: float | None = None
-        self._memory: list[tuple[list[U8], F64]] = []  # charts and poses of the last good keyframes
+        self._memory: list[tuple[list[U8], F64]] = []  # facets and poses of the last good keyframes
         self._known: tuple[float, list[Remembered]] | None = None
 
     # each frame
@@ -118,7 +118,7 @@ class Odometry:
     def add(self, time: float, grey: U8) -> None:
         """The next frame (H, W), `time` in seconds, later than the last."""
         guess = self._predicted(time)
-        self.tracker.look(grey, self._expected(guess))
+        self.tracker.track(grey, self._expected(guess))
         if not self.map.keyframes:
             self._time = time
             self._begin(time, np.eye(4))
@@ -338,8 +338,8 @@ class Odometry:
             return None
         if self._known is None:
             few = (self._memory[-1], self._memory[max(0, len(self._memory) - 3)])
-            self._known = time, [Remembered(describe(self.charts, c, self._masks), pose) for c, pose in few]
-        now = describe(self.charts, self.tracker.pictures, self._masks)
+            self._known = time, [Remembered(describe(self.facets, c, self._masks), pose) for c, pose in few]
+        now = describe(self.facets, self.tracker.pictures, self._masks)
         found = relocalise(now, *self._known[1], sigma=self.map.sigma, rng=self._rng)
         if found is not None:
             self.warn(f"{time:.2f} s: recognised the place")

@@ -1,6 +1,6 @@
 """Relocalise: where a frame is, from two keyframes that were seen before, by descriptors, whatever lies between.
 
-ORB on the charts of the sphere; what both keyframes see becomes points, what the frame sees of them places it.
+ORB on the facets of the sphere; what both keyframes see becomes points, what the frame sees of them places it.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from scan2sim.pipeline.types import F64, U8
-from scan2sim.slam.charts import Charts
+from scan2sim.slam.facets import Facets
 from scan2sim.slam.geometry import angles, epipolar_errors, essential, inverse, relative_pose, rigid, triangulate
 from scan2sim.slam.graph import Graph
 from scan2sim.slam.solvers import lm
@@ -38,19 +38,19 @@ class Remembered:
     T_world_cam: F64
 
 
-def describe(charts: Charts, pictures: list[U8], masks: list[U8] | None = None) -> Seen:
-    """ORB features of a frame's charts."""
+def describe(facets: Facets, pictures: list[U8], masks: list[U8] | None = None) -> Seen:
+    """ORB features of a frame's facets."""
     import cv2
 
     orb = cv2.ORB_create(FEATURES, fastThreshold=7)
     bearings, descriptors = [np.zeros((0, 3))], [np.zeros((0, 32), np.uint8)]
-    for chart, picture in enumerate(pictures):
-        points, found = orb.detectAndCompute(picture, None if masks is None else masks[chart])
+    for facet, picture in enumerate(pictures):
+        points, found = orb.detectAndCompute(picture, None if masks is None else masks[facet])
         if found is None:
             continue
-        bearing = charts.bearings(chart, np.array([p.pt for p in points]))
+        bearing = facets.bearings(facet, np.array([p.pt for p in points]))
         good = np.isfinite(bearing[:, 0])
-        good[good] = charts.place(bearing[good]) == chart
+        good[good] = facets.place(bearing[good]) == facet
         bearings.append(bearing[good])
         descriptors.append(found[good])
     return Seen(np.concatenate(bearings), np.concatenate(descriptors))

@@ -55,20 +55,20 @@ def load(path: Path, root: Any, values: Sequence[type]) -> None:
 
 
 def _state(part: Any, values: Sequence[type], data: bytearray) -> dict[str, Any]:
-    told = {name: _told(getattr(part, name), values, data) for name in part.STATE}
+    tree = {name: _encoded(getattr(part, name), values, data) for name in part.STATE}
     below = {name: getattr(part, name) for name in getattr(part, "PARTS", ())}
-    return told | {name: _state(value, values, data) for name, value in below.items() if hasattr(value, "STATE")}
+    return tree | {name: _state(value, values, data) for name, value in below.items() if hasattr(value, "STATE")}
 
 
-def _restore(part: Any, told: dict[str, Any], known: dict[str, type], data: bytes) -> None:
+def _restore(part: Any, tree: dict[str, Any], known: dict[str, type], data: bytes) -> None:
     for name in part.STATE:
-        setattr(part, name, _value(told[name], known, data))
+        setattr(part, name, _decoded(tree[name], known, data))
     for name in getattr(part, "PARTS", ()):
         if hasattr(getattr(part, name), "STATE"):
-            _restore(getattr(part, name), told[name], known, data)
+            _restore(getattr(part, name), tree[name], known, data)
 
 
-def _told(value: Any, values: Sequence[type], data: bytearray) -> Any:
+def _encoded(value: Any, values: Sequence[type], data: bytearray) -> Any:
     """JSON of a value; what an array holds is appended to `data`."""
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
@@ -80,32 +80,32 @@ def _told(value: Any, values: Sequence[type], data: bytearray) -> Any:
     if isinstance(value, np.random.Generator):
         return {"random": value.bit_generator.state}
     if isinstance(value, dict):
-        return {"dict": [[key, _told(one, values, data)] for key, one in value.items()]}
+        return {"dict": [[key, _encoded(one, values, data)] for key, one in value.items()]}
     if type(value) in values:
         names = getattr(value, "_fields", None) or value.__dataclass_fields__
-        return {"kind": type(value).__name__} | {name: _told(getattr(value, name), values, data) for name in names}
+        return {"kind": type(value).__name__} | {name: _encoded(getattr(value, name), values, data) for name in names}
     if type(value) in (list, tuple):
-        told = [_told(one, values, data) for one in value]
-        return told if isinstance(value, list) else {"tuple": told}
+        tree = [_encoded(one, values, data) for one in value]
+        return tree if isinstance(value, list) else {"tuple": tree}
     raise TypeError(f"{type(value).__name__} is no part of a state")
 
 
-def _value(told: Any, known: dict[str, type], data: bytes) -> Any:
+def _decoded(tree: Any, known: dict[str, type], data: bytes) -> Any:
     """The value of its JSON."""
-    if isinstance(told, list):
-        return [_value(one, known, data) for one in told]
-    if not isinstance(told, dict):
-        return told
-    if "array" in told:
-        dtype, shape = np.dtype(told["array"]), told["shape"]
+    if isinstance(tree, list):
+        return [_decoded(one, known, data) for one in tree]
+    if not isinstance(tree, dict):
+        return tree
+    if "array" in tree:
+        dtype, shape = np.dtype(tree["array"]), tree["shape"]
         size = dtype.itemsize * int(np.prod(shape))
-        return np.frombuffer(data[told["end"] - size : told["end"]], dtype).reshape(shape).copy()
-    if "random" in told:
+        return np.frombuffer(data[tree["end"] - size : tree["end"]], dtype).reshape(shape).copy()
+    if "random" in tree:
         generator = np.random.default_rng()
-        generator.bit_generator.state = told["random"]
+        generator.bit_generator.state = tree["random"]
         return generator
-    if "dict" in told:
-        return {key: _value(one, known, data) for key, one in told["dict"]}
-    if "tuple" in told:
-        return tuple(_value(one, known, data) for one in told["tuple"])
-    return known[told["kind"]](**{name: _value(one, known, data) for name, one in told.items() if name != "kind"})
+    if "dict" in tree:
+        return {key: _decoded(one, known, data) for key, one in tree["dict"]}
+    if "tuple" in tree:
+        return tuple(_decoded(one, known, data) for one in tree["tuple"])
+    return known[tree["kind"]](**{name: _decoded(one, known, data) for name, one in tree.items() if name != "kind"})

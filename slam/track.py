@@ -18,7 +18,7 @@ from scan2sim.slam.odometry import Odometry, Placed
 from scan2sim.slam.relocalise import Remembered, Seen
 from scan2sim.slam.state import WrongState, load, save
 from scan2sim.slam.trackers import Tracks
-from scan2sim.slam.trackers.descriptors import SeenInChart
+from scan2sim.slam.trackers.descriptors import SeenInFacet
 from scan2sim.slam.video import Video
 
 VERSION = 1
@@ -26,7 +26,7 @@ VERSION = 1
 interrupted run or a trajectory that is kept, is begun anew then."""
 KEEP_EVERY = 60.0
 """Seconds between states kept."""
-VALUES = (Found, Keyframe, Landmarks, Placed, Remembered, Seen, SeenInChart, Tracks)
+VALUES = (Found, Keyframe, Landmarks, Placed, Remembered, Seen, SeenInFacet, Tracks)
 """What states consist of."""
 
 

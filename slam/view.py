@@ -118,7 +118,7 @@ class Recorder:
         rows, known = map_.landmarks.find(tracks.ids)
         inliers = 0
         if len(tracks):
-            camera = odometry.charts.camera
+            camera = odometry.facets.camera
             uv, ok = project(camera, tracks.bearing)
             # sixteenths of pixels, as cv2 draws them
             place = np.round(16 * ((uv + 0.5) * [width / camera.width, height / camera.height] - 0.5))

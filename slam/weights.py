@@ -67,8 +67,8 @@ class Weights:
     def describe(self) -> str:
         """What is used: file, model, hash, licence."""
         known = self.model.published.get(self.sha256)
-        told = f"as published ({known})" if known else "not a file known to the project"
-        return f"{self.path.name}: {self.model.name}, SHA-256 {self.sha256}, {told}; licence: {self.model.licence}"
+        origin = f"as published ({known})" if known else "not a file known to the project"
+        return f"{self.path.name}: {self.model.name}, SHA-256 {self.sha256}, {origin}; licence: {self.model.licence}"
 
 
 def torch_device(device: str) -> str:
@@ -122,14 +122,14 @@ def _renamed(state: dict[str, Any], model: Model) -> dict[str, Any]:
 
 def _faults(state: dict[str, Any], model: Model) -> list[str]:
     """What speaks against a file's being of a model."""
-    told = {name: tuple(value.shape) for name, value in _renamed(state, model).items()}
-    faults = [f"{name} is missing" for name in model.shapes if name not in told]
+    shapes = {name: tuple(value.shape) for name, value in _renamed(state, model).items()}
+    faults = [f"{name} is missing" for name in model.shapes if name not in shapes]
     faults += [
-        f"{name} is {_size(told[name])}, not {_size(shape)}"
+        f"{name} is {_size(shapes[name])}, not {_size(shape)}"
         for name, shape in model.shapes.items()
-        if name in told and told[name] != shape
+        if name in shapes and shapes[name] != shape
     ]
-    strays = [name for name in told if name not in model.shapes and not re.fullmatch(model.optional, name)]
+    strays = [name for name in shapes if name not in model.shapes and not re.fullmatch(model.optional, name)]
     return faults + [f"{name} is unknown" for name in strays]
 
 

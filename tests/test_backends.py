@@ -116,7 +116,7 @@ Add = Callable[[ModuleType, str, str], None]
 def test_a_network_is_one_file(add: Add) -> None:
     from scan2sim.pipeline.types import Camera
     from scan2sim.segmentation.label import LABEL
-    from scan2sim.segmentation.photos import Labeller, labels_of
+    from scan2sim.segmentation.photos import Classifier, class_map
 
     add(networks, "allroad", """
 import numpy as np
@@ -135,10 +135,10 @@ def load(weights, device):
 """)  # fmt: skip
     assert LABEL.check is not None
     LABEL.check(LABEL.params.of("label", {"network": "allroad"}))
-    labeller = Labeller(networks.load("allroad", None), "allroad")
+    classifier = Classifier(networks.load("allroad", None), "allroad")
     seen = np.zeros((48, 64, 3), np.uint8)
     camera = Camera("pinhole", 64, 48, 50.0, 50.0, 31.5, 23.5)
-    best, _ = labels_of(labeller.probabilities(seen, camera, None), (48, 64))
+    best, _ = class_map(classifier.probabilities(seen, camera, None), (48, 64))
     assert best.shape == (48, 64) and len(np.unique(best)) == 1
 
 
@@ -167,9 +167,9 @@ def load(weights, count, upsample, device):
     grey = np.random.default_rng(0).integers(0, 255, (60, 80), np.uint8).repeat(4, 0).repeat(4, 1)
     camera = Camera("pinhole", 320, 240, 200.0, 200.0, 159.5, 119.5)
     tracker, _ = tracker_of(camera, None, TrackParams.model_validate({"count": 100, "features": "blobs"}), {})
-    tracker.look(grey)
+    tracker.track(grey)
     assert tracker.refill() > 50
-    assert tracker.look(grey) > 0.9
+    assert tracker.track(grey) > 0.9
 
 
 def test_an_export_format_is_one_file(add: Add, tmp_path: Path) -> None:

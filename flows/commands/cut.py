@@ -25,9 +25,9 @@ def tile(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a survey that is there already.")] = False,
 ) -> None:
     """Cut a long corridor into tiles that overlap: a survey."""
-    told: list[str] = []
+    warnings: list[str] = []
     with progress("tile") as report:
-        path = cut_survey(corridor, out, params, name=name, overwrite=overwrite, report=report, warn=told.append)
-    for warning in told:
+        path = cut_survey(corridor, out, params, name=name, overwrite=overwrite, report=report, warn=warnings.append)
+    for warning in warnings:
         typer.secho(f"warning: {warning}", fg="yellow", err=True)
     typer.echo(f"Survey: {path}")

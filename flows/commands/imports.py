@@ -83,13 +83,13 @@ def _import_model(kind: str, about: str) -> None:
         overwrite: Overwrite = False,
     ) -> None:
 
-        told: list[str] = []
+        warnings: list[str] = []
         with progress("import") as report:
             path = import_model(
                 kind, model, images, out, cloud=cloud, crs=crs, gps=gps, up="photos" if upright else None, scale=scale,
-                classes=parse(classes), name=name, link=link, overwrite=overwrite, warn=told.append, report=report,
+                classes=parse(classes), name=name, link=link, overwrite=overwrite, warn=warnings.append, report=report,
             )  # fmt: skip
-        _imported(path, told)
+        _imported(path, warnings)
 
     app.command(kind, help=about)(command)
 
@@ -126,14 +126,14 @@ def import_plain_clouds(
     overwrite: Overwrite = False,
 ) -> None:
     """Plain clouds, with a CSV of photos if there are any."""
-    told: list[str] = []
+    warnings: list[str] = []
     with progress("import") as report:
         path = import_las(
             clouds, out, photos=photos, cameras=cameras, images=images, crs=crs, units=units, trajectory=trajectory,
             classes=parse(classes), orthophoto=orthophoto, footprints=footprints, name=name, link=link,
-            overwrite=overwrite, warn=told.append, report=report,
+            overwrite=overwrite, warn=warnings.append, report=report,
         )  # fmt: skip
-    _imported(path, told)
+    _imported(path, warnings)
 
 
 @app.command("sweeps")
@@ -147,13 +147,13 @@ def import_sweeps_and_poses(
     overwrite: Overwrite = False,
 ) -> None:
     """A scanner's sweeps placed by a trajectory, with photos if there are any."""
-    told: list[str] = []
+    warnings: list[str] = []
     with progress("import") as report:
         path = tile_of(
-            sweeps.inputs(Path()), sweeps.params(), out, link=link, overwrite=overwrite, name=name, warn=told.append,
-            report=report,
+            sweeps.inputs(Path()), sweeps.params(), out, link=link, overwrite=overwrite, name=name,
+            warn=warnings.append, report=report,
         )  # fmt: skip
-    _imported(path, told)
+    _imported(path, warnings)
 
 
 def _imported(path: Path, warnings: Sequence[str] = ()) -> None:

@@ -31,7 +31,7 @@ from scan2sim.segmentation.backends import load
 from scan2sim.segmentation.label import LABEL
 from scan2sim.segmentation.labelled import pairs, read, read_channels
 from scan2sim.segmentation.labels import CLASSES, IGNORED, code_of_index
-from scan2sim.segmentation.photos import Labeller, labels_of
+from scan2sim.segmentation.photos import Classifier, class_map
 from scan2sim.segmentation.score import confusion
 from scan2sim.segmentation.segment import OWN, SHAPE
 from scan2sim.segmentation.things import THINGS
@@ -107,13 +107,13 @@ def segment_tile(path: Path, out: Path, settings: Settings) -> None:
             for label, manifest in done.items()
             for name, file in manifest.files.items()
         }
-        told, own = (
+        predicted, own = (
             PointCloud.load(files[last, "cloud"]).classification,
             PointCloud.load(files["carve", "cloud"]).classification,
         )
-        assert told is not None
+        assert predicted is not None
         with np.load(files["segment", "confidence"]) as beside:
-            columns = told, beside["confidence"], beside["source"]
+            columns = predicted, beside["confidence"], beside["source"]
             dropped = np.load(files["carve", "dropped"])
             if len(dropped):
                 kept = done["segment"].facts["source"] == "cloud"
@@ -125,21 +125,21 @@ def segment_tile(path: Path, out: Path, settings: Settings) -> None:
     show_warnings(done)
     console.print(json.dumps(done["segment"].facts, indent=1), highlight=False, markup=False)
     if own is not None and done["segment"].facts["source"] != "cloud" and done["segment"].facts["own_classes"] > 0:
-        console.print(confusion(own, told).table(), highlight=False, markup=False, soft_wrap=True)
+        console.print(confusion(own, predicted).table(), highlight=False, markup=False, soft_wrap=True)
     console.print(f"Clouds: {out / 'classified'}", highlight=False, soft_wrap=True, markup=False)
 
 
-def _of_all(dropped: U8, own: U8 | None, told: U8, sure: U8, source: U8) -> tuple[U8, U8, U8]:
+def _of_all(dropped: U8, own: U8 | None, predicted: U8, sure: U8, source: U8) -> tuple[U8, U8, U8]:
     """Classes of all points, how sure they are and where from, with those that `carve` has dropped.
 
     Args:
         dropped: (N,) uint8, 0 where a point is kept, else what it is for `carve`.
         own: (N,) the cloud's own classes, where they are kept, or None.
-        told, sure, source: (K,) of those kept.
+        predicted, sure, source: (K,) of those kept.
     """
     kept = dropped == 0
     codes = dropped.copy() if own is None else own
-    codes[kept] = told
+    codes[kept] = predicted
     all_sure = np.full(len(kept), 255, np.uint8)
     all_sure[kept] = sure
     sources = np.full(len(kept), SHAPE if own is None else OWN, np.uint8)
@@ -167,7 +167,7 @@ def _write_pictures(views: Path, labels: Path, out: Path) -> None:
         folder.mkdir(exist_ok=True)
     for i, view in enumerate(views_io.load(views)):
         if (labels / f"{i}.npy").is_file():
-            best, _ = labels_of(np.load(labels / f"{i}.npy"), (view.camera.height, view.camera.width))
+            best, _ = class_map(np.load(labels / f"{i}.npy"), (view.camera.height, view.camera.width))
             name = f"{Path(view.name).stem}.png"
             image.write(out / "labels" / name, code_of_index()[best])
             image.write(out / "masks" / name, np.where(away[best], 0, 255).astype(np.uint8))
@@ -210,20 +210,20 @@ def _pixels(folder: Path, settings: Settings) -> dict[str, float]:
     """Intersection over union of a network's pixels, by class; photos taken as they are, with channels if there are."""
     given = settings.params(LABEL)
     network = load(given.network, given.weights, given.device)
-    labeller = Labeller(network, str(given.weights or network.facts.name))
+    classifier = Classifier(network, str(given.weights or network.facts.name))
     resolution = network.facts.pixels_a_radian or 1.0
-    known, told = [], []
+    known, predicted = [], []
     for pair in pairs(folder):
         rgb, truth = read(*pair)
         h, w = truth.shape
         camera = Camera("pinhole", w, h, resolution, resolution, (w - 1) / 2, (h - 1) / 2)
-        best, _ = labels_of(labeller.probabilities(rgb, camera, read_channels(pair[0], (h, w))), (h, w))
+        best, _ = class_map(classifier.probabilities(rgb, camera, read_channels(pair[0], (h, w))), (h, w))
         some = truth != IGNORED
         known.append(truth[some])
-        told.append(best[some])
+        predicted.append(best[some])
     codes = code_of_index()
     codes[CLASSES.index("sky")] = 255  # a code of its own: 0 says unknown
-    found = confusion(codes[np.concatenate(known)], codes[np.concatenate(told)]).iou
+    found = confusion(codes[np.concatenate(known)], codes[np.concatenate(predicted)]).iou
     return {("sky" if name == "255" else name): value for name, value in found.items()}
 
 

@@ -39,16 +39,16 @@ def execute_shown(
         jobs = jobs or default_jobs()
         outcome = execute(planned, store, jobs=jobs, watch=watch, to_the_end=to_the_end, memory=memory)
     for node, manifest in outcome.done.items():
-        told = [manifest.facts["told"]] if "told" in manifest.facts else []
-        for line in told + [f"warning: {text}" for text in manifest.warnings]:
+        lines = [manifest.facts["told"]] if "told" in manifest.facts else []
+        for line in lines + [f"warning: {text}" for text in manifest.warnings]:
             log.write(f"{node}: {line}")
     return outcome
 
 
 def show_results(world: Path, report: Path) -> None:
     """Where the world and the report are, and how to open them, on the screen."""
-    told = [*gazebo.lines(world), f"Report: {report}"]
-    console.print("\n".join(told), highlight=False, soft_wrap=True, markup=False)
+    lines = [*gazebo.lines(world), f"Report: {report}"]
+    console.print("\n".join(lines), highlight=False, soft_wrap=True, markup=False)
 
 
 def show_findings(done: Mapping[str, Manifest]) -> None:

@@ -53,7 +53,7 @@ def dispatch(
                 break
             front.take(item)
             running[item.node.id] = (item, submit(item))
-            running[item.node.id][1].add_done_callback(partial(_tell, ended, item.node.id))
+            running[item.node.id][1].add_done_callback(partial(_notify, ended, item.node.id))
         if running:
             item, future = running.pop(ended.get())
             try:
@@ -75,7 +75,7 @@ def dispatch(
     return front.outcome
 
 
-def _tell(ended: SimpleQueue[NodeId], node: NodeId, _: object) -> None:
+def _notify(ended: SimpleQueue[NodeId], node: NodeId, _: object) -> None:
     ended.put(node)
 
 

@@ -77,13 +77,13 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
     """
     settings.check(STEPS)
     graph = _Graph(tile, settings, beside)
-    told = graph.classes()
+    evidence = graph.classes()
     graph.parts(graph.whole())
-    made = graph.made_up(told)
+    made = graph.made_up(evidence)
     for group in graph.groups:
         graph.surface(group, made.get(group, {}))
     lists = graph.places()
-    surfaces, seen = graph.photos(told, lists)
+    surfaces, seen = graph.photos(evidence, lists)
     textured = graph.textures(surfaces, seen, made)
     graph.results(surfaces, textured, seen, lists, made)
     return graph.nodes
@@ -153,12 +153,12 @@ class _Graph:
         photos: Sources = {f"photo.{i}": view.photo for i, view in enumerate(tile.views)}
         masks: Sources = {f"mask.{i}": view.mask for i, view in enumerate(tile.views) if view.mask}
         add(VIEWS, photos | masks | whole, poses=tuple(views_io.to_json(view, with_paths=False) for view in tile.views))
-        told: Sources = {}
+        evidence: Sources = {}
         if self.photographed:
             add(LABEL, whole | self._views() | _weights(self.settings), **_kept(self.settings))
-            told = {**self._views(), **self._moving(), "labels": at(LABEL, "labels")}
-        add(SEGMENT, whole | self.scanner | told)
-        return told
+            evidence = {**self._views(), **self._moving(), "labels": at(LABEL, "labels")}
+        add(SEGMENT, whole | self.scanner | evidence)
+        return evidence
 
     def _views(self) -> Sources:
         return {"views": self.at(VIEWS, "views")}
@@ -203,7 +203,7 @@ class _Graph:
         for part in self.parted:
             self.add(VOXEL, {"cloud": self.at(SPLIT, part)} | self.scanner, part)
 
-    def made_up(self, told: Sources) -> dict[str, Sources]:
+    def made_up(self, evidence: Sources) -> dict[str, Sources]:
         """Points that no scanner saw: ground below what hid it, walls below roofs and above its reach; by class."""
         made: dict[str, Sources] = {}
         when = self.settings.params(GROUND).when
@@ -218,7 +218,7 @@ class _Graph:
             below |= {"footprints": self.tile.footprints} if self.tile.footprints else {}
             made["building"] = self._make_up(WALLS, ("building", "terrain"), below)
         if self.rays and self.photographed and "building" not in made and self.settings.params(FACADES).when == "auto":
-            shown = {name: told[name] for name in ("views", "labels")}
+            shown = {name: evidence[name] for name in ("views", "labels")}
             size = self.settings.params(VOXEL, "building").size
             clouds = {"cloud": self.at(VOXEL, "cloud", "building")} | self._beside("building")
             self.add(FACADES, clouds | self.rays | shown, voxel=size, **self.cell)
@@ -280,7 +280,7 @@ class _Graph:
             lists |= {"plants": self.at(PLANTS, "geojson"), "plants_csv": self.at(PLANTS, "csv")}
         return lists
 
-    def photos(self, told: Sources, lists: Sources) -> tuple[Sources, Sources]:
+    def photos(self, evidence: Sources, lists: Sources) -> tuple[Sources, Sources]:
         """What photos see of the meshes, and how well they agree; signs are fitted to them, and listed in `lists`.
 
         Returns:
@@ -294,7 +294,7 @@ class _Graph:
             seen = {"views": at(REFINE, "views")}
         if self.photographed and self.standing and self.settings.params(SIGNS).when == "auto":
             plates = {name: self.standing[name] for name in ("plates", "geojson")}
-            add(SIGNS, _meshes(surfaces) | plates | seen | {"labels": told["labels"]}, **self.cell)
+            add(SIGNS, _meshes(surfaces) | plates | seen | {"labels": evidence["labels"]}, **self.cell)
             surfaces |= {group: at(SIGNS, group) for group in self.groups if group in ("building", "vegetation")}
             lists |= {"furniture": at(SIGNS, "geojson"), "furniture_csv": at(SIGNS, "csv")}
         add(VISIBILITY, _meshes(surfaces) | clouds | self._moving() | seen)

@@ -50,8 +50,8 @@ class Finding:
 def findings(done: Mapping[str, Manifest]) -> list[Finding]:
     """All findings of a run, worst first; those of a level and weight in the order of the steps."""
     facts = {label: manifest.facts for label, manifest in done.items()}
-    told = (_cameras, _held_out, _unseen, _remains, _moved, _disagreeing)
-    found = [one for tell in told for one in tell(facts)]
+    checks = (_cameras, _held_out, _unseen, _remains, _moved, _disagreeing)
+    found = [one for check in checks for one in check(facts)]
     found += [Finding("note", label, text) for label, manifest in done.items() for text in manifest.warnings]
     return sorted(found, key=lambda one: (LEVELS.index(one.level), -one.weight))
 

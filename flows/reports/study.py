@@ -88,8 +88,8 @@ def _markdown(tables: Tables) -> str:
     for rate in rates:
         for bitrate in bitrates:
             row = [results.get(Cell(height, bitrate, rate)) for height in heights]
-            told = [_told(result, key) for key, _ in errors for result in row]
-            lines.append(f"| {rate:g} | {bitrate:g} | {' | '.join(told)} |")
+            figures = [_cell(result, key) for key, _ in errors for result in row]
+            lines.append(f"| {rate:g} | {bitrate:g} | {' | '.join(figures)} |")
     reasons: dict[str, list[str]] = {}
     for cell in cells:
         if cell in results and results[cell].reason:
@@ -121,7 +121,7 @@ def _axes(cells: Sequence[Cell]) -> tuple[list[int], list[float], list[float]]:
     return heights, bitrates, sorted({c.rate for c in cells}, reverse=True)
 
 
-def _told(result: Result | None, key: str) -> str:
+def _cell(result: Result | None, key: str) -> str:
     if result is None:
         return "…"
     value = None if result.reason else result.figures.get(key)
@@ -143,14 +143,14 @@ def _csv(cells: Sequence[Cell], results: Mapping[Cell, Result]) -> str:
 
 
 def _plot(file: Path, segment: float, cells: Sequence[Cell], results: Mapping[Cell, Result]) -> None:
-    """Write a PNG: errors against bit rate, a line a resolution, a row of charts a frame rate."""
+    """Write a PNG: errors against bit rate, a line a resolution, a row of panels a frame rate."""
     from matplotlib.figure import Figure
 
     heights, bitrates, rates = _axes(cells)
     figure = Figure(figsize=(12, 1 + 4 * len(rates)), dpi=110, layout="constrained")
-    charts = figure.subplots(len(rates), 2, squeeze=False, sharex=True, sharey="col")
+    panels = figure.subplots(len(rates), 2, squeeze=False, sharex=True, sharey="col")
     colours = ["#9cc4e4", "#3f8fd2", "#1f5fbf", "#0b2f6b", "#c2410c", "#f0a818"]
-    for rate, row in zip(rates, charts, strict=True):
+    for rate, row in zip(rates, panels, strict=True):
         for (key, title), axes in zip(_errors(segment), row, strict=True):
             for k, height in enumerate(heights):
                 found = [(b, results.get(Cell(height, b, rate))) for b in bitrates]
@@ -167,7 +167,7 @@ def _plot(file: Path, segment: float, cells: Sequence[Cell], results: Mapping[Ce
             axes.set_xlim(min(bitrates) / 1.2, max(bitrates) * 1.2)
             axes.grid(alpha=0.3)
             axes.legend()
-    for axes in charts[-1]:
+    for axes in panels[-1]:
         axes.set_xlabel("Mbit/s asked for")
         axes.set_ylim(bottom=0)  # all that share this axis have drawn
     with replacing(file) as fresh:

@@ -178,10 +178,10 @@ def _borders(tiles: Sequence[TileState]) -> list[dict[str, Any]]:
     for tile in tiles:
         for border in tile.borders:
             pair = tuple(sorted((tile.name, border["neighbour"])))
-            told = found.setdefault(pair, {"tiles": list(pair)})
+            worst = found.setdefault(pair, {"tiles": list(pair)})
             for key, value in border.items():
                 if key != "neighbour" and value is not None:
-                    told[key] = max(told.get(key, value), value)
+                    worst[key] = max(worst.get(key, value), value)
     return sorted(found.values(), key=lambda b: (b.get("gap_m", 0), b.get("colour_step", 0)), reverse=True)
 
 
@@ -198,7 +198,7 @@ def _render(body: Mapping[str, Any], tiles: Sequence[TileState], path: F64, open
         body=body,
         tiles=ordered,
         map=_map(tiles, path),
-        warnings=sorted(warnings.items(), key=lambda told: (-told[1], told[0])),
+        warnings=sorted(warnings.items(), key=lambda item: (-item[1], item[0])),
         thumbnails={tile.name: _thumbnail(tile.thumbnail) for tile in tiles if tile.thumbnail},
         groups=SURFACES,
         gazebo=opened,

@@ -40,7 +40,7 @@ def write_report(
         if label in done:
             folder = store.folder(label, keys[label]) / done[label].files[name]
             entries = json.loads((folder / "index.json").read_text(encoding="utf-8"))
-            shown = telling(entries, done[label].facts["photos"]) if name == "error" else entries
+            shown = representative(entries, done[label].facts["photos"]) if name == "error" else entries
             pictures += [_with_pixels(entry, folder) for entry in shown]
     page = out / "report.html"
     view = done["preview"].facts if "preview" in done and done["preview"].files else None
@@ -81,7 +81,7 @@ def figures(tile: Tile, done: Mapping[str, Manifest]) -> dict[str, Any]:
     }
 
 
-def telling(entries: Sequence[Picture], scores: Mapping[str, Mapping[str, float]]) -> list[Picture]:
+def representative(entries: Sequence[Picture], scores: Mapping[str, Mapping[str, float]]) -> list[Picture]:
     """Of the error pictures the worst, the median and the best by `psnr_gain_db`, which `scores` gives by title."""
     ordered = sorted(entries, key=lambda entry: scores[entry["title"]]["psnr_gain_db"])
     if len(ordered) < 3:

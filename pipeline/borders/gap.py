@@ -59,16 +59,16 @@ def gap(a: Mesh, b: Mesh, cell: Cell, neighbour: str) -> Gap:
     distance, length = np.concatenate(
         [_apart(sides[0], sides[1], known[1]), _apart(sides[1], sides[0], known[0])], axis=1
     )
-    met = distance <= COUNTERPART
+    paired = distance <= COUNTERPART
     edges = len(sides[0]) + len(sides[1])
     return Gap(
         length_m=sum(lengths) / 2,
-        one_sided_m=float(length[~met].sum()),
+        one_sided_m=float(length[~paired].sum()),
         shared=2 * len(known[0] & known[1]) / edges if edges else 1.0,
-        max_m=float(distance[met].max(initial=0.0)),
-        p99_m=float(np.percentile(distance[met], 99)) if met.any() else 0.0,
-        mean_m=float(np.average(distance[met], weights=length[met])) if met.any() else 0.0,
-        crack_m2=float((distance * length)[met].sum() / 2),
+        max_m=float(distance[paired].max(initial=0.0)),
+        p99_m=float(np.percentile(distance[paired], 99)) if paired.any() else 0.0,
+        mean_m=float(np.average(distance[paired], weights=length[paired])) if paired.any() else 0.0,
+        crack_m2=float((distance * length)[paired].sum() / 2),
         overlap_m=overlap,
     )
 

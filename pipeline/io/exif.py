@@ -16,15 +16,15 @@ def place(photo: Path) -> tuple[float, float, float | None] | None:
 
     try:
         with Image.open(photo) as image:
-            told = image.getexif().get_ifd(GPS)
-        latitude = _degrees(told[LATITUDE]) * (-1 if str(told.get(LATITUDE_REF, "N")).upper().startswith("S") else 1)
-        longitude = _degrees(told[LONGITUDE]) * (-1 if str(told.get(LONGITUDE_REF, "E")).upper().startswith("W") else 1)
+            tags = image.getexif().get_ifd(GPS)
+        latitude = _degrees(tags[LATITUDE]) * (-1 if str(tags.get(LATITUDE_REF, "N")).upper().startswith("S") else 1)
+        longitude = _degrees(tags[LONGITUDE]) * (-1 if str(tags.get(LONGITUDE_REF, "E")).upper().startswith("W") else 1)
     except Exception:  # Pillow's parsers raise whatever damage leads to; a photo without a position is no error
         return None
     null = latitude == 0 and longitude == 0  # what devices write that have no fix
     if null or not (abs(latitude) <= 84 and abs(longitude) <= 180):
         return None
-    return latitude, longitude, _altitude(told)
+    return latitude, longitude, _altitude(tags)
 
 
 def _degrees(value: Any) -> float:
@@ -32,10 +32,10 @@ def _degrees(value: Any) -> float:
     return degrees + minutes / 60 + seconds / 3600
 
 
-def _altitude(told: Any) -> float | None:
+def _altitude(tags: Any) -> float | None:
     try:
-        altitude = float(told[ALTITUDE])
+        altitude = float(tags[ALTITUDE])
     except (KeyError, TypeError, ValueError, ZeroDivisionError):
         return None
-    below = told.get(ALTITUDE_REF) in (1, b"\x01")
+    below = tags.get(ALTITUDE_REF) in (1, b"\x01")
     return (-altitude if below else altitude) if math.isfinite(altitude) else None

@@ -12,12 +12,12 @@ Place = Sequence[float]
 
 def write_points(path: Path, crs: str, features: Sequence[tuple[Place, Mapping[str, Any]]]) -> None:
     """Write features, each its (x, y, z) in `crs` and its properties."""
-    _write(path, crs, [("Point", list(place), told) for place, told in features])
+    _write(path, crs, [("Point", list(place), properties) for place, properties in features])
 
 
 def write_polygons(path: Path, crs: str, features: Sequence[tuple[Sequence[Place], Mapping[str, Any]]]) -> None:
     """Write features, each its ring of places in `crs`, the first again at the end, and its properties."""
-    _write(path, crs, [("Polygon", [[list(place) for place in ring]], told) for ring, told in features])
+    _write(path, crs, [("Polygon", [[list(place) for place in ring]], properties) for ring, properties in features])
 
 
 def _write(path: Path, crs: str, features: Sequence[tuple[str, Any, Mapping[str, Any]]]) -> None:
@@ -25,8 +25,8 @@ def _write(path: Path, crs: str, features: Sequence[tuple[str, Any, Mapping[str,
         "type": "FeatureCollection",
         "crs": member(crs),
         "features": [
-            {"type": "Feature", "geometry": {"type": kind, "coordinates": places}, "properties": dict(told)}
-            for kind, places, told in features
+            {"type": "Feature", "geometry": {"type": kind, "coordinates": places}, "properties": dict(properties)}
+            for kind, places, properties in features
         ],
     }
     path.write_text(json.dumps({k: v for k, v in body.items() if v is not None}, indent=1), encoding="utf-8")

@@ -69,16 +69,16 @@ def import_model(
         InputError: a file can't be read or is missing. SettingError: `out` is not empty, or options that contradict.
         DataError: GPS can't tell where it lies.
     """
-    told = None if cloud is None else cloud_io.read_header(cloud)  # refuses what is no cloud
+    header = None if cloud is None else cloud_io.read_header(cloud)  # refuses what is no cloud
     found = read(kind, model, images)
     for note in found.notes:
         warn(f"{model}: {note}")
-    if told is not None and told.crs and found.T_earth is None and (gps or up is not None or scale != 1.0):
+    if header is not None and header.crs and found.T_earth is None and (gps or up is not None or scale != 1.0):
         raise SettingError(
             "gps, up, scale", f"would move the photos away from {cloud}, which has a CRS", "Align model and cloud first"
         )
     files = [Photos(images).find(shot.file) for shot in found.shots] if gps else []
-    own = crs_io.short(told.crs) if told is not None and told.crs else None
+    own = crs_io.short(header.crs) if header is not None and header.crs else None
     onto, known = _onto(model, found, own, files, crs, up, scale, gps, warn)
     placed = found.moved(onto)
     photos = Photos(images)
@@ -87,8 +87,8 @@ def import_model(
             las.write(folder / "cloud.laz", _sparse(model, placed, known))
             file = "cloud.laz"
         else:
-            assert told is not None
-            moving = _moving(cloud, told, found, onto, warn)
+            assert header is not None
+            moving = _moving(cloud, header, found, onto, warn)
             file = _cloud(cloud, folder, onto if moving else None, known, link)
         entries: list[dict[str, Any]] = []
         for i, shot in enumerate(placed.shots):
@@ -129,25 +129,25 @@ def _onto(
         if gps or up is not None or scale != 1.0:
             raise SettingError("gps, up, scale", f"{model} says itself where it lies", "Leave them out")
         fit = photo_gps.by_earth(model, found.T_earth, found.centres, crs or cloud_crs or found.crs)
-        for line in fit.told:
+        for line in fit.notes:
             warn(f"{model}: {line}")
         return fit.onto, fit.crs
     if gps:
         if up is not None or scale != 1.0:
             raise SettingError("up, scale", "GPS tells them", "Give either --gps or --upright and --scale")
         fit = photo_gps.by_photos(model, found.centres, _ups(found), files, crs)
-        for line in fit.told:
+        for line in fit.notes:
             warn(f"{model}: {line}")
         return fit.onto, fit.crs
     return Similarity(scale, _upright(_ups(found), up), np.zeros(3)), crs or cloud_crs or crs_io.LOCAL
 
 
-def _moving(cloud: Path, told: cloud_io.Header, found: Model, onto: Similarity, warn: Callable[[str], None]) -> bool:
+def _moving(cloud: Path, header: cloud_io.Header, found: Model, onto: Similarity, warn: Callable[[str], None]) -> bool:
     """Whether a cloud is in the model's coordinates, and moves with it, or is where the model is brought to."""
     middle = found.centres.mean(axis=0)
-    inside_model, inside_crs = _gap(told, middle), _gap(told, onto.apply(middle[None])[0])
-    moving = not told.crs and (found.T_earth is None or inside_model < inside_crs)
-    if not told.crs and found.T_earth is not None:
+    inside_model, inside_crs = _gap(header, middle), _gap(header, onto.apply(middle[None])[0])
+    moving = not header.crs and (found.T_earth is None or inside_model < inside_crs)
+    if not header.crs and found.T_earth is not None:
         where = "the model's coordinates, and moves with it" if moving else "the CRS already"
         warn(f"{cloud}: has no CRS; by where the photos are, it is in {where}")
     gap = inside_model * onto.scale if moving else inside_crs
@@ -156,9 +156,9 @@ def _moving(cloud: Path, told: cloud_io.Header, found: Model, onto: Similarity, 
     return moving
 
 
-def _gap(told: cloud_io.Header, place: F64) -> float:
+def _gap(header: cloud_io.Header, place: F64) -> float:
     """How far a place is from a cloud's bounding box."""
-    return float(np.linalg.norm(np.maximum(0, np.maximum(told.low - place, place - told.high))))
+    return float(np.linalg.norm(np.maximum(0, np.maximum(header.low - place, place - header.high))))
 
 
 def _ups(found: Model) -> F64:

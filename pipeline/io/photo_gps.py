@@ -35,14 +35,14 @@ class Fit:
         crs: its code.
         rms: metres between the photos' places and their GPS, of those that agree; None without GPS.
         used: indices of these photos.
-        told: for the user.
+        notes: for the user.
     """
 
     onto: Similarity
     crs: str
     rms: float | None
     used: list[int]
-    told: tuple[str, ...]
+    notes: tuple[str, ...]
 
 
 def by_earth(model: Path, T_earth: F64, centres: F64, crs: str | None) -> Fit:
@@ -62,14 +62,14 @@ def by_earth(model: Path, T_earth: F64, centres: F64, crs: str | None) -> Fit:
     u, stretch, vt = np.linalg.svd((places[1:] - places[0]).T * size / 100)
     scale = float(np.sort(stretch)[1])  # two of the three are the projection's, one is the height's
     rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
-    told = []
+    notes = []
     if crs_io.has_heights(crs):
-        told.append(
+        notes.append(
             f"heights are above the ellipsoid, and {crs_io.name(crs)} has others: where they are tens of metres off, "
             "export model and cloud with ellipsoidal heights"
         )
     onto = Similarity(scale, rotation, places[0] - scale * rotation @ middle)
-    return Fit(onto, crs, None, list(range(len(centres))), tuple(told))
+    return Fit(onto, crs, None, list(range(len(centres))), tuple(notes))
 
 
 def by_photos(model: Path, centres: F64, ups: F64, photos: Sequence[Path], crs: str | None) -> Fit:
@@ -85,14 +85,14 @@ def by_photos(model: Path, centres: F64, ups: F64, photos: Sequence[Path], crs: 
     Raises:
         DataError: fewer than three photos have GPS that agrees, or the track is too short for GPS of that error.
     """
-    told: list[str] = []
+    notes: list[str] = []
     positions = [exif.place(photo) for photo in photos]
     some = [i for i, position in enumerate(positions) if position is not None]
     high = [i for i in some if positions[i][2] is not None]  # type: ignore[index]
     if len(high) >= 3:
         some = high
     elif some:
-        told.append("the photos' GPS has no altitudes: all of them are taken to be at height 0")
+        notes.append("the photos' GPS has no altitudes: all of them are taken to be at height 0")
     if len(some) < 3:
         raise DataError(
             model, f"only {len(some)} of {len(photos)} photos have GPS", "Give --upright and --scale instead"
@@ -115,13 +115,15 @@ def by_photos(model: Path, centres: F64, ups: F64, photos: Sequence[Path], crs: 
             f"its photos lie within {2 * along:.1f} m, too little for GPS that is {rms:.1f} m off",
             "Take more photos, further apart, or give --upright and --scale",
         )
-    told.insert(0, f"placed by the GPS of {len(used)} of {len(photos)} photos, {rms:.2f} m off (rms), in {crs}")
+    notes.insert(0, f"placed by the GPS of {len(used)} of {len(photos)} photos, {rms:.2f} m off (rms), in {crs}")
     if not np.arctan2(rms, across * count) < UNSURE:
         onto = _rolled(model, onto, source[near], ups)
-        told.append("its photos lie on a line, about which GPS can't tell the roll: the photos' own up is taken for it")
+        notes.append(
+            "its photos lie on a line, about which GPS can't tell the roll: the photos' own up is taken for it"
+        )
     if len(used) < 0.6 * len(some):
-        told.append(f"the GPS of {len(some) - len(used)} photos is more than {REACH:g} m off, and was left out")
-    return Fit(Similarity(onto.scale / unit, onto.rotation, onto.translation / unit), crs, rms, used, tuple(told))
+        notes.append(f"the GPS of {len(some) - len(used)} photos is more than {REACH:g} m off, and was left out")
+    return Fit(Similarity(onto.scale / unit, onto.rotation, onto.translation / unit), crs, rms, used, tuple(notes))
 
 
 def _projected(model: Path, crs: str | None, places: F64) -> tuple[str, F64, float]:

@@ -360,14 +360,16 @@ def _moments(
     """(N,) seconds of each file, in the trajectory's clock."""
     if times is not None:
         try:
-            told = np.loadtxt(times, ndmin=1).astype(np.float64)
+            seconds = np.loadtxt(times, ndmin=1).astype(np.float64)
         except FileNotFoundError:
             raise InputError(times, "is missing", "Put it there, or mend the name") from None
         except (OSError, ValueError) as error:
             raise InputError(times, f"is no list of times ({error})", "Write seconds, one a line") from None
-        if told.shape != (len(files),) or not np.isfinite(told).all():
-            raise InputError(times, f"has {told.size} times for {len(files)} {what}", "Write a time for each, in order")
-        return told + offset
+        if seconds.shape != (len(files),) or not np.isfinite(seconds).all():
+            raise InputError(
+                times, f"has {seconds.size} times for {len(files)} {what}", "Write a time for each, in order"
+            )
+        return seconds + offset
     names = [file.stem for file in files]
     whole = all(name.isdigit() for name in names)
     numbers = [int(name) for name in names] if whole else []

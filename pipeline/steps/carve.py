@@ -73,7 +73,7 @@ def carve(inputs: Inputs, params: CarveParams, out: Path, report: Report) -> Don
     report(0.0, "reading")
     cloud = PointCloud.load(inputs["cloud"])
     path = Trajectory.load(inputs["path"]) if "path" in inputs else None
-    told = 0.0
+    seen_again = 0.0
     moved, origins, why = np.zeros(len(cloud), bool), np.zeros((0, 3)), "the scanner's path isn't known"
     way = own = None
     if path is not None:
@@ -84,8 +84,8 @@ def carve(inputs: Inputs, params: CarveParams, out: Path, report: Report) -> Don
             own = in_swept(cloud.xyz, way)
     if not why:
         report(0.2, "following rays")
-        moved, told = _moved(cloud, origins, path, params)
-        why = "" if told > SEEN_AGAIN else "nearly every place was seen once alone"
+        moved, seen_again = _moved(cloud, origins, path, params)
+        why = "" if seen_again > SEEN_AGAIN else "nearly every place was seen once alone"
     near = in_first_metre(cloud.xyz, np.array(params.cameras, np.float64).reshape(-1, 3), params.camera, way)
     own = np.zeros(len(cloud), bool) if own is None else own & ~moved
     near &= ~moved & ~own
@@ -96,7 +96,7 @@ def carve(inputs: Inputs, params: CarveParams, out: Path, report: Report) -> Don
         "moving_share": round(moving_share, 5),
         "own_volume": int(own.sum()),
         "first_metre": int(near.sum()),
-        "looked_at_again": round(told, 3),
+        "looked_at_again": round(seen_again, 3),
         "rays": why or "followed",
     }
     gone = moved | own | near
@@ -174,7 +174,7 @@ def _moved(cloud: PointCloud, origins: F64, path: Trajectory | None, params: Car
     assert cloud.time is not None and path is not None
     order = np.argsort(cloud.time, kind="stable")
     time = cloud.time[order]
-    free, told = in_free_space(
+    free, seen_again = in_free_space(
         cloud.xyz[order],
         origins[order].astype(np.float32),
         np.floor((time - time[0]) / WINDOW + 0.5).astype(np.int64),
@@ -185,7 +185,7 @@ def _moved(cloud: PointCloud, origins: F64, path: Trajectory | None, params: Car
     )
     out = np.empty(len(cloud), bool)
     out[order] = free
-    return out, told
+    return out, seen_again
 
 
 CARVE = Step("carve", 3, carve, CarveParams, memory=(0.5, 6))

@@ -14,9 +14,9 @@ def cut(inputs: Inputs, params: CutParams, out: Path, report: Report) -> Done:
     Raises:
         ScanError: as `cut_survey`.
     """
-    told: list[str] = []
-    survey = cut_survey(inputs["corridor"], out / "survey", params, report=report, warn=told.append)
-    return Done({"survey": survey.parent}, warnings=told)
+    warnings: list[str] = []
+    survey = cut_survey(inputs["corridor"], out / "survey", params, report=report, warn=warnings.append)
+    return Done({"survey": survey.parent}, warnings=warnings)
 
 
 CUT = Step("cut", VERSION, cut, CutParams)

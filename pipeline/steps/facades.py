@@ -14,7 +14,7 @@ from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.facades import Bools, Numbers, Rays, Wall
-    from scan2sim.pipeline.planesweep import Looked
+    from scan2sim.pipeline.planesweep import Photo
     from scan2sim.pipeline.types import F64, PointCloud
 
 MOST = 1_000_000  # pixels at which a photo is looked at: all of a tile are kept in memory
@@ -72,7 +72,7 @@ def facades(inputs: Inputs, params: FacadesParams, out: Path, report: Report) ->
     assert cloud.normal is not None
     planes, which, _ = detect(cloud.xyz, cloud.normal, params.voxel)
     rays = kernels.Rays.of(Trajectory.load(inputs["path"]).at(whole.time), whole.xyz)
-    photos = cache(lambda: looked(inputs, whole))
+    photos = cache(lambda: photos_of(inputs, whole))
     numba.set_num_threads(1)  # many small pictures: threads would wait for one another
     tree, parts = cKDTree(cloud.xyz), []
     for wall in kernels.walls(cloud.xyz, which, planes, params.voxel, params.rise + WINDOW / 2):
@@ -93,11 +93,11 @@ def facades(inputs: Inputs, params: FacadesParams, out: Path, report: Report) ->
         classification = np.full(len(xyz), CODE["building"], np.uint8)
         made = PointCloud(cloud.frame, on_grid(xyz).astype(np.float32), rgb, normal.astype(np.float32), classification)
     made.save(out / "made.npz")
-    told = {name: round(value, 1) if isinstance(value, float) else value for name, value in facts.items()}
-    return Done({"made": out / "made.npz"}, told | {"points": len(made)})
+    rounded = {name: round(value, 1) if isinstance(value, float) else value for name, value in facts.items()}
+    return Done({"made": out / "made.npz"}, rounded | {"points": len(made)})
 
 
-def looked(inputs: Inputs, whole: PointCloud) -> list[Looked]:
+def photos_of(inputs: Inputs, whole: PointCloud) -> list[Photo]:
     """The photos from the ground that aren't held out, with what hides walls from them."""
     from dataclasses import replace
 
@@ -107,7 +107,7 @@ def looked(inputs: Inputs, whole: PointCloud) -> list[Looked]:
     from scan2sim.pipeline.classes import SHOWN
     from scan2sim.pipeline.io import image
     from scan2sim.pipeline.io import views as views_io
-    from scan2sim.pipeline.planesweep import Looked
+    from scan2sim.pipeline.planesweep import Photo
     from scan2sim.pipeline.visibility import depth_map, scene
 
     views, held = views_io.load(inputs["views"]), views_io.load_held_out(inputs["views"])
@@ -129,11 +129,11 @@ def looked(inputs: Inputs, whole: PointCloud) -> list[Looked]:
         if usable is not None:
             usable = cv2.resize(usable, (camera.width, camera.height), interpolation=cv2.INTER_NEAREST)
         depth = depth_map(camera, view.T_world_cam, hides, time=view.time, pixels=PIXELS)
-        photos.append(Looked(replace(view, camera=camera), tuple(map(np.asarray, levels)), usable, sky, depth))
+        photos.append(Photo(replace(view, camera=camera), tuple(map(np.asarray, levels)), usable, sky, depth))
     return photos
 
 
-def raised(wall: Wall, rays: Rays, own: Numbers, through: Bools, photos: Callable[[], list[Looked]]) -> Bools:
+def raised(wall: Wall, rays: Rays, own: Numbers, through: Bools, photos: Callable[[], list[Photo]]) -> Bools:
     """(R, C) cells of a wall above its scan; its points are `own` of the rays' ends, which went `through` its cells.
 
     Photos are asked of walls that somewhere end where the scanner's rays do.

@@ -76,10 +76,10 @@ def ground(inputs: Inputs, params: GroundParams, out: Path, report: Report) -> D
     terrain = united(inputs, params, "terrain")
     above = [united(inputs, params, part) for part in ("building", "vegetation", "rest") if part in inputs]
     street = "things" in inputs
-    asked = street or params.when == "always" or from_above(above[0])
+    active = street or params.when == "always" or from_above(above[0])
     made = PointCloud(terrain.frame, np.zeros((0, 3), np.float32), normal=np.zeros((0, 3), np.float32))
     area = 0.0
-    if asked and len(terrain) and (street or any(map(len, above))):
+    if active and len(terrain) and (street or any(map(len, above))):
         from scipy import ndimage
 
         raster = Raster.over(spacing(terrain.xyz), [terrain.xyz, *(cloud.xyz for cloud in above)])
@@ -107,7 +107,7 @@ def ground(inputs: Inputs, params: GroundParams, out: Path, report: Report) -> D
         made = PointCloud(terrain.frame, xyz, rgb, normal.astype(np.float32), classification)
         area = len(xyz) * raster.cell**2
     made.save(out / "made.npz")
-    return Done({"made": out / "made.npz"}, {"from_above": asked, "points": len(made), "made_up_m2": round(area, 1)})
+    return Done({"made": out / "made.npz"}, {"from_above": active, "points": len(made), "made_up_m2": round(area, 1)})
 
 
 def gaps(has: Bools, stood: Bools, cell: float, gap: float) -> Bools:

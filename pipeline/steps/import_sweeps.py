@@ -40,9 +40,9 @@ def import_sweeps(inputs: Inputs, params: SweepsParams, out: Path, report: Repor
     Raises:
         ScanError: as `pipeline.io.sweeps.import_sweeps`.
     """
-    told: list[str] = []
-    tile = tile_of(inputs, params, out / "corridor", link=True, warn=told.append, report=report)
-    return Done({"corridor": tile.parent}, warnings=told)
+    warnings: list[str] = []
+    tile = tile_of(inputs, params, out / "corridor", link=True, warn=warnings.append, report=report)
+    return Done({"corridor": tile.parent}, warnings=warnings)
 
 
 def tile_of(

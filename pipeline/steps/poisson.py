@@ -72,8 +72,8 @@ def poisson(inputs: Inputs, params: PoissonParams, out: Path, report: Report) ->
     length = float((xyz.max(axis=0) - xyz.min(axis=0)).max())
     depth, scale = octree(length, params.voxel / 2) if params.depth is None else (params.depth, 1.1)
     cell = scale * length / 2**depth
-    told = f"{length:.0f} m at a voxel of {params.voxel * 100:.0f} cm: depth {depth}, cell {cell * 100:.1f} cm"
-    report(0.0, told)
+    summary = f"{length:.0f} m at a voxel of {params.voxel * 100:.0f} cm: depth {depth}, cell {cell * 100:.1f} cm"
+    report(0.0, summary)
     warnings = []
     # tries: as asked; on one thread, since several race on some inputs; the same surface, coarser
     for threads, coarser in ((params.threads, 0), (1, 0), (1, 1)):
@@ -90,7 +90,7 @@ def poisson(inputs: Inputs, params: PoissonParams, out: Path, report: Report) ->
         raise StepError(inputs["cloud"], "; ".join(warnings), "Use a smaller tile, or --set poisson.depth=9")
     Mesh(cloud.frame, vertices, faces, density).save(out / "mesh.npz")
     facts = {"points": len(cloud), "faces": len(faces), "depth": depth - coarser, "cell_m": round(cell * 2**coarser, 4)}
-    return Done({"mesh": out / "mesh.npz"}, facts | {"told": told}, warnings)
+    return Done({"mesh": out / "mesh.npz"}, facts | {"told": summary}, warnings)
 
 
 def bounds(xyz: F32, origin: tuple[float, float, float], block: float) -> F32:

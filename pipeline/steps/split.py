@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 FURNITURE, VEHICLE = len(GROUPS) + 1, len(GROUPS) + 2
 """Of a point, beside the groups' numbers: it is street furniture's."""
-TELL = 0.01
+NOTABLE = 0.01
 """Share of points without a class from which on a run warns."""
 AROUND = 0.4
 """Metres around a vehicle's box within which points of the class are its own: mirrors, antennas."""
@@ -84,7 +84,7 @@ def split(inputs: Inputs, params: SplitParams, out: Path, report: Report) -> Don
     codes, numbers = np.unique(cloud.classification, return_counts=True)
     classes = {name_of(int(c)): int(n) for c, n in zip(codes, numbers, strict=True)}
     vanished = {int(c): int(n) for c, n in zip(codes, numbers, strict=True) if not known()[c]}
-    if sum(vanished.values()) > TELL * len(cloud):
+    if sum(vanished.values()) > NOTABLE * len(cloud):
         which = ", ".join(f"{name_of(code)} {n / len(cloud):.1%}" for code, n in vanished.items())
         foreign = max((code for code in vanished if code not in UNKNOWN), key=vanished.__getitem__, default=None)
         mapping = f'Say what codes are by [classes] in tile.toml ({foreign} = "building"), or have'
@@ -105,13 +105,13 @@ def parked(cloud: PointCloud, things: Path) -> npt.NDArray[np.bool_]:
     inside = np.zeros(len(cloud), bool)
     vehicle = np.flatnonzero(cloud.classification == CODE["vehicle"])
     for feature in json.loads(things.read_text(encoding="utf-8"))["features"]:
-        told = feature["properties"]
-        if told["moved"] or told["kind"] == "person":
+        properties = feature["properties"]
+        if properties["moved"] or properties["kind"] == "person":
             continue
         ring = np.array(feature["geometry"]["coordinates"][0][:4])
-        corners = cloud.frame.to_local(np.column_stack([ring, np.full(4, told["ground_z"])]))
+        corners = cloud.frame.to_local(np.column_stack([ring, np.full(4, properties["ground_z"])]))
         away = cloud.xyz[vehicle] - corners.mean(axis=0)
-        own = np.abs(away[:, 2] - told["height_m"] / 2) < told["height_m"] / 2 + AROUND
+        own = np.abs(away[:, 2] - properties["height_m"] / 2) < properties["height_m"] / 2 + AROUND
         for side in (corners[0] - corners[1], corners[1] - corners[2]):
             length = np.linalg.norm(side)
             own &= np.abs(away @ side) < length * (length / 2 + AROUND)

@@ -19,7 +19,7 @@ DENSE = 0.2  # metres between points of a wall
 SUNK = 0.3  # metres that walls reach into the ground
 OUTSIDE = (1.5, 2.5, 3.5)  # cells beyond a roof's side where another roof is looked for, the nearest first
 SEEN = 1.5  # times DENSE: a wall's own points are this close
-BESIDE = 1.5  # metres from a footprint within which a roof's own outline isn't asked
+BESIDE = 1.5  # metres from a footprint within which a roof's own outline isn't used
 LIGHT = (0.83, 0.55, 0.0)
 PLASTER = (196, 190, 180)  # a wall of whose colour nothing is known
 
@@ -59,9 +59,9 @@ def walls(inputs: Inputs, params: WallsParams, out: Path, report: Report) -> Don
     if "ground" in inputs:
         floor = np.concatenate([floor, PointCloud.load(inputs["ground"]).xyz])
     made = PointCloud(building.frame, np.zeros((0, 3), np.float32), normal=np.zeros((0, 3), np.float32))
-    asked = params.when == "always" or from_above(building)
-    facts = {"from_above": asked, "roofs": 0, "sides": 0, "footprints": 0, "points": 0, "made_up_m2": 0.0}
-    if asked and len(building) and len(floor):
+    active = params.when == "always" or from_above(building)
+    facts = {"from_above": active, "roofs": 0, "sides": 0, "footprints": 0, "points": 0, "made_up_m2": 0.0}
+    if active and len(building) and len(floor):
         assert building.normal is not None
         flat = building.xyz[np.abs(building.normal[:, 2]) > FLAT]
         raster = Raster.over(spacing(flat), [building.xyz])

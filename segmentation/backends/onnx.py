@@ -57,16 +57,16 @@ class Network:
         (given,), (got,) = inputs, outputs
         meta = self._session.get_modelmeta().custom_metadata_map
         more = bool(_json(meta.get("channels"), False))
-        wanted, told = _sizes(given.shape), _sizes(got.shape)
+        wanted, produced = _sizes(given.shape), _sizes(got.shape)
         fits = len(wanted) == 4 and wanted[0] in (1, None) and wanted[1] in (3 + COUNT * more, None)
         if given.type not in FLOATS or not fits:
             raise InputError(path, f"takes {given.type} of {given.shape}", REMEDY)
-        if got.type not in FLOATS or (got.shape and len(told) != 4):
+        if got.type not in FLOATS or (got.shape and len(produced) != 4):
             raise InputError(path, f"gives {got.type} of {got.shape}", REMEDY)
         self._input, self._type, self._size = given.name, FLOATS[given.type], wanted[2:]
         labels = _labels(path, meta)
-        if got.shape and told[1] not in (None, len(labels)):
-            raise InputError(path, f"gives {told[1]} channels, but {len(labels)} labels are named", "Name one each")
+        if got.shape and produced[1] not in (None, len(labels)):
+            raise InputError(path, f"gives {produced[1]} channels, but {len(labels)} labels are named", "Name one each")
         self._mean = numbers(_json(meta.get("mean"), MEAN), 3, path, least=-np.inf)
         self._std = numbers(_json(meta.get("std"), STD), 3, path)
         digest = hashlib.sha256(path.read_bytes())
@@ -74,8 +74,8 @@ class Network:
         if beside.is_file():
             digest.update(beside.read_bytes())
         licence = meta.get("license") or "not told"
-        told = _json(meta.get("pixels_a_radian"), None)
-        resolution = None if told is None else float(numbers([told], 1, path)[0])
+        density = _json(meta.get("pixels_a_radian"), None)
+        resolution = None if density is None else float(numbers([density], 1, path)[0])
         self.facts = Facts(f"{backend} ({path.name})", labels, digest.hexdigest(), licence, resolution, more)
 
     def probabilities(self, seen: U8) -> F32:
@@ -95,7 +95,7 @@ class Network:
         try:
             (out,) = self._session.run(None, {self._input: x.transpose(2, 0, 1)[None].astype(self._type)})
         except Exception as error:  # onnxruntime's errors have no kind in common
-            raise _told(error, self._path, f"fails on a photo of {width} x {height}", REMEDY) from None
+            raise _load_error(error, self._path, f"fails on a photo of {width} x {height}", REMEDY) from None
         if out.ndim != 4 or out.shape[:2] != (1, len(self.facts.labels)):
             cause = f"gives {out.shape} for {len(self.facts.labels)} labels"
             raise InputError(self._path, cause, "Name a label for every channel of a (1, C, h, w) output")
@@ -121,7 +121,9 @@ def _session(path: Path, device: str) -> Any:
     try:
         session = onnxruntime.InferenceSession(path, options, [*providers, "CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's errors have no kind in common
-        raise _told(error, path, "can't be loaded", "Copy or export it again, with its .data if it has one") from None
+        raise _load_error(
+            error, path, "can't be loaded", "Copy or export it again, with its .data if it has one"
+        ) from None
     if device.startswith("cuda") and CUDA not in session.get_providers():
         raise SettingError(
             "label.device", f"onnxruntime can't use {device!r} here", "Install onnxruntime-gpu, or set cpu"
@@ -131,14 +133,14 @@ def _session(path: Path, device: str) -> Any:
 
 def _threads() -> int:
     """As many as OpenMP's libraries take; onnxruntime itself doesn't ask."""
-    told = os.environ.get("OMP_NUM_THREADS", "")
-    if told.isdecimal() and int(told):
-        return int(told)
+    count = os.environ.get("OMP_NUM_THREADS", "")
+    if count.isdecimal() and int(count):
+        return int(count)
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _told(error: Exception, path: Path, cause: str, remedy: str) -> Exception:
-    """MemoryError where onnxruntime tells of too little memory, else an InputError."""
+def _load_error(error: Exception, path: Path, cause: str, remedy: str) -> Exception:
+    """MemoryError where onnxruntime lacks memory, else an InputError."""
     why = str(error).strip().split("\n")[0]
     full = any(
         words in str(error).lower() for words in ("out of memory", "allocate memory", "bad_alloc", "alloc_failed")
@@ -152,7 +154,7 @@ def _sizes(shape: list[int | str | None]) -> tuple[int | None, ...]:
 
 
 def _json(text: str | None, other: object) -> Any:
-    """What is told, as it stands if it is no JSON; `other` where nothing is."""
+    """A value of the metadata, as it stands if it is no JSON; `other` where nothing is."""
     try:
         return other if text is None else json.loads(text)
     except ValueError:
@@ -163,11 +165,11 @@ def _labels(path: Path, meta: dict[str, str]) -> tuple[str, ...]:
     beside = path.with_suffix(".labels.txt")
     remedy = f'Name them in order of the channels: metadata "labels" as a JSON list, or {beside.name}, one a line'
     try:
-        told = _json(meta.get("labels"), None) or [line.strip() for line in beside.read_text("utf-8-sig").split("\n")]
+        names = _json(meta.get("labels"), None) or [line.strip() for line in beside.read_text("utf-8-sig").split("\n")]
     except FileNotFoundError:
         raise InputError(path, "doesn't name its labels", remedy) from None
     except (OSError, ValueError) as error:
         raise InputError(beside, f"can't be read ({error})", remedy) from None
-    if not isinstance(told, list) or not any(told) or not all(isinstance(name, str) for name in told):
+    if not isinstance(names, list) or not any(names) or not all(isinstance(name, str) for name in names):
         raise InputError(path, "has labels that are no list of names", remedy)
-    return tuple(name for name in told if name)
+    return tuple(name for name in names if name)

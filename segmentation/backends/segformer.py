@@ -77,18 +77,18 @@ class Network:
 
 def _read_json(path: Path) -> dict[str, Any]:
     try:
-        told = json.loads(path.read_text("utf-8"))
+        config = json.loads(path.read_text("utf-8"))
     except (OSError, ValueError) as error:
         raise InputError(path, f"can't be read ({error})", REMEDY) from None
-    if not isinstance(told, dict):
+    if not isinstance(config, dict):
         raise InputError(path, "is no JSON object", REMEDY)
-    return told
+    return config
 
 
 def _labels(config: dict[str, Any], path: Path) -> tuple[str, ...]:
     """Names by channel, of a config that is SegFormer's."""
-    told = config.get("architectures") or [config.get("model_type", "another network")]
-    names = [str(name) for name in (told if isinstance(told, list) else [told])]
+    architectures = config.get("architectures") or [config.get("model_type", "another network")]
+    names = [str(name) for name in (architectures if isinstance(architectures, list) else [architectures])]
     if not {ARCHITECTURE, "segformer"} & set(names):
         raise InputError(path, f"is of {', '.join(names)}, not of {ARCHITECTURE}", REMEDY)
     try:
@@ -102,22 +102,24 @@ def _labels(config: dict[str, Any], path: Path) -> tuple[str, ...]:
 
 def _normalisation(path: Path) -> tuple[float, F32, F32]:
     """Factor of 0 to 255, and what is then subtracted and divided by; ImageNet's where the file is absent."""
-    told = _read_json(path) if path.is_file() else {}
-    (scale,) = numbers([told.get("rescale_factor", 1 / 255) if told.get("do_rescale", True) else 1], 1, path)
-    if not told.get("do_normalize", True):
+    preprocessor = _read_json(path) if path.is_file() else {}
+    (scale,) = numbers(
+        [preprocessor.get("rescale_factor", 1 / 255) if preprocessor.get("do_rescale", True) else 1], 1, path
+    )
+    if not preprocessor.get("do_normalize", True):
         return float(scale), np.zeros(3, np.float32), np.ones(3, np.float32)
-    std = numbers(told.get("image_std", STD), 3, path)
-    return float(scale), numbers(told.get("image_mean", MEAN), 3, path, least=-np.inf), std
+    std = numbers(preprocessor.get("image_std", STD), 3, path)
+    return float(scale), numbers(preprocessor.get("image_mean", MEAN), 3, path, least=-np.inf), std
 
 
-def numbers(told: object, n: int, path: Path, least: float = 1e-6) -> F32:
-    """(n,) float32 of what a file tells of an image's normalisation; InputError if it isn't n numbers from `least`."""
+def numbers(given: object, n: int, path: Path, least: float = 1e-6) -> F32:
+    """(n,) float32 of what a file gives for an image's normalisation; InputError if it isn't n numbers from `least`."""
     try:
-        found = np.asarray(told, np.float32)
+        found = np.asarray(given, np.float32)
     except (TypeError, ValueError):
         found = np.empty(0, np.float32)
     if found.shape != (n,) or not np.isfinite(found).all() or found.min() < least:
-        raise InputError(path, f"tells {told!r} to normalise photos with", f"Mend it: it should be {n} numbers")
+        raise InputError(path, f"tells {given!r} to normalise photos with", f"Mend it: it should be {n} numbers")
     return found
 
 
@@ -163,8 +165,8 @@ def _build(config: dict[str, Any], labels: tuple[str, ...], state: dict[str, Any
     except Exception as error:  # a shape that makes no sense raises a dozen kinds
         why = str(error).strip().split("\n")[0]
         raise InputError(path, f"doesn't fit the {ARCHITECTURE} that config.json tells of ({why})", REMEDY) from None
-    net, told = built
-    strays = sorted({*told["missing_keys"], *told["unexpected_keys"]})
+    net, loading = built
+    strays = sorted({*loading["missing_keys"], *loading["unexpected_keys"]})
     strays = [name for name in strays if not name.endswith("num_batches_tracked")]
     if strays or shaped.num_channels != 3:
         why = f"{len(strays)} weights are missing or unknown, as {strays[0]}" if strays else "it doesn't take RGB"
@@ -174,9 +176,9 @@ def _build(config: dict[str, Any], labels: tuple[str, ...], state: dict[str, Any
 
 def _licence(config: dict[str, Any], readme: Path) -> str:
     """As the config or the front matter of README.md tells."""
-    told = str(config.get("license") or "")
-    if not told and readme.is_file():
+    licence = str(config.get("license") or "")
+    if not licence and readme.is_file():
         front = re.match(r"---\n(.*?)\n---", readme.read_text("utf-8-sig", errors="replace"), re.DOTALL)
         lines = re.findall(r"^license(?:_name|_link)?: *(\S.*?) *$", front[1] if front else "", re.MULTILINE)
-        told = ", ".join(line.strip("'\"") for line in lines)
-    return f"{told or 'not told'}; {NVIDIA}" if told in ("", "other") else told
+        licence = ", ".join(line.strip("'\"") for line in lines)
+    return f"{licence or 'not told'}; {NVIDIA}" if licence in ("", "other") else licence

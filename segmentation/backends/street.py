@@ -51,7 +51,7 @@ def _has_gpu(device: str) -> bool:
     return device != "cpu" and not extras.missing("torch", "safetensors") and torch_device(device) != "cpu"
 
 
-def save(network: StreetNet, path: Path, told: dict[str, object]) -> None:
+def save(network: StreetNet, path: Path, metadata: dict[str, object]) -> None:
     """Write weights in half precision, with their labels and what is told of their training.
 
     Args:
@@ -65,7 +65,7 @@ def save(network: StreetNet, path: Path, told: dict[str, object]) -> None:
     state = {name: value for name, value in network.state_dict().items() if value.dtype != torch.int64}
     halves = {name: value.half().contiguous() for name, value in state.items()}
     path.parent.mkdir(parents=True, exist_ok=True)
-    facts = {"network": "StreetNet", "labels": CLASSES, **told}
+    facts = {"network": "StreetNet", "labels": CLASSES, **metadata}
     save_file(halves, str(path.with_suffix(".safetensors")), {key: _text(value) for key, value in facts.items()})
     network.load_state_dict({name: value.float() for name, value in halves.items()}, strict=False)
     _export(network, path, facts)
@@ -109,14 +109,16 @@ class Network:
         remedy = "Give weights that `scan2sim segment train` wrote, or leave `label.weights` out"
         try:
             with safe_open(str(path), "pt") as file:
-                told = file.metadata() or {}
+                metadata = file.metadata() or {}
                 state = {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118
             digest = hashlib.sha256(path.read_bytes()).hexdigest()
         except (OSError, SafetensorError) as error:
             raise InputError(path, f"is no whole safetensors file ({error})", remedy) from None
-        if told.get("network") != "StreetNet" or "labels" not in told:
-            raise InputError(path, f"holds weights of {told.get('network', 'another network')}, not StreetNet", remedy)
-        labels = tuple(json.loads(told["labels"]))
+        if metadata.get("network") != "StreetNet" or "labels" not in metadata:
+            raise InputError(
+                path, f"holds weights of {metadata.get('network', 'another network')}, not StreetNet", remedy
+            )
+        labels = tuple(json.loads(metadata["labels"]))
         self._net = StreetNet(len(labels))
         try:
             missing, unknown = self._net.load_state_dict(state, strict=False)

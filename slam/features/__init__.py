@@ -1,7 +1,7 @@
 """Features: places in a picture that are found again in another, each with a descriptor.
 
 A file a backend (`pipeline.backends`), found by its name. Backends see pictures, never the sphere:
-`slam.trackers.descriptors` shows them the charts and makes bearings of what they find.
+`slam.trackers.descriptors` shows them the facets and makes bearings of what they find.
 """
 
 from __future__ import annotations

@@ -114,7 +114,7 @@ class LightGlue(ByNetwork):
 
         return linear(x, self.weights.tensors[f"{name}.weight"], self.weights.tensors[f"{name}.bias"])
 
-    def _told(self, name: str, x: Any, message: Any) -> Any:
+    def _updated(self, name: str, x: Any, message: Any) -> Any:
         """Features (N, D) after a message (N, D)."""
         import torch
         from torch.nn.functional import gelu, layer_norm
@@ -125,16 +125,16 @@ class LightGlue(ByNetwork):
         return x + self._linear(f"{name}.ffn.3", gelu(inner))
 
     def _own(self, i: int, x: Any, turn: Any) -> Any:
-        """After looking within the picture."""
+        """After self-attention, within the picture."""
         from torch.nn.functional import scaled_dot_product_attention
 
         name = f"transformers.{i}.self_attn"
         query, key, value = self._linear(f"{name}.Wqkv", x).reshape(len(x), HEADS, -1, 3).permute(3, 1, 0, 2)
-        told = scaled_dot_product_attention(_turned(query, turn), _turned(key, turn), value)
-        return self._told(name, x, self._linear(f"{name}.out_proj", told.transpose(0, 1).reshape(len(x), DIM)))
+        message = scaled_dot_product_attention(_turned(query, turn), _turned(key, turn), value)
+        return self._updated(name, x, self._linear(f"{name}.out_proj", message.transpose(0, 1).reshape(len(x), DIM)))
 
     def _across(self, i: int, xa: Any, xb: Any) -> tuple[Any, Any]:
-        """After looking at the other picture."""
+        """After cross-attention, to the other picture."""
         from torch.nn.functional import scaled_dot_product_attention
 
         name = f"transformers.{i}.cross_attn"
@@ -144,8 +144,10 @@ class LightGlue(ByNetwork):
         )
         out = []
         for x, mine, other in ((xa, 0, 1), (xb, 1, 0)):
-            told = scaled_dot_product_attention(keys[mine], keys[other], values[other])
-            out.append(self._told(name, x, self._linear(f"{name}.to_out", told.transpose(0, 1).reshape(len(x), DIM))))
+            message = scaled_dot_product_attention(keys[mine], keys[other], values[other])
+            out.append(
+                self._updated(name, x, self._linear(f"{name}.to_out", message.transpose(0, 1).reshape(len(x), DIM)))
+            )
         return out[0], out[1]
 
 

@@ -17,7 +17,7 @@ from scan2sim.slam.features import Found
 from scan2sim.slam.matchers import ByNetwork, Sizes
 
 LAYERS, HEADS, DIM = 18, 4, 256
-"""Layers look in turn within a picture and across."""
+"""Layers attend in turn within a picture and across."""
 ROUNDS, THRESHOLD = 100, 0.2
 """Of Sinkhorn's normalisation, and least probability of a match: as published."""
 NEEDS = files.NEEDS
@@ -104,7 +104,7 @@ class SuperGlue(ByNetwork):
         return x
 
     def _attend(self, i: int, x: Any, source: Any) -> Any:
-        """(D, N) what features x learn from looking at features `source`."""
+        """(D, N) attention of features x to features `source`."""
         import torch
         from torch.nn.functional import scaled_dot_product_attention
 
@@ -113,8 +113,8 @@ class SuperGlue(ByNetwork):
             self._layer(f"{name}.proj.{k}", y).reshape(DIM // HEADS, HEADS, -1).permute(1, 2, 0)
             for k, y in enumerate((x, source, source))
         )
-        told = scaled_dot_product_attention(query, key, value).permute(2, 0, 1).reshape(DIM, -1)
-        return self._stack(f"gnn.layers.{i}.mlp", 2, torch.cat([x, self._layer(f"{name}.merge", told)]))
+        message = scaled_dot_product_attention(query, key, value).permute(2, 0, 1).reshape(DIM, -1)
+        return self._stack(f"gnn.layers.{i}.mlp", 2, torch.cat([x, self._layer(f"{name}.merge", message)]))
 
 
 def transported(scores: Any, nowhere: Any, rounds: int) -> Any:

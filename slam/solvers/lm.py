@@ -182,7 +182,7 @@ def _reduce(
 
 
 @njit(cache=True, inline="always")
-def _look(T, X, bend, shared, R):  # type: ignore[no-untyped-def]
+def _transformed(T, X, bend, shared, R):  # type: ignore[no-untyped-def]
     """Point in the camera's axes; `R` (3, 3) receives the camera's rotation, bent by the shared parameters."""
     tx, ty, tz = T[0, 3], T[1, 3], T[2, 3]
     for r in range(3):
@@ -221,7 +221,7 @@ def _robust_cost(poses, xyz, point_of, camera_of, bearing, bend, shared, sigma):
     for o in range(len(point_of)):
         R = np.empty((3, 3))
         b = bend[o] if shared.shape[0] > 0 else none
-        x, y, z, _, _, _ = _look(poses[camera_of[o]], xyz[point_of[o]], b, shared, R)
+        x, y, z, _, _, _ = _transformed(poses[camera_of[o]], xyz[point_of[o]], b, shared, R)
         p, q, s = bearing[o, 0], bearing[o, 1], bearing[o, 2]
         cx, cy, cz = q * z - s * y, s * x - p * z, p * y - q * x
         r2 = x * x + y * y + z * z
@@ -251,7 +251,7 @@ def _accumulate(poses, xyz, starts, camera_of, bearing, bend, shared, free, size
         for o in range(starts[p], starts[p + 1]):
             camera = camera_of[o]
             b = bend[o] if S > 0 else none
-            x, y, z, dx, dy, dz = _look(poses[camera], xyz[p], b, shared, R)
+            x, y, z, dx, dy, dz = _transformed(poses[camera], xyz[p], b, shared, R)
             length = math.sqrt(x * x + y * y + z * z)
             bx, by, bz = bearing[o, 0], bearing[o, 1], bearing[o, 2]
             if length < 1e-9 or bx * x + by * y + bz * z <= 0:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from scan2sim.pipeline.ranges import Rate
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.slam.charts import Charts
+from scan2sim.slam.facets import Facets
 from scan2sim.slam.loops import Places, close
 from scan2sim.slam.mapped import Mapped
 from scan2sim.slam.video import open_video
@@ -26,12 +26,12 @@ def close_loops(inputs: Inputs, params: LoopsParams, out: Path, report: Report) 
     """Bend the keyframes' path of `mapped`, whose frames are read from `video` (and `times`) again."""
     mapped = Mapped.read(inputs["mapped"])
     video = open_video(inputs["video"], fps=params.fps, times=inputs.get("times"))
-    charts = Charts(mapped.camera)
-    places = Places(charts)
+    facets = Facets(mapped.camera)
+    places = Places(facets)
     keyframes = {keyframe.time: number for number, keyframe in enumerate(mapped.map.keyframes)}
     for frame in video.frames():
         if frame.time in keyframes:
-            places(keyframes[frame.time], charts.pictures(frame.grey))
+            places(keyframes[frame.time], facets.pictures(frame.grey))
             report(0.9 * len(places.seen) / len(keyframes), f"{len(places.seen)} of {len(keyframes)} keyframes")
     facts = close(mapped, places)
     return Done({"mapped": mapped.write(out / "mapped.npz")}, dict(facts))

@@ -18,7 +18,7 @@ from scan2sim.pipeline.ranges import Focal, Pixels, Rate, Shift
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.types import U8, Camera, GpsTrack
 from scan2sim.slam import features, matchers, solvers, trackers
-from scan2sim.slam.charts import Charts
+from scan2sim.slam.facets import Facets
 from scan2sim.slam.gps import smooth
 from scan2sim.slam.mapped import Mapped
 from scan2sim.slam.odometry import Odometry, OdometryParams
@@ -66,8 +66,8 @@ def track_video(inputs: Inputs, params: TrackParams, out: Path, report: Report, 
     """
     video = open_video(inputs["video"], fps=params.fps, times=inputs.get("times"))
     camera, mask = video_camera(video, params, inputs), read_mask(video, inputs.get("mask"))
-    told: list[str] = []
-    gps = read_gps(video, inputs.get("gps"), params.gps_offset, told.append)
+    warnings: list[str] = []
+    gps = read_gps(video, inputs.get("gps"), params.gps_offset, warnings.append)
     tracker, about = tracker_of(camera, mask, params, inputs)
 
     def start(warn: Callable[[str], None]) -> Odometry:
@@ -83,7 +83,9 @@ def track_video(inputs: Inputs, params: TrackParams, out: Path, report: Report, 
         )  # fmt: skip
     files = {"mapped": Mapped.of(run.odometry, run.names).write(out / "mapped.npz")}
     films = {"view": film} if params.view else {}
-    return Done(files | films, run.facts() | ({"told": about} if about else {}), [*told, *dict.fromkeys(run.warnings)])
+    return Done(
+        files | films, run.facts() | ({"told": about} if about else {}), [*warnings, *dict.fromkeys(run.warnings)]
+    )
 
 
 def can_track(params: TrackParams) -> None:
@@ -150,13 +152,13 @@ def read_mask(video: Video, path: Path | None) -> U8 | None:
 
 def tracker_of(camera: Camera, mask: U8 | None, params: TrackParams, inputs: Inputs) -> tuple[Tracker, str]:
     """What follows features: corners by Lucas-Kanade, or descriptors from frame to frame (D3.2); and what it is."""
-    charts = Charts(camera)
+    facets = Facets(camera)
     if params.features == "corners":
-        return trackers.named("corners", charts, mask, params.count), ""
+        return trackers.named("corners", facets, mask, params.count), ""
     detector = features.named(params.features, inputs.get("weights"))
     matcher = matchers.named(params.matcher, inputs.get("matcher_weights"))
     matchers.check(detector, matcher)
-    tracker = trackers.named("descriptors", charts, mask, params.count, detector, matcher)
+    tracker = trackers.named("descriptors", facets, mask, params.count, detector, matcher)
     return tracker, f"{detector.describe()}; {matcher.describe()}"
 
 

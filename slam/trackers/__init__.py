@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from scan2sim.pipeline import backends
 from scan2sim.pipeline.types import F64, U8
-from scan2sim.slam.charts import Charts
+from scan2sim.slam.facets import Facets
 from scan2sim.slam.features import Features
 from scan2sim.slam.matchers import Matcher
 
@@ -42,13 +42,13 @@ class Tracker(Protocol):
 
     Attributes:
         tracks: of the last frame.
-        pictures: charts of the last frame.
+        pictures: facets of the last frame.
     """
 
     tracks: Tracks
     pictures: list[U8]
 
-    def look(self, grey: U8, expected: F64 | None = None) -> float:
+    def track(self, grey: U8, expected: F64 | None = None) -> float:
         """Follow all tracks into the next frame; returns the share that could be followed.
 
         Args:
@@ -67,14 +67,14 @@ class Backend(Protocol):
     """What a backend's module has."""
 
     def load(
-        self, charts: Charts, mask: U8 | None, count: int, features: Features | None, matcher: Matcher | None
+        self, facets: Facets, mask: U8 | None, count: int, features: Features | None, matcher: Matcher | None
     ) -> Tracker:
         """See `named`."""
 
 
 def named(
     name: str,
-    charts: Charts,
+    facets: Facets,
     mask: U8 | None,
     count: int,
     features: Features | None = None,
@@ -84,7 +84,7 @@ def named(
 
     Args:
         name: of its file here.
-        charts: of the frames.
+        facets: of the frames.
         mask: (H, W), 0 where the car itself is; None: nowhere.
         count: features to keep alive.
         features, matcher: for a backend that finds features and matches them.
@@ -94,4 +94,4 @@ def named(
         UnavailableError: it can't run here.
     """
     backend: Backend = backends.find(__name__, name, "slam.tracker")
-    return backend.load(charts, mask, count, features, matcher)
+    return backend.load(facets, mask, count, features, matcher)

@@ -1,4 +1,4 @@
-"""Corners, followed from frame to frame by pyramidal Lucas-Kanade, each in its chart of the sphere.
+"""Corners, followed from frame to frame by pyramidal Lucas-Kanade, each in its facet of the sphere.
 
 Needs no weights. A corner is followed there and back; one that doesn't return to where it was is lost.
 """
@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scan2sim.pipeline.types import F32, F64, U8
-from scan2sim.slam.charts import Charts
+from scan2sim.slam.facets import Facets
 from scan2sim.slam.trackers import Tracks
 
 I64 = npt.NDArray[np.int64]
@@ -30,9 +30,9 @@ ACROSS = 24
 """Cells a full width, between which corners are shared out evenly."""
 
 
-def load(charts: Charts, mask: U8 | None, count: int, features: None = None, matcher: None = None) -> CornerTracker:
+def load(facets: Facets, mask: U8 | None, count: int, features: None = None, matcher: None = None) -> CornerTracker:
     """See `slam.trackers.named`; it needs no features."""
-    return CornerTracker(charts, mask, count)
+    return CornerTracker(facets, mask, count)
 
 
 class CornerTracker:
@@ -40,44 +40,44 @@ class CornerTracker:
 
     STATE: tuple[str, ...] = ("tracks", "pictures", "_next")
 
-    def __init__(self, charts: Charts, mask: U8 | None, count: int) -> None:
+    def __init__(self, facets: Facets, mask: U8 | None, count: int) -> None:
         """`mask` (H, W): 0 where the car itself is; `count`: corners to keep alive."""
-        self.charts, self.count = charts, count
+        self.facets, self.count = facets, count
         self.tracks = Tracks()
-        self._masks = None if mask is None else charts.pictures(np.where(mask > 0, np.uint8(255), np.uint8(0)))
+        self._masks = None if mask is None else facets.pictures(np.where(mask > 0, np.uint8(255), np.uint8(0)))
         self.pictures: list[U8] = []
         self._next = 0
 
-    def look(self, grey: U8, expected: F64 | None = None) -> float:
+    def track(self, grey: U8, expected: F64 | None = None) -> float:
         """Follow all tracks into the next frame; returns the share that could be followed.
 
         Args:
             grey: (H, W).
             expected: (N, 3) bearings where they are probably seen now.
         """
-        pictures = self.charts.pictures(grey)
+        pictures = self.facets.pictures(grey)
         before, tracks = self.pictures, self.tracks
         self.pictures = pictures
         if not before or not len(tracks):
             return 0.0
         expected = tracks.bearing if expected is None else expected
         bearing = np.full_like(tracks.bearing, np.nan)
-        chart_of = self.charts.place(tracks.bearing)
-        for chart in range(self.charts.count):
-            rows = np.flatnonzero(chart_of == chart)
+        facet_of = self.facets.place(tracks.bearing)
+        for facet in range(self.facets.count):
+            rows = np.flatnonzero(facet_of == facet)
             if len(rows):
                 bearing[rows] = self._follow(
-                    chart, before[chart], pictures[chart], tracks.bearing[rows], expected[rows]
+                    facet, before[facet], pictures[facet], tracks.bearing[rows], expected[rows]
                 )
         found = np.isfinite(bearing[:, 0])
         self.tracks = Tracks(tracks.ids[found], bearing[found])
         return float(found.mean())
 
-    def _follow(self, chart: int, old: U8, new: U8, bearing: F64, expected: F64) -> F64:
-        start, guess = self.charts.pixels(chart, bearing), self.charts.pixels(chart, expected)
+    def _follow(self, facet: int, old: U8, new: U8, bearing: F64, expected: F64) -> F64:
+        start, guess = self.facets.pixels(facet, bearing), self.facets.pixels(facet, expected)
         height, width = new.shape
-        if chart == 0 and not self.charts.whole:  # the shorter way round
-            turn = float(self.charts.camera.width)
+        if facet == 0 and not self.facets.whole:  # the shorter way round
+            turn = float(self.facets.camera.width)
             guess[:, 0] = start[:, 0] + (guess[:, 0] - start[:, 0] + turn / 2) % turn - turn / 2
         away = ~(np.isfinite(guess).all(axis=1) & (guess >= 0).all(axis=1) & (guess < (width, height)).all(axis=1))
         guess[away] = start[away]
@@ -89,9 +89,9 @@ class CornerTracker:
         good &= (there > edge).all(axis=1) & (there < (width - 1 - edge, height - 1 - edge)).all(axis=1)
         if self._masks is not None:
             at = there[good].astype(int)
-            good[good] = self._masks[chart][at[:, 1], at[:, 0]] > 0
+            good[good] = self._masks[facet][at[:, 1], at[:, 0]] > 0
         out = np.full((len(bearing), 3), np.nan)
-        out[good] = self.charts.bearings(chart, there[good])
+        out[good] = self.facets.bearings(facet, there[good])
         return out
 
     def drop(self, ids: I64) -> None:
@@ -100,13 +100,13 @@ class CornerTracker:
 
     def refill(self) -> int:
         """Find corners where few are followed; how many."""
-        fresh = [self._corners(chart) for chart in range(self.charts.count)]
+        fresh = [self._corners(facet) for facet in range(self.facets.count)]
         bearing = np.concatenate([b for b, _ in fresh])
         strength = np.concatenate([s for _, s in fresh])
         if not len(bearing):
             return 0
-        cell = self.charts.cell(bearing, ACROSS)
-        taken = np.bincount(self.charts.cell(self.tracks.bearing, ACROSS), minlength=cell.max() + 1)
+        cell = self.facets.cell(bearing, ACROSS)
+        taken = np.bincount(self.facets.cell(self.tracks.bearing, ACROSS), minlength=cell.max() + 1)
         cells = len(np.union1d(np.unique(cell), np.flatnonzero(taken)))
         order = np.lexsort((-strength, cell))
         first = np.searchsorted(cell[order], cell[order])
@@ -123,16 +123,16 @@ class CornerTracker:
         )
         return len(chosen)
 
-    def _corners(self, chart: int) -> tuple[F64, npt.NDArray[np.float32]]:
+    def _corners(self, facet: int) -> tuple[F64, npt.NDArray[np.float32]]:
         """(N, 3) bearings of corners away from all tracks, and how pronounced they are."""
         import cv2
 
-        picture = self.pictures[chart]
-        mask = np.full(picture.shape, 255, np.uint8) if self._masks is None else self._masks[chart].copy()
+        picture = self.pictures[facet]
+        mask = np.full(picture.shape, 255, np.uint8) if self._masks is None else self._masks[facet].copy()
         height, width = picture.shape
         edge = WINDOW // 2 + 1
         mask[:edge], mask[-edge:], mask[:, :edge], mask[:, -edge:] = 0, 0, 0, 0
-        for x, y in self.charts.pixels(chart, self.tracks.bearing):
+        for x, y in self.facets.pixels(facet, self.tracks.bearing):
             if 0 <= x < width and 0 <= y < height:
                 cv2.circle(mask, (int(x), int(y)), SPACING, 0, -1)
         found = cv2.goodFeaturesToTrack(picture, 3 * self.count, 0.002, SPACING, mask=mask, blockSize=5)
@@ -141,9 +141,9 @@ class CornerTracker:
         uv: F32 = np.asarray(found, np.float32).reshape(-1, 2)
         strength = np.linspace(1, 0, len(uv), dtype=np.float32)  # they come strongest first
         cv2.cornerSubPix(picture, uv, (3, 3), (-1, -1), (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 10, 0.03))
-        bearing = self.charts.bearings(chart, uv)
+        bearing = self.facets.bearings(facet, uv)
         ok = np.isfinite(bearing[:, 0])
-        ok[ok] = self.charts.place(bearing[ok]) == chart
+        ok[ok] = self.facets.place(bearing[ok]) == facet
         return bearing[ok], strength[ok]
 
 

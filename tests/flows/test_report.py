@@ -11,7 +11,7 @@ import pytest
 
 from scan2sim.flows.engine.planning import Planned
 from scan2sim.flows.recipes.graph import Node
-from scan2sim.flows.reports.tile import telling, write_report
+from scan2sim.flows.reports.tile import representative, write_report
 from scan2sim.pipeline.io import image
 from scan2sim.pipeline.step import Done, Params, Step
 from scan2sim.pipeline.store import Manifest, Store
@@ -106,8 +106,8 @@ def test_a_page_without_held_out_photos(report: Any) -> None:
     assert "--hold-out 8" in page and "Where it differs" not in page and "24.0 dB" in page
 
 
-def test_telling_pictures_are_the_worst_the_median_and_the_best() -> None:
+def test_representative_pictures_are_the_worst_the_median_and_the_best() -> None:
     entries = [{"title": str(i), "caption": ""} for i in range(5)]
     scores = {str(i): {"psnr_gain_db": float(value)} for i, value in enumerate([3, 1, 4, 5, 2])}
-    assert [entry["title"] for entry in telling(entries, scores)] == ["1", "0", "3"]
-    assert [entry["title"] for entry in telling(entries[:2], scores)] == ["1", "0"]
+    assert [entry["title"] for entry in representative(entries, scores)] == ["1", "0", "3"]
+    assert [entry["title"] for entry in representative(entries[:2], scores)] == ["1", "0"]

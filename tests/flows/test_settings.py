@@ -14,7 +14,7 @@ from scan2sim.flows.recipes.settings import Settings
 from scan2sim.flows.recipes.steps import STEPS
 from scan2sim.pipeline.corridor import CutParams
 from scan2sim.pipeline.errors import SettingError
-from scan2sim.pipeline.ranges import told
+from scan2sim.pipeline.ranges import described
 from scan2sim.pipeline.step import Params
 from scan2sim.pipeline.steps.decimate import DECIMATE
 from scan2sim.pipeline.steps.import_sweeps import SweepsParams
@@ -102,8 +102,8 @@ def test_wild_values_are_refused_by_name_and_range(where: str, name: str) -> Non
         try:
             made = model.of(where, required | {name: value})
         except SettingError as error:
-            told_name = f"{where}.{name}" if where else f"--{name.replace('_', '-')}"
-            assert error.where == told_name and told(model.model_fields[name]) in error.cause, (value, error)
+            where_named = f"{where}.{name}" if where else f"--{name.replace('_', '-')}"
+            assert error.where == where_named and described(model.model_fields[name]) in error.cause, (value, error)
             assert len(str(error)) < 400, "as long as what is told, not as what was given"
         else:
             assert harmless(getattr(made, name)) or f"{where}.{name}" in BY_RECIPE, (value, made)
@@ -119,7 +119,7 @@ def harmless(value: object) -> bool:
 @pytest.mark.parametrize(("where", "name"), SETTINGS)
 def test_every_number_has_two_ends(where: str, name: str) -> None:
     if f"{where}.{name}" not in BY_RECIPE:
-        assert "any" not in told(MODELS[where].model_fields[name]).replace(",", "").split()
+        assert "any" not in described(MODELS[where].model_fields[name]).replace(",", "").split()
 
 
 def test_the_page_of_settings_tells_their_ranges() -> None:
@@ -127,7 +127,7 @@ def test_the_page_of_settings_tells_their_ranges() -> None:
     for step in STEPS:
         for name, field in step.params.model_fields.items():
             line = next(line for line in text.splitlines() if line.startswith(f"| `{step.name}.{name}` "))
-            assert line.split("|")[3].strip() == told(field), line
+            assert line.split("|")[3].strip() == described(field), line
 
 
 def test_every_number_that_a_command_takes_has_a_range() -> None:

@@ -62,7 +62,7 @@ def points(n: int = 200_000, seed: int = 0, frame: Frame = UTM) -> PointCloud:
     )
 
 
-def look(along: float, aside: float = 0.0) -> dict[str, Any]:
+def facing(along: float, aside: float = 0.0) -> dict[str, Any]:
     """A photo's pose, looking along the street."""
     (x, y), a = street(np.array([along]), np.array([aside]))[0], along / RADIUS
     forward, right = np.array([np.cos(a), np.sin(a), 0]), np.array([np.sin(a), -np.cos(a), 0])
@@ -90,8 +90,8 @@ def corridor(
 def bend(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The street with photos: at 10 m forward, at 290 m forward, at 95 m, and one whose file is missing."""
     folder = tmp_path_factory.mktemp("bend") / "corridor"
-    photos = [{"file": f"photos/{along}.jpg", **look(along)} for along in (10, 95, 290)]
-    photos.append({"file": "photos/lost.jpg", **look(200)})
+    photos = [{"file": f"photos/{along}.jpg", **facing(along)} for along in (10, 95, 290)]
+    photos.append({"file": "photos/lost.jpg", **facing(200)})
     photos[1] |= {"mask": "mask.png", "time": 105.0}
     corridor(folder, cameras={"front": CAMERA}, photos=photos)
     (folder / "photos").mkdir()

@@ -11,7 +11,7 @@ from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.types import F32, U8, Camera
 from scan2sim.segmentation.backends import Facts
 from scan2sim.segmentation.labels import CLASSES, IGNORED, LABEL_SETS, code_of_index, index_of_code, mapped
-from scan2sim.segmentation.photos import OVERLAP, Labeller, labels_of
+from scan2sim.segmentation.photos import OVERLAP, Classifier, class_map
 
 PINHOLE = Camera("pinhole", 640, 480, 500.0, 500.0, 319.5, 239.5)
 PANORAMA = Camera("equirectangular", 1024, 512)
@@ -42,7 +42,7 @@ def painted(camera: Camera, classes: int = 12) -> tuple[U8, npt.NDArray[np.int64
 
 def test_classes_come_back_where_they_are() -> None:
     rgb, truth = painted(PINHOLE)
-    best, sure = labels_of(Labeller(ByColour(), "").probabilities(rgb, PINHOLE), rgb.shape[:2])
+    best, sure = class_map(Classifier(ByColour(), "").probabilities(rgb, PINHOLE), rgb.shape[:2])
     assert (best == truth).mean() > 0.95
     assert sure[best == truth].mean() > 230
 
@@ -51,26 +51,26 @@ def test_classes_come_back_where_they_are() -> None:
 def test_large_photos_are_looked_at_in_tiles_without_seams(camera: Camera) -> None:
     rgb, truth = painted(camera)
     network = ByColour()
-    labeller = Labeller(network, "")
-    best, _ = labels_of(labeller.probabilities(rgb, camera), rgb.shape[:2])
+    classifier = Classifier(network, "")
+    best, _ = class_map(classifier.probabilities(rgb, camera), rgb.shape[:2])
     assert (best == truth).mean() > 0.97
-    assert len(network.seen) > 1 and max(max(size) for size in network.seen) <= labeller.tile
+    assert len(network.seen) > 1 and max(max(size) for size in network.seen) <= classifier.tile
 
 
 def test_a_device_short_of_memory_gets_smaller_tiles() -> None:
     rgb, truth = painted(PINHOLE)
     network = ByColour(memory=400 * 400)
-    labeller = Labeller(network, "")
-    best, _ = labels_of(labeller.probabilities(rgb, PINHOLE), rgb.shape[:2])
-    assert (best == truth).mean() > 0.93 and labeller.tile < 500
+    classifier = Classifier(network, "")
+    best, _ = class_map(classifier.probabilities(rgb, PINHOLE), rgb.shape[:2])
+    assert (best == truth).mean() > 0.93 and classifier.tile < 500
     with pytest.raises(MemoryError):
-        Labeller(ByColour(memory=100), "").probabilities(rgb, PINHOLE)
+        Classifier(ByColour(memory=100), "").probabilities(rgb, PINHOLE)
 
 
 def test_photos_are_looked_at_at_one_angular_resolution() -> None:
     network = ByColour(resolution=250.0)
     rgb, _ = painted(PINHOLE)
-    Labeller(network, "").probabilities(rgb, PINHOLE)
+    Classifier(network, "").probabilities(rgb, PINHOLE)
     assert network.seen == [(240, 320)]
 
 
@@ -86,15 +86,15 @@ def test_a_network_that_takes_channels_gets_them_beside_the_colours(camera: Came
     rgb, truth = painted(camera)
     channels = np.zeros((camera.height // 4, camera.width // 4, 4), np.uint8)
     channels[..., 0] = 20 * truth[2::4, 2::4]
-    labeller = Labeller(network, "")
-    assert (labels_of(labeller.probabilities(0 * rgb, camera, channels), truth.shape)[0] == truth).mean() > 0.9
-    assert (labels_of(labeller.probabilities(rgb, camera), truth.shape)[0] == 0).all(), "a photo alone has none"
+    classifier = Classifier(network, "")
+    assert (class_map(classifier.probabilities(0 * rgb, camera, channels), truth.shape)[0] == truth).mean() > 0.9
+    assert (class_map(classifier.probabilities(rgb, camera), truth.shape)[0] == 0).all(), "a photo alone has none"
 
 
 def test_a_panoramas_seam_is_no_special_place() -> None:
     network = ByColour(resolution=PANORAMA.width / (2 * np.pi))
     rgb, truth = painted(PANORAMA)
-    best, _ = labels_of(Labeller(network, "").probabilities(rgb, PANORAMA), rgb.shape[:2])
+    best, _ = class_map(Classifier(network, "").probabilities(rgb, PANORAMA), rgb.shape[:2])
     assert (best == truth).mean() > 0.95
     assert {size[1] for size in network.seen} == {1024 + 2 * OVERLAP}, "each side is continued by the other"
 

@@ -67,7 +67,7 @@ class Follower:
         seen = (far < 40) & (far > 1)
         return bearing / np.linalg.norm(bearing, axis=1, keepdims=True), seen
 
-    def look(self, grey: np.ndarray, expected: np.ndarray | None = None) -> float:
+    def track(self, grey: np.ndarray, expected: np.ndarray | None = None) -> float:
         self._frame += 1
         of = self._point[self.tracks.ids] if len(self.tracks) else np.zeros(0, np.int64)
         bearing, seen = self._seen(self.points[of])

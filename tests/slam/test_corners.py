@@ -7,7 +7,7 @@ import pytest
 
 from scan2sim.pipeline.cameras import pixel_rays, project
 from scan2sim.pipeline.types import F32, F64, U8, Camera
-from scan2sim.slam.charts import Charts
+from scan2sim.slam.facets import Facets
 from scan2sim.slam.geometry import exp_so3, relative_pose, rigid
 from scan2sim.slam.trackers.corners import CornerTracker
 
@@ -42,26 +42,26 @@ def frame(world: Callable[[F64], F32], R: F64) -> U8:
 
 
 def test_charts_and_sphere_agree_everywhere() -> None:
-    charts, rng = Charts(CAMERA), np.random.default_rng(0)
+    facets, rng = Facets(CAMERA), np.random.default_rng(0)
     bearing = rng.normal(size=(3000, 3))
     bearing /= np.linalg.norm(bearing, axis=1, keepdims=True)
-    chart = charts.place(bearing)
-    assert set(chart) == {0, 1, 2}
+    facet = facets.place(bearing)
+    assert set(facet) == {0, 1, 2}
     for k in range(3):
-        mine = bearing[chart == k]
-        assert np.abs(charts.bearings(k, charts.pixels(k, mine)) - mine).max() < 1e-5
+        mine = bearing[facet == k]
+        assert np.abs(facets.bearings(k, facets.pixels(k, mine)) - mine).max() < 1e-5
 
 
 @pytest.mark.parametrize("axis", [[0, 1, 0], [1, 0, 0], [0, 0, 1]])
 def test_corners_are_followed_across_seam_and_poles(axis: list[int]) -> None:
-    world, charts = sphere(), Charts(CAMERA)
-    tracker = CornerTracker(charts, None, 500)
-    tracker.look(frame(world, np.eye(3)))
+    world, facets = sphere(), Facets(CAMERA)
+    tracker = CornerTracker(facets, None, 500)
+    tracker.track(frame(world, np.eye(3)))
     tracker.refill()
     first = tracker.tracks
     steps = 8
     for k in range(1, steps + 1):
-        tracker.look(frame(world, exp_so3(np.array(axis) * 0.06 * k)))
+        tracker.track(frame(world, exp_so3(np.array(axis) * 0.06 * k)))
     R = exp_so3(np.array(axis) * 0.06 * steps)
     at = np.searchsorted(first.ids, tracker.tracks.ids)
     assert len(at) > 0.6 * len(first)
@@ -78,20 +78,20 @@ def test_corners_are_followed_across_seam_and_poles(axis: list[int]) -> None:
 
 
 def test_nothing_is_found_or_followed_on_the_car() -> None:
-    world, charts = sphere(), Charts(CAMERA)
+    world, facets = sphere(), Facets(CAMERA)
     mask = np.full((CAMERA.height, CAMERA.width), 255, np.uint8)
     mask[300:] = 0
-    tracker = CornerTracker(charts, mask, 500)
+    tracker = CornerTracker(facets, mask, 500)
     for k in range(3):
-        tracker.look(frame(world, exp_so3([0, 0.05 * k, 0])))
+        tracker.track(frame(world, exp_so3([0, 0.05 * k, 0])))
         tracker.refill()
     uv, _ = project(CAMERA, tracker.tracks.bearing)
     assert len(uv) > 100 and uv[:, 1].max() < 302
 
 
 def test_corners_are_shared_out_over_the_sphere() -> None:
-    tracker = CornerTracker(Charts(CAMERA), None, 400)
-    tracker.look(frame(sphere(), np.eye(3)))
+    tracker = CornerTracker(Facets(CAMERA), None, 400)
+    tracker.track(frame(sphere(), np.eye(3)))
     tracker.refill()
     octant = (tracker.tracks.bearing > 0) @ [1, 2, 4]
     counts = np.bincount(octant, minlength=8)

@@ -12,7 +12,7 @@ from scan2sim.pipeline import backends
 from scan2sim.pipeline.errors import SettingError
 from scan2sim.pipeline.types import F64, U8, Camera
 from scan2sim.slam import features, matchers
-from scan2sim.slam.charts import Charts
+from scan2sim.slam.facets import Facets
 from scan2sim.slam.features import Found
 from scan2sim.slam.geometry import exp_so3
 from scan2sim.slam.state import load, save
@@ -58,16 +58,16 @@ def tracker(
 
         torch.set_num_threads(1)
     found = features.named(name, weights, count=1500, device="cpu")
-    return DescriptorTracker(Charts(camera), mask, count, found, matchers.named("nearest"), bridge=bridge)
+    return DescriptorTracker(Facets(camera), mask, count, found, matchers.named("nearest"), bridge=bridge)
 
 
 def followed(track: DescriptorTracker, frames: list[U8], turns: list[F64]) -> tuple[F64, F64, F64]:
     """Bearings at first and at last (N, 3) of features still followed, and degrees (N,) that they are wrong by."""
-    track.look(frames[0])
+    track.track(frames[0])
     track.refill()
     ids, start = track.tracks.ids, track.tracks.bearing
     for frame in frames[1:]:
-        track.look(frame)
+        track.track(frame)
     _, i, j = np.intersect1d(ids, track.tracks.ids, return_indices=True)
     first, last = start[i], track.tracks.bearing[j]
     return first, last, degrees(last, first @ (turns[-1].T @ turns[0]).T)
@@ -95,14 +95,14 @@ def test_the_sphere_has_no_special_places(name: str) -> None:
 
 @pytest.mark.parametrize(("axis", "step"), [((1.0, 0.0, 0.0), 1.0), ((0.0, 1.0, 0.0), 5.0)])
 def test_tracks_go_on_across_seam_and_poles(axis: tuple[float, float, float], step: float) -> None:
-    """What was at the horizon comes into the charts of the poles, what was at a pole passes it, or the seam."""
+    """What was at the horizon comes into the facets of the poles, what was at a pole passes it, or the seam."""
     turns = [exp_so3(np.radians(step * i) * np.array(axis)) for i in range(6)]
     camera = Camera("equirectangular", 640, 320)
     track = tracker("orb", camera=camera, count=700)
     first, last, error = followed(track, [seen(camera, R) for R in turns], turns)
     assert len(first) > 500
     if axis[0]:  # the elevation changes, or the side of a pole
-        moved = track.charts.place(first) != track.charts.place(last)
+        moved = track.facets.place(first) != track.facets.place(last)
         passed = (np.abs(first[:, 1]) > 0.9) & (first[:, 2] * last[:, 2] < 0)
         assert passed.sum() >= 2 and np.median(error[passed]) < 0.1
     else:
@@ -156,9 +156,9 @@ def test_wrong_matches_are_not_believed() -> None:
 
     turns = [np.eye(3), exp_so3(np.radians([0.0, 1.0, 0.0]))]
     frames = [seen(SPHERE, R) for R in turns]
-    track = DescriptorTracker(Charts(SPHERE), None, NUMBER, features.named("orb"), Wrong(), bridge=False)
+    track = DescriptorTracker(Facets(SPHERE), None, NUMBER, features.named("orb"), Wrong(), bridge=False)
     assert len(followed(track, frames, turns)[0]) < 0.05 * NUMBER
-    track = DescriptorTracker(Charts(SPHERE), None, NUMBER, features.named("orb"), Wrong())
+    track = DescriptorTracker(Facets(SPHERE), None, NUMBER, features.named("orb"), Wrong())
     first, _, error = followed(track, frames, turns)
     assert len(first) > 0.5 * NUMBER and np.median(error) < 0.1
 
@@ -167,7 +167,7 @@ def test_the_interface_of_a_tracker_whose_run_is_interrupted(tmp_path: Path) -> 
     mask = np.full((256, 512), 255, np.uint8)
     mask[180:] = 0
     track = tracker("orb", mask=mask)
-    assert track.look(seen(SPHERE, np.eye(3))) == 0.0 and len(track.tracks) == 0 and len(track.pictures) == 3
+    assert track.track(seen(SPHERE, np.eye(3))) == 0.0 and len(track.tracks) == 0 and len(track.pictures) == 3
     count = track.refill()
     ids = track.tracks.ids
     assert count == len(ids) == len(np.unique(ids)) > 0.5 * NUMBER and track.refill() < 0.2 * count
@@ -181,7 +181,7 @@ def test_the_interface_of_a_tracker_whose_run_is_interrupted(tmp_path: Path) -> 
     load(tmp_path / "state.npz", track, VALUES)
     before = track.tracks
     turn = exp_so3(np.radians([0.0, 3.0, 0.0]))
-    share = track.look(seen(SPHERE, turn), before.bearing @ turn)
+    share = track.track(seen(SPHERE, turn), before.bearing @ turn)
     assert share == len(track.tracks) / len(before) > 0.6
     assert np.isin(track.tracks.ids, before.ids).all() and len(np.unique(track.tracks.ids)) == len(track.tracks)
     highest = max(ids.max(), track.tracks.ids.max())
@@ -191,9 +191,9 @@ def test_the_interface_of_a_tracker_whose_run_is_interrupted(tmp_path: Path) -> 
     assert fresh and min(fresh) > highest, "a number is never given twice"
     track.tracks = type(track.tracks)()  # as odometry does when it is lost
     assert track.refill() > 0.5 * NUMBER
-    assert track.look(np.full((256, 512), 90, np.uint8)) == 0.0 and len(track.tracks) == 0
+    assert track.track(np.full((256, 512), 90, np.uint8)) == 0.0 and len(track.tracks) == 0
     assert track.refill() == 0
-    track.look(seen(SPHERE, turn))
+    track.track(seen(SPHERE, turn))
     assert track.refill() > 0.5 * NUMBER
 
 
@@ -202,7 +202,7 @@ def test_a_matcher_made_for_other_features_is_refused() -> None:
         name, takes, dimension = "superglue", "superpoint", 256
 
     with pytest.raises(SettingError, match="'superglue' was made for superpoint of 256 numbers, not for orb of 32 by"):
-        DescriptorTracker(Charts(SPHERE), None, 100, features.named("orb"), Glue())  # type: ignore[arg-type]
+        DescriptorTracker(Facets(SPHERE), None, 100, features.named("orb"), Glue())  # type: ignore[arg-type]
 
 
 def test_superpoint_and_superglue_run_together(tmp_path: Path) -> None:
@@ -213,7 +213,7 @@ def test_superpoint_and_superglue_run_together(tmp_path: Path) -> None:
 
     found = features.named("superpoint", saved(tmp_path / "superpoint_v1.pth", MODEL), count=100, device="cpu")
     matcher = matchers.named("superglue", saved(tmp_path / "superglue_outdoor.pth", GLUE), device="cpu")
-    track = DescriptorTracker(Charts(SPHERE), None, NUMBER, found, matcher)
+    track = DescriptorTracker(Facets(SPHERE), None, NUMBER, found, matcher)
     turns = [np.eye(3), exp_so3(np.radians([0.0, 1.0, 0.0]))]
     first, _, error = followed(track, [seen(SPHERE, R) for R in turns], turns)
     assert len(first) > 20 and np.median(error) < 0.1

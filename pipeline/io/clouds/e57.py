@@ -151,9 +151,9 @@ def _crs(path: Path) -> str | None:
 
     with closing(_open(path)) as file:
         root = file.root()
-        told = str(root["coordinateMetadata"].value()) if root.isDefined("coordinateMetadata") else ""
+        text = str(root["coordinateMetadata"].value()) if root.isDefined("coordinateMetadata") else ""
     try:
-        return CRS.from_user_input(told).to_wkt() if told.strip() else None
+        return CRS.from_user_input(text).to_wkt() if text.strip() else None
     except CRSError:
         return None
 

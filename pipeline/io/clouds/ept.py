@@ -179,8 +179,8 @@ def _crs(path: Path, info: dict[str, Any]) -> str | None:
     srs = info.get("srs")
     if not isinstance(srs, dict) or not srs:
         return None
-    told = srs.get("wkt") or f"{srs.get('authority')}:{srs.get('horizontal')}"
+    text = srs.get("wkt") or f"{srs.get('authority')}:{srs.get('horizontal')}"
     try:
-        return CRS.from_user_input(told).to_wkt()
+        return CRS.from_user_input(text).to_wkt()
     except CRSError as error:
         raise InputError(path, f"its CRS can't be read ({str(error)[:100]})", "Mend `srs` in ept.json") from None

@@ -128,8 +128,8 @@ def _parts(path: Path) -> Iterator[Points]:
     Raises:
         InputError: there are fewer, or more, or something else.
     """
-    told = layout(path)
-    for rows in _of_text(path, told) if told.form == "ascii" else _of_bytes(path, told):
+    header = layout(path)
+    for rows in _of_text(path, header) if header.form == "ascii" else _of_bytes(path, header):
         names = rows.dtype.names or ()
 
         def first(wanted: Sequence[str], rows: Any = rows, names: Sequence[str] = names) -> Any:
@@ -145,46 +145,46 @@ def _parts(path: Path) -> Iterator[Points]:
         )
 
 
-def _of_bytes(path: Path, told: Layout) -> Iterator[npt.NDArray[Any]]:
-    first = told.start + told.before
-    there = max(0, path.stat().st_size - first) // told.row.itemsize
-    if there < told.count or (told.last and there > told.count):
-        raise _other_count(path, told.count, there)
+def _of_bytes(path: Path, header: Layout) -> Iterator[npt.NDArray[Any]]:
+    first = header.start + header.before
+    there = max(0, path.stat().st_size - first) // header.row.itemsize
+    if there < header.count or (header.last and there > header.count):
+        raise _other_count(path, header.count, there)
     with path.open("rb") as file:
         file.seek(first)
-        for at in range(0, told.count, PART):
-            yield np.fromfile(file, told.row, min(PART, told.count - at))
+        for at in range(0, header.count, PART):
+            yield np.fromfile(file, header.row, min(PART, header.count - at))
 
 
-def _of_text(path: Path, told: Layout) -> Iterator[npt.NDArray[Any]]:
-    skip, at, names = told.before, 0, told.row.names or ()
+def _of_text(path: Path, header: Layout) -> Iterator[npt.NDArray[Any]]:
+    skip, at, names = header.before, 0, header.row.names or ()
     with path.open("rb") as file:
-        file.seek(told.start)
+        file.seek(header.start)
         for block in text.blocks(path, file):
             lines = block[skip:]
             skip = max(0, skip - len(block))
-            if told.last and at + len(lines) > told.count:
-                raise _other_count(path, told.count, at + len(lines))
-            lines = lines[: told.count - at]
+            if header.last and at + len(lines) > header.count:
+                raise _other_count(path, header.count, at + len(lines))
+            lines = lines[: header.count - at]
             try:
                 table = text.numbers(lines, None, len(names))
             except ValueError as error:
                 if lines and len(lines[-1].split()) < len(names):  # the last line of a broken copy
-                    raise _other_count(path, told.count, at + len(lines) - 1) from None
+                    raise _other_count(path, header.count, at + len(lines) - 1) from None
                 raise _bad(path, f"vertices {at + 1:,} to {at + len(lines):,}: {error}") from None
-            rows = np.empty(len(table), told.row)
+            rows = np.empty(len(table), header.row)
             with np.errstate(invalid="ignore", over="ignore"):  # numbers that their type can't hold
                 for k, name in enumerate(names):
                     rows[name] = table[:, k]
             yield rows
             at += len(rows)
-    if at < told.count:
-        raise _other_count(path, told.count, at)
+    if at < header.count:
+        raise _other_count(path, header.count, at)
 
 
-def _other_count(path: Path, told: int, there: int) -> InputError:
-    some = f"{there:,}" if there < told else f"{there:,} or more"
-    return InputError(path, f"is truncated or damaged: its header says {told:,} vertices, there are {some}", AGAIN)
+def _other_count(path: Path, declared: int, there: int) -> InputError:
+    some = f"{there:,}" if there < declared else f"{there:,} or more"
+    return InputError(path, f"is truncated or damaged: its header says {declared:,} vertices, there are {some}", AGAIN)
 
 
 def _bad(path: Path, cause: str) -> InputError:

@@ -138,5 +138,5 @@ def _crs(path: Path) -> str | None:
     if not file.is_file():
         return None
     with open(file, encoding="utf-8", errors="replace") as lines:
-        told = re.match(r"WGS84 UTM (\d{1,2})([NS])", lines.readline(200))
-    return utm_zone(int(told[1]), north=told[2] == "N") if told and 1 <= int(told[1]) <= 60 else None
+        match = re.match(r"WGS84 UTM (\d{1,2})([NS])", lines.readline(200))
+    return utm_zone(int(match[1]), north=match[2] == "N") if match and 1 <= int(match[1]) <= 60 else None

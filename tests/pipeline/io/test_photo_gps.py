@@ -89,7 +89,7 @@ def test_a_model_is_placed_in_spite_of_noise_and_wrong_fixes(tmp_path: Path) -> 
     assert 1.5 < present(fit.rms) < 3.5  # 1.5 m in each of three directions
     assert np.abs(fit.onto.apply(in_model(places)) - places).max() < 2.0
     assert fit.onto.scale == pytest.approx(1 / SCALE, rel=0.02)
-    assert "37 of 40 photos" in fit.told[0] and f"{fit.rms:.2f} m off" in fit.told[0] and len(fit.told) == 1
+    assert "37 of 40 photos" in fit.notes[0] and f"{fit.rms:.2f} m off" in fit.notes[0] and len(fit.notes) == 1
 
 
 def test_exact_gps_places_exactly(tmp_path: Path) -> None:
@@ -111,7 +111,7 @@ def test_on_a_straight_track_the_photos_own_up_tells_the_roll(tmp_path: Path) ->
     fit = by_photos(tmp_path, in_model(line()), ups(16), photos(tmp_path, told), CRS)
     up = fit.onto.rotation @ TURN.apply([0.0, 0.0, 1.0])
     assert np.degrees(np.arccos(up[2])) < 3
-    assert "GPS can't tell the roll" in fit.told[1]
+    assert "GPS can't tell the roll" in fit.notes[1]
 
 
 @pytest.mark.parametrize(
@@ -131,7 +131,7 @@ def test_a_track_that_tells_too_little_is_refused(tmp_path: Path, places: F64, n
 def test_photos_without_altitudes_are_told(tmp_path: Path) -> None:
     flat = circle() * [1, 1, 0]
     fit = by_photos(tmp_path, in_model(flat), ups(16), photos(tmp_path, flat, altitude=False), CRS)
-    assert "no altitudes" in fit.told[1] and np.abs(fit.onto.apply(in_model(flat)) - flat).max() < 0.02
+    assert "no altitudes" in fit.notes[1] and np.abs(fit.onto.apply(in_model(flat)) - flat).max() < 0.02
 
 
 def test_the_command_places_model_and_cloud(tmp_path: Path) -> None:

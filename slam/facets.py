@@ -1,6 +1,6 @@
-"""Charts: the pictures in which features of a frame are found and followed, and the way from pixels to the sphere.
+"""Facets: the pictures in which features of a frame are found and followed, and the way from pixels to the sphere.
 
-A perspective or fisheye frame is its own chart. An equirectangular frame is three: the band around the horizon,
+A perspective or fisheye frame is its own facet. An equirectangular frame is three: the band around the horizon,
 continued on both sides across the seam, and what two wide-angle cameras see that look straight up and straight down.
 Within the band a turn of the car merely shifts the picture, within the caps it merely turns it: the seam and the poles
 are no special places, and no feature is ever followed where the frame is stretched to more than 1.5 times its width.
@@ -22,16 +22,16 @@ Bools = npt.NDArray[np.bool_]
 BAND = math.radians(46)
 """Elevation up to which features are followed in the band."""
 MARGIN = math.radians(8)
-"""The charts overlap so far, so that a feature's surroundings are in its chart."""
+"""The facets overlap so far, so that a feature's surroundings are in its facet."""
 
 
-class Charts:
+class Facets:
     """Of a camera's frames.
 
     Attributes:
         camera: of the frames.
-        count: of the charts.
-        pixel: radians that a chart's pixel spans.
+        count: of the facets.
+        pixel: radians that a facet's pixel spans.
     """
 
     def __init__(self, camera: Camera) -> None:
@@ -58,7 +58,7 @@ class Charts:
             self._maps.append((np.ascontiguousarray(x), np.clip(y, 0, h - 1)))  # beyond a pole isn't the other one
 
     def pictures(self, grey: U8) -> list[U8]:
-        """The charts of a frame (H, W); of masks, too."""
+        """The facets of a frame (H, W); of masks, too."""
         if self.whole:
             return [grey]
         import cv2
@@ -68,32 +68,32 @@ class Charts:
         return [band, *caps]
 
     def place(self, bearing: F64) -> I32:
-        """(N,) the chart in which each of (N, 3) unit bearings is to be followed."""
+        """(N,) the facet in which each of (N, 3) unit bearings is to be followed."""
         if self.whole:
             return np.zeros(len(bearing), np.int32)
         y = bearing[:, 1]
         return np.where(np.abs(y) <= math.sin(BAND), 0, np.where(y < 0, 1, 2)).astype(np.int32)
 
-    def pixels(self, chart: int, bearing: F64) -> F32:
-        """(N, 2) places in a chart of (N, 3) bearings; NaN where it doesn't show them."""
-        if self.whole or chart == 0:
+    def pixels(self, facet: int, bearing: F64) -> F32:
+        """(N, 2) places in a facet of (N, 3) bearings; NaN where it doesn't show them."""
+        if self.whole or facet == 0:
             uv, ok = project(self.camera, bearing)
             if not self.whole:
                 uv[:, 0] += self._pad
                 uv[:, 1] -= self._rows[0]
         else:
-            uv, ok = project(self._cap, bearing @ _CAPS[chart - 1])
+            uv, ok = project(self._cap, bearing @ _CAPS[facet - 1])
         uv[~ok] = np.nan
         return uv
 
-    def bearings(self, chart: int, uv: npt.NDArray[np.floating]) -> F64:
-        """(N, 3) unit bearings, camera axes, of places (N, 2) in a chart."""
+    def bearings(self, facet: int, uv: npt.NDArray[np.floating]) -> F64:
+        """(N, 3) unit bearings, camera axes, of places (N, 2) in a facet."""
         uv = np.asarray(uv, np.float64)
         if self.whole:
             return unproject(self.camera, uv)
-        if chart == 0:
+        if facet == 0:
             return unproject(self.camera, uv + [-self._pad, self._rows[0]])
-        return unproject(self._cap, uv) @ _CAPS[chart - 1].T
+        return unproject(self._cap, uv) @ _CAPS[facet - 1].T
 
     def cell(self, bearing: F64, across: int) -> npt.NDArray[np.int64]:
         """(N,) number of the cell of the sphere, or of the frame, that holds a bearing: `across` cells a full width."""
