@@ -73,8 +73,8 @@ def street(out: Path, seed: int) -> Path:
     return folder
 
 
-def told(tile: Path, out: Path, *settings: str) -> tuple[Confusion, float]:
-    """Run `scan2sim segment` anew on a tile whose cloud has classes; what it told, and seconds."""
+def segmented(tile: Path, out: Path, *settings: str) -> tuple[Confusion, float]:
+    """Run `scan2sim segment` anew on a tile whose cloud has classes; how its classes compare, and seconds."""
     from scan2sim.pipeline.io.clouds import las
     from scan2sim.pipeline.io.tile import read_tile
 
@@ -93,7 +93,7 @@ def streets(out: Path) -> dict[str, float]:
     for seed in STREETS:
         tile = street(out, seed)
         for kind, settings in (("photos", ()), ("shape", ("segment.photos=false",))):
-            found, seconds = told(tile, out / f"told_{seed}_{kind}", *settings)
+            found, seconds = segmented(tile, out / f"told_{seed}_{kind}", *settings)
             rows[kind].append(found)
             sign = found.iou.get("road_sign", float("nan"))
             print(f"\nstreet {seed}, {kind}: mIoU {found.mean():.3f}, signs {sign:.3f}, {seconds:.0f} s")
@@ -110,7 +110,7 @@ def time_of_nine_million(out: Path) -> float:
     tile = out.parent / "street_100_9e+06_40"
     if not (tile / "tile.toml").is_file():
         scan2sim("sample", "--length=100", "--points=9e6", "--photos=40", "--seed=0", tile)
-    found, seconds = told(tile, out / "told_9m")
+    found, seconds = segmented(tile, out / "told_9m")
     print(f"\n9 million points, 40 photos: {seconds:.0f} s, mIoU {found.mean():.3f}\n{found.table()}", flush=True)
     return seconds / 60
 
@@ -126,7 +126,7 @@ def network() -> dict[str, float]:
     rgb = cv2.resize(bgr, (1536, 1024))[..., ::-1]
     photo = np.concatenate([rgb, np.zeros((*rgb.shape[:2], COUNT), np.uint8)], axis=2)
     networks = {form: load("street", OWN.with_suffix(form), "cpu") for form in (".onnx", ".safetensors")}
-    told = {form: one.probabilities(photo).argmax(axis=0) for form, one in networks.items()}
+    segmented = {form: one.probabilities(photo).argmax(axis=0) for form, one in networks.items()}
     seconds: dict[str, list[float]] = {form: [] for form in networks}
     for _ in range(15):
         for form, one in networks.items():
@@ -134,7 +134,7 @@ def network() -> dict[str, float]:
             one.probabilities(photo)
             seconds[form].append(time.perf_counter() - start)
     onnx, torch = (float(np.median(seconds[form])) for form in networks)
-    same = float((told[".onnx"] == told[".safetensors"]).mean())
+    same = float((segmented[".onnx"] == segmented[".safetensors"]).mean())
     print(f"\na photo of 1536 x 1024: {onnx:.3f} s by onnxruntime, {torch:.3f} s by torch; same class: {same:.6f}")
     return {"network_ratio": onnx / torch, "network_same": same}
 

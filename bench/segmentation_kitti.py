@@ -38,9 +38,9 @@ VOXEL = 0.1
 def kitti(out: Path) -> dict[str, Confusion]:
     """Both streets, by way; overlays of the photos in `out`."""
     known: list[U8] = []
-    told: dict[str, list[U8]] = {way: [] for way in WAYS}
+    predicted: dict[str, list[U8]] = {way: [] for way in WAYS}
     for name in STREETS:
-        for view, by_way in _told(name, out / name):
+        for view, by_way in _labelled(name, out / name):
             drawn = _drawn(view)
             rgb = image.read_rgb(view.photo)
             rows = [rgb, *(0.5 * rgb + 0.5 * _colours()[codes] for codes in by_way.values())]
@@ -48,8 +48,8 @@ def kitti(out: Path) -> dict[str, Confusion]:
             some = drawn != NONE
             known.append(_codes()[drawn[some]])
             for way, codes in by_way.items():
-                told[way].append(np.where(codes[some] == 0, SKY, codes[some]).astype(np.uint8))
-    found = {way: confusion(np.concatenate(known), np.concatenate(told[way])) for way in WAYS}
+                predicted[way].append(np.where(codes[some] == 0, SKY, codes[some]).astype(np.uint8))
+    found = {way: confusion(np.concatenate(known), np.concatenate(predicted[way])) for way in WAYS}
     for way, result in found.items():
         print(f"\nKITTI pixels, {way} ({SKY} is sky): mIoU {mean(result):.3f}\n{result.table()}", flush=True)
     return found
@@ -60,7 +60,7 @@ def mean(found: Confusion) -> float:
     return float(np.mean(list(found.iou.values())))
 
 
-def _told(name: str, folder: Path) -> Iterator[tuple[View, dict[str, U8]]]:
+def _labelled(name: str, folder: Path) -> Iterator[tuple[View, dict[str, U8]]]:
     """The photos that polygons were drawn on, and LAS codes (H, W), 0 for the sky, by way."""
     path, _ = made(STREETS[name], folder, run=False)
     run("segment", path / "tile.toml", "--out", folder / "told")

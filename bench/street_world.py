@@ -99,14 +99,14 @@ class World:
         for part in np.array_split(np.arange(height * width), height * width * SAMPLES**2 // CHUNK + 1):
             distance[part], _ = self._cast(photo, column[part], row[part], colours=False)
             hit = np.isfinite(distance[part])
-            total, met = np.zeros((hit.sum(), 3)), np.zeros(hit.sum())
+            total, hits = np.zeros((hit.sum(), 3)), np.zeros(hit.sum())
             for down in offset:
                 for across in offset:
                     far, colour = self._cast(photo, column[part][hit] + across, row[part][hit] + down)
                     total += colour
-                    met += np.isfinite(far)
-            mean = np.round(total / np.maximum(met, 1)[:, None]).astype(np.uint8)
-            rgb[part[hit]] = np.where(met[:, None] > 0, mean, rgb[part[hit]])
+                    hits += np.isfinite(far)
+            mean = np.round(total / np.maximum(hits, 1)[:, None]).astype(np.uint8)
+            rgb[part[hit]] = np.where(hits[:, None] > 0, mean, rgb[part[hit]])
         return Seen(rgb.reshape(height, width, 3), distance.reshape(height, width))
 
     def _cast(
@@ -118,16 +118,16 @@ class World:
         way = np.stack([column, row, np.ones(len(row))], axis=1) @ np.linalg.inv(photo.K).T
         way = way / np.linalg.norm(way, axis=1, keepdims=True) @ photo.T[:3, :3].T
         rays = np.concatenate([np.broadcast_to(photo.T[:3, 3], way.shape), way], axis=1).astype(np.float32)
-        met = self.casting.cast_rays(o3d.core.Tensor(rays))
-        distance = met["t_hit"].numpy()
+        hits = self.casting.cast_rays(o3d.core.Tensor(rays))
+        distance = hits["t_hit"].numpy()
         rgb = np.zeros((len(rays), 3))
         if colours:
-            which, face, weight = (met[k].numpy() for k in ("geometry_ids", "primitive_ids", "primitive_uvs"))
+            which, face, weight = (hits[k].numpy() for k in ("geometry_ids", "primitive_ids", "primitive_uvs"))
             for k in range(len(self._uv)):
                 at = np.flatnonzero(np.isfinite(distance) & (which == k))
                 b, c = weight[at].T
                 uv = np.einsum("nkj,nk->nj", self._uv[k][face[at]], np.stack([1 - b - c, b, c], axis=1))
-                rgb[at] = _look_up(self._page[k], uv)
+                rgb[at] = _sample(self._page[k], uv)
         return distance, rgb
 
     def distance(self, places: F64) -> npt.NDArray[np.float32]:
@@ -135,7 +135,7 @@ class World:
         return np.asarray(self.casting.compute_distance(np.ascontiguousarray(places, np.float32)).numpy())
 
 
-def _look_up(page: U8, uv: npt.NDArray[Any]) -> F64:
+def _sample(page: U8, uv: npt.NDArray[Any]) -> F64:
     """Bilinear colours (N, 3) of a picture at uv (N, 2), (0, 0) its lower left corner."""
     height, width = page.shape[:2]
     x = np.clip(uv[:, 0] * width - 0.5, 0, width - 1.001)

@@ -68,7 +68,7 @@ def main() -> None:
             known[part] = one_tile(survey / MIDDLE, out / "tile")
         print(part, json.dumps(known[part]), flush=True)
         notes.write_text(json.dumps(known, indent=1))
-    told(known, out)
+    report(known, out)
 
 
 def street(out: Path) -> Path:
@@ -199,7 +199,7 @@ def borders(out: Path) -> dict[str, float]:
     }
 
 
-def told(known: dict[str, dict[str, Any]], out: Path) -> None:
+def report(known: dict[str, dict[str, Any]], out: Path) -> None:
     """Print the table and RESULT."""
     for part, values in known.items():
         print(f"{part:<8}", " ".join(f"{name} {value}" for name, value in values.items()))

@@ -82,9 +82,9 @@ def _root(
 
 def _through_prefect(*arguments: Any) -> None:
     """Make a survey as a flow of Prefect; arguments as the flow's."""
-    from scan2sim.flows.deployed.survey import meet_server, survey
+    from scan2sim.flows.deployed.survey import check_server, survey
 
-    meet_server()
+    check_server()
     survey(*arguments)
 
 

@@ -97,7 +97,7 @@ class CloseUps:
         """
         return _clear(self.pictures, self.project, self.focal, plates, *_samples(shape), RIM, off, NOISE)
 
-    def shows(self, plate: Plate, share: float = 1.0) -> bool:
+    def is_there(self, plate: Plate, share: float = 1.0) -> bool:
         """Whether a plate is there, as clear as one must be, or a share of it."""
         _, weakest, alike = self.clear(plate.shape, _row(plate))[0]
         return bool(weakest >= share * CLOSED and alike >= share * ALIKE)
@@ -216,8 +216,8 @@ def _clearest(
     """
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         best = list(pool.map(lambda shape: _best(shown, shape, at, low, high), OUTLINES))
-    found = [_outermost(shown, plate, turns) for plate in best if plate is not None and shown.shows(plate, NEARLY)]
-    there = [plate for plate in found if shown.shows(plate)]
+    found = [_outermost(shown, plate, turns) for plate in best if plate is not None and shown.is_there(plate, NEARLY)]
+    there = [plate for plate in found if shown.is_there(plate)]
     if not there:
         return None
     largest = max(plate.area for plate in there)
@@ -248,14 +248,14 @@ def _best(
 
     def hopeless(intermediate_result: OptimizeResult) -> bool:
         best = _of(shape, plates(intermediate_result.x[None])[0])
-        return bool(intermediate_result.nit >= MIDWAY and not shown.shows(best, HOPEFUL))
+        return bool(intermediate_result.nit >= MIDWAY and not shown.is_there(best, HOPEFUL))
 
     bounds = list(zip(low, high, strict=True))
     found = differential_evolution(
         price, bounds, popsize=16, maxiter=GENERATIONS, tol=1e-2, rng=0, polish=False, updating="deferred",
         vectorized=True, callback=hopeless,
     )  # fmt: skip
-    if not shown.shows(_of(shape, plates(found.x[None])[0]), ROUGHLY):
+    if not shown.is_there(_of(shape, plates(found.x[None])[0]), ROUGHLY):
         return None
     finer = minimize(
         one, found.x, method="Nelder-Mead", bounds=bounds, options={"maxiter": 300, "xatol": 1e-3, "fatol": 1e-5}
@@ -271,7 +271,7 @@ def _outermost(shown: CloseUps, plate: Plate, turns: Sequence[float]) -> Plate:
         worth = shown.worth(plate.shape, np.concatenate([_row(p) for p in ring]))
         peaks = [k for k in range(1, len(ring) - 1) if worth[k] > max(worth[k - 1], worth[k + 1])]
         larger = (_nearby(shown, ring[k], turns) for k in reversed(peaks))
-        found = next((other for other in larger if shown.shows(other)), None)
+        found = next((other for other in larger if shown.is_there(other)), None)
         if found is None:
             break
         plate = found

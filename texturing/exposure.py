@@ -118,7 +118,7 @@ def observe(
     params: ExposureParams,
     report: Report,
 ) -> Observed:
-    """Look random places of every photo up in all photos that see them; read photo by photo."""
+    """Sample random places of every photo in all photos that see them; read photo by photo."""
     import numpy as np
 
     from scan2sim.pipeline.visibility import load_depth_map
@@ -143,7 +143,7 @@ def observe(
         if photo is None:
             continue
         depth = load_depth_map(depth_file(i), views[i].camera, views[i].T_world_cam)
-        rows.append((i, *_look_up(photo.low, photo.mask, views[i], depth, place, normal, params.max_distance)))
+        rows.append((i, *_observe(photo.low, photo.mask, views[i], depth, place, normal, params.max_distance)))
     if not rows:
         return Observed(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0))
     index = np.concatenate([np.full(len(r[1]), r[0]) for r in rows])
@@ -152,7 +152,7 @@ def observe(
     return Observed(index[several], at[several], value[several], q[several])
 
 
-def _look_up(
+def _observe(
     low: npt.NDArray[np.uint8],
     mask: npt.NDArray[np.uint8],
     view: View,

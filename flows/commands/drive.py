@@ -27,7 +27,7 @@ def survey_of(
     *,
     length: float | None = None,
     buffer: float | None = None,
-    say: Callable[[str], None] = lambda _: None,
+    warn: Callable[[str], None] = lambda _: None,
 ) -> str:
     """The `survey.toml` of a source: a survey itself, a corridor (`tile.toml`), or a drive (`drive.toml`).
 
@@ -38,7 +38,7 @@ def survey_of(
         target: gets `prepared/` with `slam/`, `corridor/` and `survey/`, as needed.
         run: runs the steps.
         length, buffer: metres, how it is cut, if not as the drive says or as usual.
-        say: told what the steps that ran have warned of.
+        warn: gets what the steps that ran have warned of.
 
     Raises:
         InputError: it is none of these, or says something impossible.
@@ -57,12 +57,12 @@ def survey_of(
         outcome.check()
         for item in planned:
             for text in outcome.done[item.node.id].warnings if item.reason is not None else ():
-                say(text)
+                warn(text)
         folders = {item.node.id.name: store.folder(item.node.label, item.key) for item in planned}
         if "place" in folders:
             publish_path(planned, outcome.of_tile(), store, out / "slam")
         for name in SHOWN.keys() & folders.keys():
-            _show(folders[name] / SHOWN[name], out / SHOWN[name])
+            _link(folders[name] / SHOWN[name], out / SHOWN[name])
         store.sweep({item.node.id.name: item.key for item in planned})
         digests.save()
     return str(folders["cut"] / "survey" / "survey.toml")
@@ -99,7 +99,7 @@ def plan_drive(
     return plan(recipe(drive, source.parent), store, digest=digests), store, digests
 
 
-def _show(folder: Path, place: Path) -> None:
+def _link(folder: Path, place: Path) -> None:
     """Have a link lead to a result."""
     if place.is_symlink():
         place.unlink()

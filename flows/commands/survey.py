@@ -105,7 +105,7 @@ def run_source(
     def run(planned: list[Planned], store: Store) -> Outcome:
         return execute_shown(planned, store, log, jobs, to_the_end=True, memory=gigabytes)
 
-    path = survey_of(source, target, run, length=length, buffer=buffer, say=warn)
+    path = survey_of(source, target, run, length=length, buffer=buffer, warn=warn)
     make_survey(path, target, settings, run)
 
 

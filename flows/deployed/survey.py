@@ -25,7 +25,7 @@ from scan2sim.pipeline.errors import INTERRUPTED, StepError, UnavailableError, e
 from scan2sim.pipeline.io.remote import likeness
 
 
-def meet_server() -> None:
+def check_server() -> None:
     """Find out early whether the server that is named answers; without one the run starts its own.
 
     Ctrl-C interrupts that one, too, and Prefect would try for minutes to tell it: the process ends at once instead.

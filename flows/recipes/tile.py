@@ -95,7 +95,7 @@ class _Graph:
     Attributes:
         nodes: so far.
         cell: parameters of what happens at borders; empty where the tile was cut from nothing.
-        met: neighbours that are made, too, and
+        adjoining: neighbours that are made, too, and
         first: those of them that own the border with this one.
         photographed: whether there are photos from the ground.
         scanner: the path, where there is one, and
@@ -113,8 +113,8 @@ class _Graph:
         self.cell: dict[str, Any] = {}
         if tile.cell:
             self.cell = {"seed": tile.cell.seed, "neighbours": dict(tile.cell.neighbours)}
-        self.met = [name for name in self.cell.get("neighbours", {}) if name in (beside or ())]
-        self.first = [name for name in self.met if name < tile.name]
+        self.adjoining = [name for name in self.cell.get("neighbours", {}) if name in (beside or ())]
+        self.first = [name for name in self.adjoining if name < tile.name]
         self.photographed = any(view.camera.model != "orthographic" for view in tile.views)
         self.scanner: Sources = {}
         self.rays: Sources = {}
@@ -134,7 +134,7 @@ class _Graph:
 
     def of_neighbours(self, step: Step, name: str, group: str = "", prefix: str | None = None) -> Sources:
         """An output of all neighbours' nodes, by `prefix` (default: its name) and the tile's name."""
-        return {f"{prefix or name}.{tile}": self.at(step, name, group, tile) for tile in self.met}
+        return {f"{prefix or name}.{tile}": self.at(step, name, group, tile) for tile in self.adjoining}
 
     def classes(self) -> Sources:
         """What each point is, by photos and shape; returns what photos tell of points."""
@@ -170,17 +170,17 @@ class _Graph:
         """The cloud without what moves or is too far, with what neighbours know of the border; returns it."""
         at, add = self.at, self.add
         last = SEGMENT  # step whose cloud is split, in every tile of a survey the same
-        if self.settings.params(THINGS).find and (self.scanner or self.met):
+        if self.settings.params(THINGS).find and (self.scanner or self.adjoining):
             classified: Sources = {name: at(SEGMENT, name) for name in ("cloud", "confidence")}
             add(THINGS, classified | self._moving() | self.scanner)
             last, self.listed = THINGS, {"things": at(THINGS, "things")} if self.scanner else {}
         limit = self.settings.params(REACH).limit
-        if limit != "off" and (self.met or (self.scanner and (self.photographed or limit != "auto"))):
+        if limit != "off" and (self.adjoining or (self.scanner and (self.photographed or limit != "auto"))):
             shown = self._views() if self.photographed else {}
             size = self.settings.params(VOXEL, "terrain").size
             add(REACH, {"cloud": at(last, "cloud")} | self.scanner | shown, voxel=size)
             last = REACH
-        if not (self.met and self.tile.cell):
+        if not (self.adjoining and self.tile.cell):
             return at(last, "cloud")
         others = self.of_neighbours(last, "cloud")
         cell = self.tile.cell
@@ -261,7 +261,7 @@ class _Graph:
         if cell:
             add(CLIP, {"mesh": surface}, group, **cell)
             surface = at(CLIP, "mesh", group)
-        if self.met:
+        if self.adjoining:
             clipped = {name: at(CLIP, name, group) for name in ("mesh", "on")}
             others = {f"{name}.{tile}": at(CLIP, name, group, tile) for tile in self.first for name in clipped}
             add(JOIN, clipped | others, group, name=self.tile.name, **cell)
@@ -323,7 +323,7 @@ class _Graph:
             stood = self.listed if group == "terrain" and not self.kept else {}
             add(TEXTURE, {**unwrapped, **choice, **points, **seen, **stood}, group)
         last = TEXTURE
-        if self.met:
+        if self.adjoining:
             last = LEVEL
             for group in self.groups:
                 others = self.of_neighbours(TEXTURE, "textured", group, prefix="neighbour")
@@ -344,7 +344,7 @@ class _Graph:
             truth = {"truth.mesh": tile.truth_mesh, "truth.points": tile.truth_points}
         add(GEOMETRY, _meshes(surfaces) | self._clouds() | _invented(made) | truth, **self.cell)
         add(SCORE, textured | {name: seen[name] for name in ("views", "depth")} | self.listed | truth)
-        if self.met:
+        if self.adjoining:
             mine = {f"textured.{g}": at(LEVEL, "textured", g) for g in self.groups}
             theirs = {f"textured.{g}.{n}": at(LEVEL, "textured", g, n) for g in self.groups for n in self.first}
             add(BORDERS, mine | theirs, **self.cell)

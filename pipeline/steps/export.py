@@ -163,7 +163,7 @@ def _write_group(
     import shutil
 
     from scan2sim.pipeline.io import image
-    from scan2sim.pipeline.io.meshes import Look
+    from scan2sim.pipeline.io.meshes import PageNames
 
     formats = [form for form in formats if hasattr(form, "write")]
     if not formats:
@@ -175,13 +175,13 @@ def _write_group(
             shutil.copyfile(surface.pages[page], folder / images[page])
         else:
             image.write(folder / images[page], image.read_rgb(surface.pages[page]), quality=params.jpeg_quality)
-    look = Look(group, materials, images, tuple(surface.used_pages))
+    names = PageNames(group, materials, images, tuple(surface.used_pages))
     counts = {}
     parts = surface.parts(params.max_visual_triangles)
     for i, part in enumerate(parts, start=1):
         stem = group if len(parts) == 1 else f"{group}_part{i}"
         for form in formats:
-            form.write(folder / f"{stem}{form.SUFFIX}", part, look)
+            form.write(folder / f"{stem}{form.SUFFIX}", part, names)
             counts[f"{stem}{form.SUFFIX}"] = len(part)
     return counts
 

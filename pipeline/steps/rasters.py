@@ -72,7 +72,7 @@ def rasters(inputs: Inputs, params: RastersParams, out: Path, report: Report) ->
             f"Set export.rasters={params.pixel * (grid.width * grid.height / LARGEST) ** 0.5 * 1.1:.2g} or more",
         )
 
-    def looks(renderer: Renderer, samples: int = 1) -> Iterator[Image]:
+    def rendered(renderer: Renderer, samples: int = 1) -> Iterator[Image]:
         rows = max(1, BAND // grid.width)
         for first in range(0, grid.height, rows):
             south_west, north_east = grid.band(first, min(rows, grid.height - first))
@@ -80,12 +80,12 @@ def rasters(inputs: Inputs, params: RastersParams, out: Path, report: Report) ->
             yield renderer.above(*corners, width=grid.width, samples=samples)
 
     def heights(renderer: Renderer) -> Iterator[npt.NDArray[np.float64]]:
-        for image in looks(renderer):
+        for image in rendered(renderer):
             z = high[2] + 1.0 - image.range.astype(float) + frame.origin[2]
             yield np.where(image.hit, z / frame.unit, np.nan)
 
     def colours() -> Iterator[npt.NDArray[np.uint8]]:
-        for image in looks(
+        for image in rendered(
             render.Renderer(list(bodies.values())), min(SAMPLES, round(params.pixel / params.texel)) or 1
         ):
             yield np.dstack([image.rgb, image.hit * np.uint8(255)])

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Look:
+class PageNames:
     """What the texture pages of a class are called in its files, and beside them.
 
     Attributes:
@@ -41,7 +41,7 @@ class ModelFormat(Protocol):
 
     SUFFIX: str
 
-    def write(self, path: Path, surface: Textured, look: Look) -> None:
+    def write(self, path: Path, surface: Textured, names: PageNames) -> None:
         """Write a class, or a part of it: local metres, z up."""
 
 

@@ -12,20 +12,20 @@ from pathlib import Path
 
 import numpy as np
 
-from scan2sim.pipeline.io.meshes import Look
+from scan2sim.pipeline.io.meshes import PageNames
 from scan2sim.pipeline.io.textured import Textured, unique_uv
 
 SUFFIX = ".dae"
 EPOCH = datetime(2000, 1, 1)  # written for the time of making, so that the same mesh gives the same bytes
 
 
-def write(path: Path, surface: Textured, look: Look) -> None:
+def write(path: Path, surface: Textured, names: PageNames) -> None:
     """Write a textured mesh, one geometry and one material a page.
 
     Args:
         path: of the .dae.
         surface: local metres, z up; seven significant digits are written (0.1 mm within 1 km).
-        look: names of materials and images.
+        names: names of materials and images.
     """
     import collada
     from collada import asset, scene, source
@@ -36,7 +36,7 @@ def write(path: Path, surface: Textured, look: Look) -> None:
     document.assetInfo.unitname, document.assetInfo.unitmeter = "meter", 1.0
     nodes = []
     for page in surface.used_pages:
-        name = look.materials[page]
+        name = names.materials[page]
         part = surface.on_page(page)
         assert part.mesh.uv is not None
         uv, corner_uv = unique_uv(part.mesh.uv)
@@ -57,7 +57,7 @@ def write(path: Path, surface: Textured, look: Look) -> None:
         index = np.stack([part.mesh.faces, part.mesh.faces, corner_uv], axis=2)
         geometry.primitives.append(geometry.createTriangleSet(index.ravel(), inputs, name))
         document.geometries.append(geometry)
-        material = _material(document, name, look.images[page])
+        material = _material(document, name, names.images[page])
         bound = scene.MaterialNode(name, material, inputs=[("UV", "TEXCOORD", "0")])
         nodes.append(scene.Node(name, children=[scene.GeometryNode(geometry, [bound])]))
     document.scenes.append(scene.Scene("scene", nodes))

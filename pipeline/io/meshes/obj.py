@@ -11,7 +11,7 @@ from typing import Any, TextIO
 import numpy as np
 import numpy.typing as npt
 
-from scan2sim.pipeline.io.meshes import Look
+from scan2sim.pipeline.io.meshes import PageNames
 from scan2sim.pipeline.io.textured import Textured, unique_uv, vertex_normals
 from scan2sim.pipeline.types import Mesh
 
@@ -19,16 +19,16 @@ SUFFIX = ".obj"
 CHUNK = 100_000  # rows formatted at once
 
 
-def write(path: Path, surface: Textured, look: Look) -> None:
+def write(path: Path, surface: Textured, names: PageNames) -> None:
     """Write a textured mesh, one `usemtl` a page, and its class's materials beside it.
 
     Args:
         path: of the .obj.
         surface: local metres, z up; its texture coordinates have their origin at the lower left, as OBJ's.
-        look: names of materials and images; the material file is called by the class.
+        names: names of materials and images; the material file is called by the class.
     """
-    mtl = path.with_name(f"{look.group}.mtl")
-    _write_materials(mtl, look)
+    mtl = path.with_name(f"{names.group}.mtl")
+    _write_materials(mtl, names)
     mesh = surface.mesh
     assert mesh.uv is not None and mesh.page is not None
     uv, corner_uv = unique_uv(mesh.uv)
@@ -38,7 +38,7 @@ def write(path: Path, surface: Textured, look: Look) -> None:
         _rows(file, "vt %.6f %.6f\n", uv)
         _rows(file, "vn %.3f %.3f %.3f\n", surface.normal)
         for page in surface.used_pages:
-            file.write(f"usemtl {look.materials[page]}\n")
+            file.write(f"usemtl {names.materials[page]}\n")
             here = mesh.page == page
             v, vt = mesh.faces[here] + 1, corner_uv[here] + 1
             _rows(file, "f %d/%d/%d %d/%d/%d %d/%d/%d\n", np.stack([v, vt, v], axis=2))
@@ -52,11 +52,11 @@ def write_plain(path: Path, mesh: Mesh) -> None:
         _rows(file, "f %d//%d %d//%d %d//%d\n", np.repeat(mesh.faces + 1, 2, axis=1))
 
 
-def _write_materials(path: Path, look: Look) -> None:
+def _write_materials(path: Path, names: PageNames) -> None:
     """Write matt materials of the pages that are used."""
     lines = [
-        f"newmtl {look.materials[page]}\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nd 1\nillum 1\nmap_Kd {look.images[page]}\n"
-        for page in look.used
+        f"newmtl {names.materials[page]}\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nd 1\nillum 1\nmap_Kd {names.images[page]}\n"
+        for page in names.used
     ]
     path.write_text("\n".join(lines), encoding="ascii")
 

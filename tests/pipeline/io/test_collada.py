@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from scan2sim.pipeline.io import textured
-from scan2sim.pipeline.io.meshes import Look
+from scan2sim.pipeline.io.meshes import PageNames
 from scan2sim.pipeline.io.meshes import collada as dae
 from scan2sim.pipeline.types import Mesh
 from tests.pipeline import made_up
@@ -22,7 +22,7 @@ def test_triangles_uv_and_pages_survive(tmp_path: Path, make: Callable[[], Mesh]
 
     mesh = make()
     surface = present(textured.read(made_up.textured(tmp_path / "in", mesh)))
-    dae.write(tmp_path / "a.dae", surface, Look("a", ("m_0", "m_1"), ("m_0.png", "m_1.png"), (0, 1)))
+    dae.write(tmp_path / "a.dae", surface, PageNames("a", ("m_0", "m_1"), ("m_0.png", "m_1.png"), (0, 1)))
     read = collada.Collada(str(tmp_path / "a.dae"))
     assert read.assetInfo.upaxis == "Z_UP" and read.assetInfo.unitmeter == 1.0
     for page, (corners, uv) in made_up.by_page(mesh).items():

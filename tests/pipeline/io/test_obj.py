@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from scan2sim.pipeline.io import textured
-from scan2sim.pipeline.io.meshes import Look, obj
+from scan2sim.pipeline.io.meshes import PageNames, obj
 from scan2sim.pipeline.types import Mesh
 from tests.pipeline import made_up
 from tests.present import present
 
-LOOK = Look("a", ("m_0", "m_1"), ("m_0.png", "m_1.png"), (0, 1))
+NAMES = PageNames("a", ("m_0", "m_1"), ("m_0.png", "m_1.png"), (0, 1))
 
 
 @pytest.mark.parametrize("make", [made_up.ground, made_up.house])
@@ -23,7 +23,7 @@ def test_triangles_uv_and_pages_survive(tmp_path: Path, make: Callable[[], Mesh]
 
     mesh = make()
     surface = present(textured.read(made_up.textured(tmp_path / "in", mesh)))
-    obj.write(tmp_path / "a.obj", surface, LOOK)
+    obj.write(tmp_path / "a.obj", surface, NAMES)
     for page in (0, 1):
         (tmp_path / f"m_{page}.png").write_bytes(surface.pages[page].read_bytes())
     read = trimesh.load_scene(tmp_path / "a.obj", process=False)
@@ -36,7 +36,7 @@ def test_triangles_uv_and_pages_survive(tmp_path: Path, make: Callable[[], Mesh]
 
 def test_texture_coordinates_are_said_once_and_v_goes_up(tmp_path: Path) -> None:
     surface = present(textured.read(made_up.textured(tmp_path / "in", made_up.house())))
-    obj.write(tmp_path / "a.obj", surface, LOOK)
+    obj.write(tmp_path / "a.obj", surface, NAMES)
     lines = (tmp_path / "a.obj").read_text().splitlines()
     vt = [line for line in lines if line.startswith("vt ")]
     assert len(vt) == len(set(vt)) == 10
