@@ -169,7 +169,7 @@ def photo(survey: Path, out: Path, options: tuple[str, ...]) -> dict[str, Any]:
     finally:
         changed.write_bytes(original)
         os.utime(changed, ns=(stat.st_atime_ns, stat.st_mtime_ns))
-    anew = sorted({label for label, content in after.items() if before.get(label) != content})
+    anew = sorted({node for node, content in after.items() if before.get(node) != content})
     made = json.loads((out / "two" / "survey.json").read_text())["tiles"]
     return {
         "seconds": round(ran.seconds, 1),

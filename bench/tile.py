@@ -66,7 +66,7 @@ def main() -> None:
     baseline = json.loads((naive_out / "naive.json").read_text())
     print(f"\n{'step':<12}{'naive s':>9}{'ours s':>9}{'ratio':>8}   (ours: sum over steps, two of which run at a time)")
     for name, parts in STEPS.items():
-        own = sum(s["seconds"] for label, s in steps.items() if label.split(".")[0] in parts)
+        own = sum(s["seconds"] for node, s in steps.items() if node.split(".")[0] in parts)
         theirs = baseline.get(name, 0.0)
         print(f"{name:<12}{theirs:>9.1f}{own:>9.1f}{theirs / own if own and theirs else float('nan'):>8.1f}")
     print(f"{'whole':<12}{naive.seconds:>9.1f}{ours.seconds:>9.1f}{naive.seconds / ours.seconds:>8.1f}")

@@ -148,7 +148,7 @@ def make(tile: Tile, out: Path) -> Made:
     store = Store(out)
     planned = plan(needed(recipe(tile, Settings()), [*meshes, *clouds]), store)
     execute(planned, store, jobs=2, watch=lambda node, event, fraction, message: None)
-    folder = {p.node.id: store.folder(p.node.label, p.key) for p in planned}
+    folder = {p.node.id: store.folder(p.node.full_name, p.key) for p in planned}
     return Made(
         {g: Mesh.load(folder[node] / "mesh.npz") for g, node in zip(GROUPS, meshes, strict=True)},
         PointCloud.join([PointCloud.load(folder[node] / "cloud.npz") for node in clouds]),

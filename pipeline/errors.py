@@ -53,7 +53,7 @@ class StepError(ScanError):
 
 
 class DamagedError(StepError):
-    """A kept result whose bytes aren't as they were made; `where` is the label of its node, which is run again."""
+    """A kept result whose bytes aren't as they were made; `where` is the full name of its node, which is run again."""
 
     def __init__(self, where: str | Path, cause: str = "its kept result is damaged", remedy: str = REBUILT) -> None:
         super().__init__(where, cause, remedy)

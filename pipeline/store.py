@@ -42,7 +42,7 @@ class Manifest:
     """What is kept of a result beside its files.
 
     Attributes:
-        label: the node's name in the recipe (`poisson.terrain`).
+        label: the full name of its node (`poisson.terrain`).
         version, params, inputs: what the key was made of; inputs are keys or digests by name.
         fed: like the key, but of the contents of what was read, whatever made them.
         content: digest of all output files.
@@ -166,7 +166,7 @@ def key_of(step: Step, params: Params, inputs: Mapping[str, str]) -> str:
 
 
 class Store:
-    """Results below one folder.
+    """Results below one folder; a `node` is named by its full name in the recipe (`poisson.terrain`).
 
     Args:
         root: the folder.
@@ -179,53 +179,53 @@ class Store:
         self._sound: set[Path] = set()  # folders of results that this run has made, or digested
 
     def within(self, name: str) -> Store:
-        """The store of the labels that begin with `name/`."""
+        """The store of the nodes whose full names begin with `name/`."""
         store = Store(self.root / name, self.remote and self.remote.below(name), self.sources)
         store._sound = self._sound
         return store
 
-    def folder(self, label: str, key: str) -> Path:
+    def folder(self, node: str, key: str) -> Path:
         """Where the result is, or will be."""
-        return self.root / label / key
+        return self.root / node / key
 
-    def find(self, label: str, key: str) -> Manifest | None:
+    def find(self, node: str, key: str) -> Manifest | None:
         """The manifest of a complete result; None where it is absent or a file of it was deleted."""
-        manifest = self._manifest(label, key)
-        if manifest is None or self._complete(label, key, manifest):
+        manifest = self._manifest(node, key)
+        if manifest is None or self._complete(node, key, manifest):
             return manifest
         return manifest if self.remote is not None else None  # its files are fetched when they are read
 
-    def read(self, label: str, key: str) -> Manifest | None:
+    def read(self, node: str, key: str) -> Manifest | None:
         """As `find`, with its files on this machine."""
-        manifest = self.find(label, key)
-        if manifest is not None and self.remote is not None and not self._complete(label, key, manifest):
-            return manifest if self.remote.pull(f"{label}/{key}/{name}" for name in manifest.sizes) else None
+        manifest = self.find(node, key)
+        if manifest is not None and self.remote is not None and not self._complete(node, key, manifest):
+            return manifest if self.remote.pull(f"{node}/{key}/{name}" for name in manifest.sizes) else None
         return manifest
 
-    def intact(self, label: str, key: str) -> bool:
+    def intact(self, node: str, key: str) -> bool:
         """Whether a result's files are on this machine, each with the bytes that it was made with."""
-        folder = self.folder(label, key)
+        folder = self.folder(node, key)
         if folder in self._sound:
             return True
-        manifest = self.read(label, key)
+        manifest = self.read(node, key)
         if manifest is not None and self.remote is not None and damaged(folder, manifest):
             shutil.rmtree(folder, ignore_errors=True)  # what was fetched: the storage has it
-            manifest = self.read(label, key)
+            manifest = self.read(node, key)
         if manifest is None or damaged(folder, manifest):
             return False
-        self.trust(label, key)
+        self.trust(node, key)
         return True
 
-    def trust(self, label: str, key: str) -> None:
+    def trust(self, node: str, key: str) -> None:
         """The result was made in this run, or found intact: it isn't looked into any more."""
-        self._sound.add(self.folder(label, key))
+        self._sound.add(self.folder(node, key))
 
-    def discard(self, label: str, key: str) -> None:
+    def discard(self, node: str, key: str) -> None:
         """Remove a result that is of no use."""
-        self._sound.discard(self.folder(label, key))
+        self._sound.discard(self.folder(node, key))
         if self.remote is not None:
-            self.remote.remove(f"{label}/{key}/manifest.json")
-        shutil.rmtree(self.folder(label, key), ignore_errors=True)
+            self.remote.remove(f"{node}/{key}/manifest.json")
+        shutil.rmtree(self.folder(node, key), ignore_errors=True)
 
     def source(self, path: Path) -> Path:
         """A source file, fetched if it isn't on this machine and it is known where from."""
@@ -233,15 +233,15 @@ class Store:
             self.sources.pull([path.relative_to(self.sources.local).as_posix()])
         return path
 
-    def _manifest(self, label: str, key: str) -> Manifest | None:
-        path = self.folder(label, key) / "manifest.json"
+    def _manifest(self, node: str, key: str) -> Manifest | None:
+        path = self.folder(node, key) / "manifest.json"
         if self.remote is not None and not path.is_file():
-            self.remote.pull([f"{label}/{key}/manifest.json"])
+            self.remote.pull([f"{node}/{key}/manifest.json"])
         manifest = read_manifest(path)
-        return manifest if manifest is not None and f"/{manifest.label}".endswith(f"/{label}") else None
+        return manifest if manifest is not None and f"/{manifest.label}".endswith(f"/{node}") else None
 
-    def _complete(self, label: str, key: str, manifest: Manifest) -> bool:
-        folder = self.folder(label, key)
+    def _complete(self, node: str, key: str, manifest: Manifest) -> bool:
+        folder = self.folder(node, key)
         try:
             written = newest = (folder / "manifest.json").stat().st_mtime_ns
             for name, size in manifest.sizes.items():
@@ -258,25 +258,25 @@ class Store:
                 os.utime(folder / "manifest.json", ns=(newest, newest))
         return True
 
-    def begin(self, label: str) -> Path:
+    def begin(self, node: str) -> Path:
         """A fresh temporary folder to write a result in."""
         try:
-            parent = self.root / label
+            parent = self.root / node
             parent.mkdir(parents=True, exist_ok=True)
             return Path(tempfile.mkdtemp(prefix=TEMPORARY, dir=parent))
         except OSError as error:
             raise from_os_error(error, self.root) from None
 
-    def checkpoint(self, label: str, key: str) -> Path:
+    def checkpoint(self, node: str, key: str) -> Path:
         """A folder that outlives a killed run: what the same step left there of the same inputs and parameters."""
-        place = self.root / label / f"{PART}{key}"
+        place = self.root / node / f"{PART}{key}"
         try:
             place.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise from_os_error(error, self.root) from None
         return place
 
-    def commit(self, label: str, key: str, folder: Path, done: Done, about: Mapping[str, Any]) -> Manifest:
+    def commit(self, node: str, key: str, folder: Path, done: Done, about: Mapping[str, Any]) -> Manifest:
         """Move a finished result into place, replacing an incomplete one of the same key.
 
         Args:
@@ -286,7 +286,7 @@ class Store:
         sizes = {p.relative_to(folder).as_posix(): p.stat().st_size for p in sorted(folder.rglob("*")) if p.is_file()}
         digests = {name: digest(folder / name) for name in sizes}
         manifest = Manifest(
-            label=label,
+            label=node,
             content=content_of(digests),
             files={name: path.relative_to(folder).as_posix() for name, path in done.files.items()},
             sizes=sizes,
@@ -296,23 +296,23 @@ class Store:
             **about,
         )
         self._place(manifest, key, folder)
-        shutil.rmtree(self.root / label / f"{PART}{key}", ignore_errors=True)
+        shutil.rmtree(self.root / node / f"{PART}{key}", ignore_errors=True)
         return manifest
 
-    def contents(self, label: str) -> set[str]:
+    def contents(self, node: str) -> set[str]:
         """Digests of the contents of all results of a node, of whatever key."""
-        keys = (path.parent.name for path in (self.root / label).glob("*/manifest.json"))
-        return {manifest.content for manifest in (self.find(label, key) for key in keys) if manifest is not None}
+        keys = (path.parent.name for path in (self.root / node).glob("*/manifest.json"))
+        return {manifest.content for manifest in (self.find(node, key) for key in keys) if manifest is not None}
 
-    def adopt(self, label: str, key: str, fed: str, inputs: Mapping[str, str]) -> Manifest | None:
+    def adopt(self, node: str, key: str, fed: str, inputs: Mapping[str, str]) -> Manifest | None:
         """Take a result over that was made of the same contents by the same step, whatever made those; None: no such.
 
         What was made anew and came out the same ends the need to redo what depends on it.
         """
-        for other in self.folder(label, key).parent.glob("*/manifest.json"):
-            old = self.find(label, other.parent.name)
+        for other in self.folder(node, key).parent.glob("*/manifest.json"):
+            old = self.find(node, other.parent.name)
             if old is not None and old.fed == fed:
-                folder = self.begin(label)
+                folder = self.begin(node)
                 try:
                     shutil.copytree(other.parent, folder, symlinks=True, copy_function=os.link, dirs_exist_ok=True)
                     (folder / "manifest.json").unlink()  # shared with the old result
@@ -343,7 +343,7 @@ class Store:
             self.remote.push(f"{manifest.label}/{key}/{name}" for name in (*manifest.sizes, "manifest.json"))
 
     def sweep(self, used: Mapping[str, str]) -> None:
-        """Remove what `used` (label to key) does not name, leftovers of killed runs included."""
+        """Remove what `used` (node to key) does not name, leftovers of killed runs included."""
         for path in self.root.glob("*/*"):
             if used.get(path.parent.name) != path.name:
                 shutil.rmtree(path, ignore_errors=True)

@@ -77,13 +77,13 @@ class RunDisplay:
     def watch(self, node: Node, event: Event, fraction: float, message: str) -> None:
         """An `execute.Watch`."""
         if event == "start":
-            self._started[node.label] = time.perf_counter()
-            self._tasks[node.label] = self._bars.add_task(node.label, total=1.0, message="")
+            self._started[node.full_name] = time.perf_counter()
+            self._tasks[node.full_name] = self._bars.add_task(node.full_name, total=1.0, message="")
         elif event == "progress":
-            self._bars.update(self._tasks[node.label], completed=fraction, message=escape(message))  # type: ignore[arg-type]
+            self._bars.update(self._tasks[node.full_name], completed=fraction, message=escape(message))  # type: ignore[arg-type]
         elif event == "again":
-            if node.label in self._tasks:
-                self._bars.remove_task(self._tasks.pop(node.label))  # type: ignore[arg-type]
+            if node.full_name in self._tasks:
+                self._bars.remove_task(self._tasks.pop(node.full_name))  # type: ignore[arg-type]
             self._done, self._kept = self._done - 1, self._kept - 1
             console.print(f"[yellow]![/] {escape(message)}", highlight=False, soft_wrap=True)
         else:
@@ -91,10 +91,10 @@ class RunDisplay:
             self._kept += event == "kept"
             self._bars.update(self._whole, completed=self._done)
             if event in ("done", "failed"):
-                self._bars.remove_task(self._tasks.pop(node.label))  # type: ignore[arg-type]
-                seconds = time.perf_counter() - self._started[node.label]
+                self._bars.remove_task(self._tasks.pop(node.full_name))  # type: ignore[arg-type]
+                seconds = time.perf_counter() - self._started[node.full_name]
                 mark = "[green]✓[/]" if event == "done" else "[red]✗[/]"
-                console.print(f"{mark} {node.label:<22}[dim]{seconds:7.1f} s  {self._done}/{self._nodes}")
+                console.print(f"{mark} {node.full_name:<22}[dim]{seconds:7.1f} s  {self._done}/{self._nodes}")
 
 
 def log_unexpected(error: BaseException) -> Path:

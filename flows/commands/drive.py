@@ -58,7 +58,7 @@ def survey_of(
         for item in planned:
             for text in outcome.done[item.node.id].warnings if item.reason is not None else ():
                 warn(text)
-        folders = {item.node.id.name: store.folder(item.node.label, item.key) for item in planned}
+        folders = {item.node.id.name: store.folder(item.node.full_name, item.key) for item in planned}
         if "place" in folders:
             publish_path(planned, outcome.of_tile(), store, out / "slam")
         for name in SHOWN.keys() & folders.keys():

@@ -50,7 +50,7 @@ def show_plan(path: Path, out: Path, settings: Settings, *, force: bool = False,
     table = Table("step", "would run", "why", box=None, header_style="bold")
     for item in planned:
         runs, why = ("yes", item.reason.value) if item.reason else ("no", "kept: same input, settings and version")
-        table.add_row(item.node.label, runs, why, style=None if item.reason else "dim")
+        table.add_row(item.node.full_name, runs, why, style=None if item.reason else "dim")
     console.print(table)
 
 

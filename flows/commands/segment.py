@@ -103,8 +103,8 @@ def segment_tile(path: Path, out: Path, settings: Settings) -> None:
         done = outcome.of_tile()
         keys = {p.node.id.name: p.key for p in planned}
         files = {
-            (label, name): store.folder(label, keys[label]) / file
-            for label, manifest in done.items()
+            (node, name): store.folder(node, keys[node]) / file
+            for node, manifest in done.items()
             for name, file in manifest.files.items()
         }
         predicted, own = (

@@ -34,7 +34,7 @@ def execute_shown(
         def watch(node: Node, event: Event, fraction: float, message: str) -> None:
             display.watch(node, event, fraction, message)
             if event != "progress":
-                log.write(f"{node.label}: {event}{': ' if message else ''}{message}")
+                log.write(f"{node.full_name}: {event}{': ' if message else ''}{message}")
 
         jobs = jobs or default_jobs()
         outcome = execute(planned, store, jobs=jobs, watch=watch, to_the_end=to_the_end, memory=memory)
@@ -64,9 +64,9 @@ def show_findings(done: Mapping[str, Manifest]) -> None:
 
 def show_warnings(done: Mapping[str, Manifest]) -> None:
     """What the steps warned of, on the screen."""
-    for label, manifest in done.items():
+    for node, manifest in done.items():
         for warning in manifest.warnings:
-            warn(f"{label}: {warning}")
+            warn(f"{node}: {warning}")
 
 
 def default_jobs() -> int:

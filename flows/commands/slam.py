@@ -123,7 +123,7 @@ def slam_video(video: Video, out: Path, settings: Settings) -> dict[str, Manifes
 def publish_path(planned: Iterable[Planned], done: Mapping[str, Manifest], store: Store, out: Path) -> None:
     """Put the trajectory, and what came with it, where users look; of an earlier run nothing stays."""
     out.mkdir(exist_ok=True)
-    folder = {item.node.id.name: store.folder(item.node.label, item.key) for item in planned}
+    folder = {item.node.id.name: store.folder(item.node.full_name, item.key) for item in planned}
     made = {path.name: path for path in (folder["place"] / "path").iterdir()}
     if f"place.{ALONE}" in folder:
         made["odometry.csv"] = folder[f"place.{ALONE}"] / "path" / "trajectory.csv"

@@ -85,7 +85,7 @@ def study(asked: Study, out: Path, settings: Settings, jobs: int = 1) -> Path:
         for error in failed.values():
             if isinstance(error, SpaceError):  # no cell's fault
                 raise error
-        store.sweep({item.node.label: item.key for item in planned})
+        store.sweep({item.node.full_name: item.key for item in planned})
     return table
 
 
@@ -97,7 +97,7 @@ def _results(
     for cell in cells(asked):
         own = [item.node for item in planned if item.node.group == cell.name]
         keys = [item.key for item in planned if item.node.group == cell.name]
-        made = [store.find(node.label, key) for node, key in zip(own, keys, strict=True)]
+        made = [store.find(node.full_name, key) for node, key in zip(own, keys, strict=True)]
         done = [manifest for manifest in made if manifest is not None]
         error = next((failed[node.id] for node in own if node.id in failed), None)
         facts = {key: value for manifest in done for key, value in manifest.facts.items()}

@@ -189,7 +189,7 @@ def _make(survey: Survey, settings: Settings, store: Store, run: Executor, diges
         planned = [replace(item, reason=item.reason or ran.get((item.node.id, item.key))) for item in planned]
         ran |= {(item.node.id, item.key): item.reason for item in planned if item.reason is not None}
         for node in {item.node.id for item in planned if item.reason is not None} - before.keys():
-            before[node] = store.contents(node.label)
+            before[node] = store.contents(node.full_name)
         outcome = run(planned, store)
         for error in outcome.failed.values():
             if isinstance(error, (SpaceError, SettingError)):  # no tile's fault

@@ -24,8 +24,8 @@ from scan2sim.flows.recipes.settings import Settings
 from scan2sim.pipeline.store import Manifest, Store
 
 
-@task(name="step", task_run_name="{label}", cache_policy=NO_CACHE)
-def run_step(label: str, work: Callable[[], Manifest], manifest: str) -> str:
+@task(name="step", task_run_name="{node}", cache_policy=NO_CACHE)
+def run_step(node: str, work: Callable[[], Manifest], manifest: str) -> str:
     """Have a worker run a step, and wait for it; returns its manifest's path."""
     log, done = get_run_logger(), work()
     for line in [done.facts["told"]] if "told" in done.facts else []:
@@ -59,9 +59,9 @@ def by_tasks(
         with workers(runner if missing else "threads", count, address) as call:
 
             def submit(item: Planned) -> Any:
-                manifest = store.folder(item.node.label, item.key) / "manifest.json"
+                manifest = store.folder(item.node.full_name, item.key) / "manifest.json"
                 work = partial(call, run_on_worker, item, store, gigabytes, cores, version)
-                return run_step.submit(item.node.label, work, str(manifest))
+                return run_step.submit(item.node.full_name, work, str(manifest))
 
             # those of a cluster find their next step waiting
             at_once = count if runner == "threads" else 2 * count

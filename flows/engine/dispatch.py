@@ -63,13 +63,13 @@ def dispatch(
             if isinstance(outcome, DamagedError):
                 front.again(item, outcome)
                 continue
-            label = item.node.label
-            manifest = None if isinstance(outcome, BaseException) else store.find(label, item.key)
+            name = item.node.full_name
+            manifest = None if isinstance(outcome, BaseException) else store.find(name, item.key)
             if manifest is not None:
                 front.end(item, manifest)
             else:
                 cause = f"its worker failed ({type(outcome).__name__}: {outcome})"
-                lost = StepError(label, cause, "Run again: what is finished is kept; the worker's log tells more")
+                lost = StepError(name, cause, "Run again: what is finished is kept; the worker's log tells more")
                 front.fail(item, outcome if isinstance(outcome, ScanError) else lost)
     board.flush()
     return front.outcome

@@ -51,7 +51,7 @@ class Frontier:
         self.failed: dict[NodeId, ScanError] = {}
         self._store, self._watch = store, watch
         self._planned = {item.node.id: item for item in planned}
-        self._labels = {item.node.label: item.node.id for item in planned}
+        self._by_name = {item.node.full_name: item.node.id for item in planned}
         self._waiting = dict(self._planned)
         self._missing: set[NodeId] = set()  # known not to be kept
         self._lost: set[NodeId] = set()  # failed, or in need of what failed
@@ -88,15 +88,15 @@ class Frontier:
         """The node is done; what it has read was intact."""
         self.done[item.node.id] = manifest
         for node in (item.node.id, *item.upstream):
-            self._store.trust(node.label, self._planned[node].key)
+            self._store.trust(node.full_name, self._planned[node].key)
         self._watch(item.node, "done", 1.0, "")
 
     def again(self, item: Planned, error: DamagedError) -> None:
         """The node has met a result that is damaged: that is made anew, and the node waits for it."""
         self._waiting[item.node.id] = item
-        damaged = self._labels[error.where]
+        damaged = self._by_name[error.where]
         if self.done.pop(damaged, None) is not None:
-            self._store.discard(damaged.label, self._planned[damaged].key)
+            self._store.discard(damaged.full_name, self._planned[damaged].key)
             self._missing.add(damaged)
             self._waiting[damaged] = self._planned[damaged]
         self._watch(item.node, "again", 0.0, f"the kept result of {damaged} is damaged: made anew")

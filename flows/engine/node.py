@@ -23,11 +23,11 @@ def run_node(item: Planned, store: Store, inputs: dict[str, Path], report: Repor
     node = item.node
     item.check(store)
     fed = item.fed(store)
-    folder = store.begin(node.label)
+    folder = store.begin(node.full_name)
     start = time.perf_counter()
     _forget_peak()
     try:
-        kept = {"checkpoint": store.checkpoint(node.label, item.key)} if node.step.resumes else {}
+        kept = {"checkpoint": store.checkpoint(node.full_name, item.key)} if node.step.resumes else {}
         result = node.step.run(inputs, node.params, folder, report, **kept)
         about = {
             "version": node.step.version,
@@ -37,16 +37,16 @@ def run_node(item: Planned, store: Store, inputs: dict[str, Path], report: Repor
             "seconds": round(time.perf_counter() - start, 3),
             "peak_mb": _peak_mb(),
         }
-        return store.commit(node.label, item.key, folder, result, about)
+        return store.commit(node.full_name, item.key, folder, result, about)
     except ScanError:
         raise
     except OSError as error:
         raise from_os_error(error, folder) from error
     except MemoryError as error:
-        raise StepError(node.label, "ran out of memory", "Use a smaller tile, or larger voxels") from error
+        raise StepError(node.full_name, "ran out of memory", "Use a smaller tile, or larger voxels") from error
     except Exception as error:
         raise StepError(
-            node.label,
+            node.full_name,
             f"failed unexpectedly ({type(error).__name__}: {error})",
             "The log holds the details; please report it",
         ) from error

@@ -64,7 +64,7 @@ class Planned:
         contents = dict(self.keys)
         for name, source in self.node.inputs.items():
             if isinstance(source, Output):
-                manifest = self._found(store.find(source.node.label, self._key(name)), source)
+                manifest = self._found(store.find(source.node.full_name, self._key(name)), source)
                 contents[name] = f"{manifest.content}/{source.name}"
         return key_of(self.node.step, self.node.params, contents)
 
@@ -72,8 +72,8 @@ class Planned:
         """Its result if there is one: made before, or made of the same contents; None if it is to run."""
         if self.again:
             return None
-        label = self.node.label
-        return store.find(label, self.key) or store.adopt(label, self.key, self.fed(store), self.keys)
+        name = self.node.full_name
+        return store.find(name, self.key) or store.adopt(name, self.key, self.fed(store), self.keys)
 
     def inputs(self, store: Store) -> dict[str, Path]:
         """Where the files are that it reads.
@@ -84,8 +84,8 @@ class Planned:
         paths = {}
         for name, source in self.node.inputs.items():
             if isinstance(source, Output):
-                manifest = self._found(store.read(source.node.label, self._key(name)), source)
-                paths[name] = store.folder(source.node.label, self._key(name)) / manifest.files[source.name]
+                manifest = self._found(store.read(source.node.full_name, self._key(name)), source)
+                paths[name] = store.folder(source.node.full_name, self._key(name)) / manifest.files[source.name]
             else:
                 paths[name] = store.source(source)
         return paths
@@ -97,15 +97,15 @@ class Planned:
             DamagedError: naming the node whose result is to be made anew.
         """
         for name, source in self.node.inputs.items():
-            if isinstance(source, Output) and not store.intact(source.node.label, self._key(name)):
-                raise DamagedError(source.node.label)
+            if isinstance(source, Output) and not store.intact(source.node.full_name, self._key(name)):
+                raise DamagedError(source.node.full_name)
 
     def _key(self, name: str) -> str:
         return self.keys[name].split("/")[0]
 
     def _found(self, manifest: Manifest | None, source: Output) -> Manifest:
         if manifest is None:
-            raise DamagedError(source.node.label, "its result has gone in the meantime")
+            raise DamagedError(source.node.full_name, "its result has gone in the meantime")
         return manifest
 
 
@@ -165,16 +165,16 @@ def check(planned: Sequence[Planned]) -> None:
 def drop_damaged(planned: Sequence[Planned], store: Store, names: Collection[str]) -> bool:
     """Remove those results of nodes of these names that are kept, and not as they were made; whether there were any."""
     kept = [item for item in planned if item.reason is None and item.node.id.name in names]
-    damaged = [item for item in kept if not store.intact(item.node.label, item.key)]
+    damaged = [item for item in kept if not store.intact(item.node.full_name, item.key)]
     for item in damaged:
-        store.discard(item.node.label, item.key)
+        store.discard(item.node.full_name, item.key)
     return bool(damaged)
 
 
 def _reason(node: Node, key: str, store: Store) -> Reason | None:
-    if store.find(node.label, key) is not None:
+    if store.find(node.full_name, key) is not None:
         return None
-    if store.folder(node.label, key).exists():
+    if store.folder(node.full_name, key).exists():
         return Reason.DAMAGED
-    others = [p for p in (store.root / node.label).glob("*") if not p.name.startswith(".")]
+    others = [p for p in (store.root / node.full_name).glob("*") if not p.name.startswith(".")]
     return Reason.CHANGED if others else Reason.NEW

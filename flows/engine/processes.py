@@ -95,7 +95,7 @@ def receive(connection: Connection, item: Planned, process: ForkServerProcess, w
         process.join()
         cause = "was killed, probably for want of memory" if process.exitcode == -signal.SIGKILL else "crashed"
         raise StepError(
-            item.node.label,
+            item.node.full_name,
             f"{cause} (exit status {process.exitcode})",
             "Run again with --jobs 1, or use a smaller tile",
         ) from None

@@ -29,12 +29,12 @@ class NodeId:
         return f"{self.step}.{self.group}" if self.group else self.step
 
     @property
-    def label(self) -> str:
+    def full_name(self) -> str:
         """On screens, and as the folder in the store: `street_0001/poisson.terrain`."""
         return f"{self.tile}/{self.name}" if self.tile else self.name
 
     def __str__(self) -> str:
-        return self.label
+        return self.full_name
 
 
 @dataclass(frozen=True)
@@ -67,9 +67,9 @@ class Node:
         return NodeId(self.step.name, self.group, self.tile)
 
     @property
-    def label(self) -> str:
-        """As `NodeId.label`."""
-        return self.id.label
+    def full_name(self) -> str:
+        """As `NodeId.full_name`."""
+        return self.id.full_name
 
 
 def needed(nodes: Sequence[Node], wanted: Iterable[NodeId]) -> list[Node]:

@@ -69,7 +69,7 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
     Args:
         tile: to be made.
         settings: of all steps.
-        beside: names of the tiles of its survey that are made, too: labels are `tile/step` then, and what happens at
+        beside: names of the tiles of its survey that are made, too: nodes are `tile/step` then, and what happens at the
             borders reads neighbours' results. Without it the tile is made for itself, and ends at its borders.
 
     Raises:

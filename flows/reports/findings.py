@@ -49,10 +49,10 @@ class Finding:
 
 def findings(done: Mapping[str, Manifest]) -> list[Finding]:
     """All findings of a run, worst first; those of a level and weight in the order of the steps."""
-    facts = {label: manifest.facts for label, manifest in done.items()}
+    facts = {node: manifest.facts for node, manifest in done.items()}
     checks = (_cameras, _held_out, _unseen, _remains, _moved, _disagreeing)
     found = [one for check in checks for one in check(facts)]
-    found += [Finding("note", label, text) for label, manifest in done.items() for text in manifest.warnings]
+    found += [Finding("note", node, text) for node, manifest in done.items() for text in manifest.warnings]
     return sorted(found, key=lambda one: (LEVELS.index(one.level), -one.weight))
 
 

@@ -75,8 +75,8 @@ def _finish_tile(one: Made, store: Store, out: Path, settings: Settings, warn: W
     keys = {item.node.id.name: item.key for item in planned}
     out.mkdir(parents=True, exist_ok=True)
     if not (one.kept and is_finished(store, planned, out)):
-        for label in keys.keys() & to_read(store, planned, out):
-            store.read(label, keys[label])
+        for node in keys.keys() & to_read(store, planned, out):
+            store.read(node, keys[node])
         for warning in publish(store, planned, done, out, one.tile, settings):
             warn(warning)
         seconds = sum(done[item.node.id.name].seconds for item in planned if item.reason is not None)

@@ -38,12 +38,12 @@ def publish(
     keys = {p.node.id.name: p.key for p in planned}
     changed: list[Path] = []
     places = _published(store, keys, out)
-    for label in PLACES.keys() & done.keys():
-        if done[label].files and label not in places:
-            raise DamagedError(label)
-    for label, (source, place) in places.items():
-        if not _current(source, place, keys[label]):
-            _publish(source, place, keys[label])
+    for node in PLACES.keys() & done.keys():
+        if done[node].files and node not in places:
+            raise DamagedError(node)
+    for node, (source, place) in places.items():
+        if not _current(source, place, keys[node]):
+            _publish(source, place, keys[node])
         changed += edited(source, place)
     if "rasters" not in done and (out / "rasters" / STAMP).is_file():  # of an earlier world
         shutil.rmtree(out / "rasters")
@@ -55,7 +55,7 @@ def publish(
         "tile": str(tile.path),
         "versions": versions(),
         "set": settings.values,
-        "steps": {label: {k: v for k, v in m.params.items() if k not in BULKY} for label, m in done.items()},
+        "steps": {node: {k: v for k, v in m.params.items() if k not in BULKY} for node, m in done.items()},
     }
     (out / "config.json").write_text(json.dumps(config, indent=1), encoding="utf-8")
     return [f"{path} was changed since it was made, and stays so: remove it to have it made anew" for path in changed]
@@ -65,23 +65,23 @@ def to_read(store: Store, planned: Iterable[Planned], out: Path) -> set[str]:
     """Labels of results that will be read for what is shown; what is published already isn't read again."""
     keys = {item.node.id.name: item.key for item in planned}
     places = _published(store, keys, out)
-    return {*READ, *(label for label, (source, place) in places.items() if not _current(source, place, keys[label]))}
+    return {*READ, *(node for node, (source, place) in places.items() if not _current(source, place, keys[node]))}
 
 
 def published(store: Store, planned: Iterable[Planned], out: Path) -> bool:
     """Whether all that is published beside the report is as the kept results are, file by file."""
     keys = {item.node.id.name: item.key for item in planned}
     places = _published(store, keys, out)
-    return "export" in places and all(_current(*both, keys[label]) for label, both in places.items())
+    return "export" in places and all(_current(*both, keys[node]) for node, both in places.items())
 
 
 def _published(store: Store, keys: Mapping[str, str], out: Path) -> dict[str, tuple[Path, Path]]:
-    """Of results that are kept, by label: the folder that is to be published, and where."""
+    """Of results that are kept, by node: the folder that is to be published, and where."""
     found = {}
-    for label, (output, place) in PLACES.items():
-        manifest = store.find(label, keys[label]) if label in keys else None
+    for node, (output, place) in PLACES.items():
+        manifest = store.find(node, keys[node]) if node in keys else None
         if manifest is not None and output in manifest.files:
-            found[label] = store.folder(label, keys[label]) / manifest.files[output], out / place
+            found[node] = store.folder(node, keys[node]) / manifest.files[output], out / place
     return found
 
 

@@ -36,11 +36,11 @@ def write_report(
     write_whole(out / "report.json", json.dumps(body, indent=1))
     keys = {p.node.id.name: p.key for p in planned}
     pictures: list[Picture] = []
-    for label, name in (("pictures", "pictures"), ("score", "error")):
-        if label in done:
-            folder = store.folder(label, keys[label]) / done[label].files[name]
+    for node, name in (("pictures", "pictures"), ("score", "error")):
+        if node in done:
+            folder = store.folder(node, keys[node]) / done[node].files[name]
             entries = json.loads((folder / "index.json").read_text(encoding="utf-8"))
-            shown = representative(entries, done[label].facts["photos"]) if name == "error" else entries
+            shown = representative(entries, done[node].facts["photos"]) if name == "error" else entries
             pictures += [_with_pixels(entry, folder) for entry in shown]
     page = out / "report.html"
     view = done["preview"].facts if "preview" in done and done["preview"].files else None
@@ -50,7 +50,7 @@ def write_report(
 
 def figures(tile: Tile, done: Mapping[str, Manifest]) -> dict[str, Any]:
     """All figures of a run as one JSON-able table; keys as docs/formats.md names them."""
-    facts = {label: manifest.facts for label, manifest in done.items()}
+    facts = {node: manifest.facts for node, manifest in done.items()}
     geometry: dict[str, dict[str, float]] = {}
     for group, values in facts["geometry"].items():
         for name, value in values.items():
@@ -75,8 +75,8 @@ def figures(tile: Tile, done: Mapping[str, Manifest]) -> dict[str, Any]:
         "texture": texture | facts["score"],
         "world": facts["export"],
         "steps": {
-            label: {"seconds": m.seconds, "peak_mb": m.peak_mb, "facts": m.facts, "warnings": m.warnings}
-            for label, m in done.items()
+            node: {"seconds": m.seconds, "peak_mb": m.peak_mb, "facts": m.facts, "warnings": m.warnings}
+            for node, m in done.items()
         },
     }
 

@@ -317,7 +317,7 @@ def test_plan_says_why(tmp_path: Path, source: Path, run: Run) -> None:
     store = Store(tmp_path / "store")
 
     def reasons(**changes: dict[str, object]) -> dict[str, Reason | None]:
-        return {p.node.label: p.reason for p in plan(chain(source, tmp_path / "log", **changes), store)}
+        return {p.node.full_name: p.reason for p in plan(chain(source, tmp_path / "log", **changes), store)}
 
     assert set(reasons().values()) == {None}
     changed = reasons(b={"value": 1})
@@ -346,7 +346,7 @@ def test_kill_9_leaves_nothing_half_made_and_no_process_behind(tmp_path: Path, s
     child.send_signal(signal.SIGKILL)
     child.wait()
     store = Store(tmp_path / "store")
-    kept = {p.node.label: p.reason for p in plan(chain(source, log), store)}
+    kept = {p.node.full_name: p.reason for p in plan(chain(source, log), store)}
     assert kept["a"] is None and kept["b"] is not None
     assert run()["d"].facts == {"total": 2}
     pid = (tmp_path / "pid_b").read_text()  # of the run above, which ended

@@ -55,7 +55,7 @@ def test_a_step_of_ones_own_is_one_file_and_one_line(
         planned = plan(needed([*recipe(tile, Settings()), line], [line.id]), store)
         outcome = execute(planned, store, jobs=1, watch=lambda *_: None)
         outcome.check()
-        return outcome.of_tile()["lift"].facts["highest"], {item.node.label: item.reason for item in planned}
+        return outcome.of_tile()["lift"].facts["highest"], {item.node.full_name: item.reason for item in planned}
 
     low, why = run()
     assert why == {"ingest": Reason.NEW, "lift": Reason.NEW}

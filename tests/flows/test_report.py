@@ -51,12 +51,12 @@ def report(tmp_path: Path) -> Any:
 
     def write(scored: dict[str, Any]) -> tuple[dict[str, Any], str]:
         store, done, planned = Store(tmp_path / "steps"), dict[str, Manifest](), []
-        for label, facts in {**FACTS, "score": scored}.items():
-            folder = store.begin(label)
-            files = {"error": album(folder, list(scored["photos"]))} if label == "score" else {}
+        for node, facts in {**FACTS, "score": scored}.items():
+            folder = store.begin(node)
+            files = {"error": album(folder, list(scored["photos"]))} if node == "score" else {}
             about = {"version": 1, "params": {}, "inputs": {}, "fed": "", "seconds": 1.0, "peak_mb": 100.0}
-            done[label] = store.commit(label, "key", folder, Done(files, facts), about)
-            planned.append(Planned(Node(Step(label, 1, no_step), Params(), {}), "key", {}, None))
+            done[node] = store.commit(node, "key", folder, Done(files, facts), about)
+            planned.append(Planned(Node(Step(node, 1, no_step), Params(), {}), "key", {}, None))
         tile = Tile(tmp_path / "tile.toml", "made_up", Frame(), ())
         page = write_report(tile, planned, done, store, tmp_path, seconds=1.0).read_text()
         return json.loads((tmp_path / "report.json").read_text()), page

@@ -29,12 +29,12 @@ STREET = ROOT / "data_samples" / "tile"
 
 def test_only_where_asked_there_are_steps_for_vehicles() -> None:
     tile = read_tile(STREET)
-    plain, kept = ({node.label: node for node in recipe(tile, s)} for s in (Settings(), KEEP))
+    plain, kept = ({node.full_name: node for node in recipe(tile, s)} for s in (Settings(), KEEP))
     assert not any(label.endswith(".vehicle") for label in plain)
     assert {"voxel.vehicle", "poisson.vehicle", "decimate.vehicle", "texture.vehicle"} <= kept.keys()
     assert "vehicle" in kept["export"].inputs and "vehicle" in kept["collision"].inputs
     assert kept["decimate.vehicle"].params.target == 50_000  # type: ignore[attr-defined]
-    airborne = {node.label for node in recipe(replace(tile, views=(), trajectory=None), KEEP)}
+    airborne = {node.full_name for node in recipe(replace(tile, views=(), trajectory=None), KEEP)}
     assert not any(label.endswith(".vehicle") for label in airborne)
 
 

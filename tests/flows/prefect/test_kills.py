@@ -55,8 +55,10 @@ class Survey:
     def done(self) -> dict[str, int]:
         """When each step that is kept was finished."""
         store = Store(self.folder / "steps")
-        kept = [p for p in planned(self.folder, TILES) if store.find(p.node.label, p.key)]
-        return {p.node.label: (store.folder(p.node.label, p.key) / "manifest.json").stat().st_mtime_ns for p in kept}
+        kept = [p for p in planned(self.folder, TILES) if store.find(p.node.full_name, p.key)]
+        return {
+            p.node.full_name: (store.folder(p.node.full_name, p.key) / "manifest.json").stat().st_mtime_ns for p in kept
+        }
 
     def going_on(self) -> dict[str, int]:
         """Steps that have begun and not ended, and the worker that runs each."""

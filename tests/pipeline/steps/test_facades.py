@@ -184,7 +184,7 @@ def test_only_streets_with_rays_and_photos_have_the_step() -> None:
     tile, never = read_tile(SAMPLE / "tile.toml"), Settings({"facades": {"when": "never"}})
 
     def has(one: Tile, settings: Settings) -> bool:
-        return "facades" in {node.label for node in recipe(one, settings)}
+        return "facades" in {node.full_name for node in recipe(one, settings)}
 
     assert has(tile, Settings())
     assert not has(tile, never)

@@ -116,6 +116,6 @@ def test_only_where_photos_are_taken_along_a_path_and_neighbours_read_it() -> No
         replace(street, name="a", cell=Cell((0, 0), {"b": (10, 0)})),
         replace(bare, name="b", cell=Cell((10, 0), {"a": (0, 0)})),
     ]
-    nodes = {node.label: node for node in survey_recipe(tiles, Settings())}
-    read = {(source.node.label, source.name) for source in nodes["a/overlap"].inputs.values()}  # type: ignore[union-attr]
+    nodes = {node.full_name: node for node in survey_recipe(tiles, Settings())}
+    read = {(source.node.full_name, source.name) for source in nodes["a/overlap"].inputs.values()}  # type: ignore[union-attr]
     assert read == {("a/reach", "cloud"), ("b/reach", "cloud")}

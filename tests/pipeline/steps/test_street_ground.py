@@ -91,5 +91,5 @@ def test_gaps_wider_than_asked_for_stay(tmp_path: Path) -> None:
 
 def test_the_step_is_left_out_where_asked() -> None:
     tile = read_tile(SAMPLE)
-    assert "ground" in {node.label for node in recipe(tile, Settings())}
-    assert "ground" not in {node.label for node in recipe(tile, Settings({"ground": {"when": "never"}}))}
+    assert "ground" in {node.full_name for node in recipe(tile, Settings())}
+    assert "ground" not in {node.full_name for node in recipe(tile, Settings({"ground": {"when": "never"}}))}
