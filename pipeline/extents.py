@@ -203,12 +203,12 @@ def steps(
         return none
     places, of = found.along(voxel)
     normal = planes.normal[found.plane]
-    tree, label = cKDTree(thin[on]), which[on]
+    tree, plane = cKDTree(thin[on]), which[on]
     behind = np.full(len(places), -1, np.int32)
     for depth in np.arange(STEP_LEAST, STEP_MOST, 0.8) * voxel:
         probe = places + 1.5 * voxel * found.outward[of] - depth * normal[of]
         _, at = tree.query(probe, distance_upper_bound=1.2 * voxel, workers=-1)
-        back = np.append(label, np.int32(-1))[at]
+        back = np.append(plane, np.int32(-1))[at]
         ok = (back >= 0) & (back != found.plane[of]) & (behind < 0)
         ok &= (planes.normal[back] * normal[of]).sum(axis=1) > PARALLEL
         down = planes.beyond(places, back)
@@ -288,10 +288,10 @@ def free(
         empty &= ~np.isfinite(near)
     on = np.flatnonzero(which >= 0)
     _, at = cKDTree(thin[on]).query(places, 12, distance_upper_bound=1.5 * voxel, workers=-1)
-    label = np.append(which[on], np.int32(-1))[at]
+    plane = np.append(which[on], np.int32(-1))[at]
     mine = found.plane[of][:, None]
-    turned = np.abs(np.einsum("nkj,nj->nk", planes.normal[label], planes.normal[mine[:, 0]])) < PARALLEL
-    empty &= ~((label >= 0) & (label != mine) & turned).any(axis=1)
+    turned = np.abs(np.einsum("nkj,nj->nk", planes.normal[plane], planes.normal[mine[:, 0]])) < PARALLEL
+    empty &= ~((plane >= 0) & (plane != mine) & turned).any(axis=1)
     return places[empty], of[empty]
 
 

@@ -85,14 +85,14 @@ def roofs(top: F64, cell: float, step: float, least: float) -> Ints:
     n = int(mask.sum())
     _, piece = connected_components(coo_matrix((np.ones(len(i), bool), (i, j)), shape=(n, n)), directed=False)
     large = np.bincount(piece) * cell**2 >= least
-    label = np.zeros(top.shape, np.int64)
-    label[mask] = np.where(large[piece], np.cumsum(large)[piece], 0)
-    loose = mask & (label == 0)
-    if loose.any() and label.any():
-        reach, index = ndimage.distance_transform_edt(label == 0, return_indices=True)
+    component = np.zeros(top.shape, np.int64)
+    component[mask] = np.where(large[piece], np.cumsum(large)[piece], 0)
+    loose = mask & (component == 0)
+    if loose.any() and component.any():
+        reach, index = ndimage.distance_transform_edt(component == 0, return_indices=True)
         near = loose & (reach <= np.sqrt(least) / cell)
-        label[near] = label[tuple(index)][near]
-    return label
+        component[near] = component[tuple(index)][near]
+    return component
 
 
 def nearest_value(values: F64, known: Bools) -> F64:

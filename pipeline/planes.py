@@ -189,19 +189,19 @@ def _fitted(xyz: F64, normal: F64, which: I32, tolerance: float) -> Planes:
     """Each region's plane, by least squares with Tukey's weights."""
     count = int(which.max(initial=-1)) + 1
     own = np.flatnonzero(which >= 0)
-    label, places = which[own], xyz[own]
+    plane, places = which[own], xyz[own]
     weight = np.ones(len(own))
     planes = Planes(np.zeros((count, 3)), np.zeros(count))
-    outward = _sums(label, normal[own], count)
+    outward = _sums(plane, normal[own], count)
     for _ in range(3):
-        total = np.maximum(np.bincount(label, weight, count), 1e-12)
-        middle = _sums(label, places * weight[:, None], count) / total[:, None]
-        apart = places - middle[label]
+        total = np.maximum(np.bincount(plane, weight, count), 1e-12)
+        middle = _sums(plane, places * weight[:, None], count) / total[:, None]
+        apart = places - middle[plane]
         outer = np.einsum("ni,nj,n->nij", apart, apart, weight).reshape(-1, 9)
-        axis = np.linalg.eigh(_sums(label, outer, count).reshape(-1, 3, 3))[1][:, :, 0]
+        axis = np.linalg.eigh(_sums(plane, outer, count).reshape(-1, 3, 3))[1][:, :, 0]
         axis = axis * np.where((axis * outward).sum(axis=1) < 0, -1.0, 1.0)[:, None]
         planes = Planes(axis, (axis * middle).sum(axis=1))
-        weight = np.maximum(0.0, 1 - (planes.beyond(places, label) / (1.5 * tolerance)) ** 2) ** 2
+        weight = np.maximum(0.0, 1 - (planes.beyond(places, plane) / (1.5 * tolerance)) ** 2) ** 2
     return planes
 
 
@@ -221,6 +221,6 @@ def _without_bent(xyz: F64, which: I32, planes: Planes) -> I32:
     return np.where(flat, np.cumsum(flat) - 1, -1)[which].astype(np.int32)
 
 
-def _sums(label: I32, values: F64, count: int) -> F64:
-    """(count, K) sums of values (N, K) by label (N,)."""
-    return np.stack([np.bincount(label, column, count) for column in values.T], axis=1)
+def _sums(plane: I32, values: F64, count: int) -> F64:
+    """(count, K) sums of values (N, K) by plane (N,)."""
+    return np.stack([np.bincount(plane, column, count) for column in values.T], axis=1)

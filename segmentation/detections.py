@@ -22,14 +22,14 @@ APART = 0.5
 """Metres between two signs: nearer ones are found around one another."""
 
 
-def hanging(views: Sequence[View], labels: Mapping[int, U8]) -> list[F64]:
+def hanging(views: Sequence[View], probabilities: Mapping[int, U8]) -> list[F64]:
     """Places (3,), local metres, where signs hang, the surest first.
 
     Args:
         views: all of them.
-        labels: index of a view to its probabilities (h, w, C), 255 for 1, by class of `segmentation.labels`.
+        probabilities: index of a view to its probabilities (h, w, C), 255 for 1, by class of `segmentation.labels`.
     """
-    shown = {i: np.ascontiguousarray(label[..., CLASSES.index("road_sign")]) for i, label in labels.items()}
+    shown = {i: np.ascontiguousarray(picture[..., CLASSES.index("road_sign")]) for i, picture in probabilities.items()}
     found = [one for i in shown for ray in _rays(views[i], shown[i]) if (one := _along(ray, i, views, shown))]
     places: list[F64] = []
     for _, place in sorted(found, key=lambda one: -one[0]):

@@ -127,7 +127,7 @@ def _from_photos(
     thin: PointCloud,
     shape: U8,
     views: Any,
-    labels: Path,
+    probabilities: Path,
     driven: PointCloud | None,
     params: SegmentParams,
     report: Report,
@@ -144,11 +144,11 @@ def _from_photos(
     from scan2sim.segmentation.votes import vote
 
     votes = vote(
-        thin, views, labels, radius=0.8 * params.size, moving=driven,
+        thin, views, probabilities, radius=0.8 * params.size, moving=driven,
         report=lambda f, m="": report(0.5 + 0.3 * f, m),
     )  # fmt: skip
     report(0.8, "smoothing")
-    tells = json.loads((labels / "network.json").read_text(encoding="utf-8"))["tells"]
+    tells = json.loads((probabilities / "network.json").read_text(encoding="utf-8"))["tells"]
     height, ground = split_ground(thin.xyz)
     moved = moving(thin, height, ground)
     best, sure = decide(votes, shape, height, moved, thin, knows_low_vegetation="low_vegetation" in tells)

@@ -69,7 +69,7 @@ def signs(inputs: Inputs, params: SignsParams, out: Path, report: Report) -> Don
     rows = [f["properties"] | dict(zip("xyz", f["geometry"]["coordinates"], strict=True)) for f in features]
     views, held = views_io.load(inputs["views"]), views_io.load_held_out(inputs["views"])
     used = [i for i, view in enumerate(views) if not held[i] and view.camera.model != "orthographic"]
-    found = _found(views, used, _labels(inputs, used), known, lambda place: _own(place, frame, params), report)
+    found = _found(views, used, _probabilities(inputs, used), known, lambda place: _own(place, frame, params), report)
     building = meshes["building"]
     if found:
         replaced = [old for old in known if any(np.linalg.norm(old.centre - p.centre) < SAME for p in found)]
@@ -85,7 +85,7 @@ def signs(inputs: Inputs, params: SignsParams, out: Path, report: Report) -> Don
     return Done(files | listed(out, frame.crs, rows), facts)
 
 
-def _labels(inputs: Inputs, used: Sequence[int]) -> dict[int, U8]:
+def _probabilities(inputs: Inputs, used: Sequence[int]) -> dict[int, U8]:
     """A network's probabilities by index of view, of those that it looked at."""
     import numpy as np
 
@@ -109,7 +109,7 @@ def _own(place: F64, frame: Frame, params: SignsParams) -> bool:
 def _found(
     views: Sequence[View],
     used: Sequence[int],
-    labels: Mapping[int, U8],
+    probabilities: Mapping[int, U8],
     known: Sequence[Plate],
     own: Callable[[F64], bool],
     report: Report,
@@ -124,7 +124,7 @@ def _found(
     seen = [views[i] for i in used]
     photo = lru_cache(maxsize=KEPT)(lambda k: image.usable_photo(seen[k]))
     wanted: list[tuple[F64, F64 | None]] = [(plate.centre, plate.normal) for plate in known]
-    wanted += [(place, None) for place in hanging(views, labels)]
+    wanted += [(place, None) for place in hanging(views, probabilities)]
     found: list[Plate] = []
     for done, (place, normal) in enumerate(wanted):
         report(done / len(wanted), f"{len(found)} plates")

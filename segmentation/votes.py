@@ -47,7 +47,7 @@ class Votes:
 def vote(
     cloud: PointCloud,
     views: Sequence[View],
-    labels: Path,
+    probabilities: Path,
     *,
     radius: float,
     moving: PointCloud | None = None,
@@ -58,7 +58,7 @@ def vote(
     Args:
         cloud: with normals; thinned to about one point a voxel.
         views: all, by index; those without a file are not asked.
-        labels: folder of `<view index>.npy`, (h, w, C) uint8.
+        probabilities: folder of `<view index>.npy`, (h, w, C) uint8.
         radius: metres, of the discs that points hide by: about the voxel's size.
         moving: what the step `carve` found moving: it hides, too, while it is there.
         report: progress.
@@ -70,7 +70,7 @@ def vote(
     seen = sky = 0
     for i, view in enumerate(views):
         report(i / len(views), view.name)
-        file = labels / f"{i}.npy"
+        file = probabilities / f"{i}.npy"
         if not file.is_file():
             continue
         depth = depth_map(view.camera, view.T_world_cam, hides, time=view.time, pixels=PIXELS)
@@ -88,7 +88,7 @@ def _mask(view: View) -> np.ndarray:
 
 
 @njit(cache=True, parallel=True)
-def _vote(score, weight, xyz, normals, eye, ranges, labels, mask):  # type: ignore[no-untyped-def]
+def _vote(score, weight, xyz, normals, eye, ranges, probabilities, mask):  # type: ignore[no-untyped-def]
     """Add a photo's votes in place; returns (points seen, those that it takes for sky)."""
     n, classes = score.shape
     kind = np.zeros(n, np.uint8)
@@ -105,15 +105,15 @@ def _vote(score, weight, xyz, normals, eye, ranges, labels, mask):  # type: igno
         if not is_visible(eye, ranges, u, v, distance, cos, BIAS):
             continue
         w = (0.2 + 0.8 * abs(cos)) / (1 + d2 / (NEAR * NEAR))
-        s, t = rescaled(eye.p, u, v, labels)
-        at = taps(labels, s, t, eye.model == EQUIRECTANGULAR)
-        up = mixed(labels, SKY, at) / 255.0
+        s, t = rescaled(eye.p, u, v, probabilities)
+        at = taps(probabilities, s, t, eye.model == EQUIRECTANGULAR)
+        up = mixed(probabilities, SKY, at) / 255.0
         if up > 0.5:
             kind[i] = 2
             continue
         kind[i] = 1
         for k in range(classes):
             if k != SKY:
-                score[i, k] += w * mixed(labels, k, at) / 255.0
+                score[i, k] += w * mixed(probabilities, k, at) / 255.0
         weight[i] += w * (1 - up)
     return (kind > 0).sum(), (kind == 2).sum()

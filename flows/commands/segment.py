@@ -79,7 +79,7 @@ def segment_evaluate(
 
 
 def segment_tile(path: Path, out: Path, settings: Settings) -> None:
-    """Write `classified/*.laz`, `labels/*.png` (LAS codes a pixel) and `masks/*.png` of the tile at `path`.
+    """Write `classified/*.laz`, `probabilities/*.png` (LAS codes a pixel) and `masks/*.png` of the tile at `path`.
 
     Results are kept in `out/steps`, so that `scan2sim run --out` the same folder goes on from there.
 
@@ -160,14 +160,14 @@ def _write_clouds(tile: Tile, out: Path, code: np.ndarray, confidence: np.ndarra
         write_classified(path, out / f"{path.stem}.laz", code[here], confidence[here], source[here])
 
 
-def _write_pictures(views: Path, labels: Path, out: Path) -> None:
+def _write_pictures(views: Path, probabilities: Path, out: Path) -> None:
     """Codes of every pixel, and masks: 0 on vehicles, people and the sky, 255 elsewhere."""
     away = np.isin(np.arange(len(CLASSES)), [CLASSES.index(name) for name in ("vehicle", "person", "sky")])
     for folder in (out / "labels", out / "masks"):
         folder.mkdir(exist_ok=True)
     for i, view in enumerate(views_io.load(views)):
-        if (labels / f"{i}.npy").is_file():
-            best, _ = class_map(np.load(labels / f"{i}.npy"), (view.camera.height, view.camera.width))
+        if (probabilities / f"{i}.npy").is_file():
+            best, _ = class_map(np.load(probabilities / f"{i}.npy"), (view.camera.height, view.camera.width))
             name = f"{Path(view.name).stem}.png"
             image.write(out / "labels" / name, code_of_index()[best])
             image.write(out / "masks" / name, np.where(away[best], 0, 255).astype(np.uint8))

@@ -123,8 +123,8 @@ def photos_of(inputs: Inputs, whole: PointCloud) -> list[Photo]:
             levels = [cv2.resize(grey, (camera.width, camera.height), interpolation=cv2.INTER_AREA)]
         for _ in range(2):
             levels.append(cv2.resize(levels[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
-        labels = inputs["labels"] / f"{i}.npy"
-        sky = np.ascontiguousarray(np.load(labels)[..., SHOWN.index("sky")]) if labels.is_file() else None
+        file = inputs["labels"] / f"{i}.npy"
+        sky = np.ascontiguousarray(np.load(file)[..., SHOWN.index("sky")]) if file.is_file() else None
         usable = image.read_mask(view)
         if usable is not None:
             usable = cv2.resize(usable, (camera.width, camera.height), interpolation=cv2.INTER_NEAREST)

@@ -109,26 +109,26 @@ def _check_rotation(R: F64, where: str) -> None:
 
 
 def _camera(model: Path, sensor: Element) -> Camera:
-    label = f"sensor {sensor.get('label') or sensor.get('id')}"
+    title = f"sensor {sensor.get('label') or sensor.get('id')}"
     resolution = sensor.find("resolution")
     if resolution is None:
-        raise ValueError(f"{label}: its resolution")
+        raise ValueError(f"{title}: its resolution")
     width, height = int(resolution.get("width") or 0), int(resolution.get("height") or 0)
     if min(width, height) < 1:
-        raise ValueError(f"{label}: its resolution")
+        raise ValueError(f"{title}: its resolution")
     kind = sensor.get("type", "frame")
     if kind == "spherical":
         return Camera("equirectangular", width, height)
     if kind not in ("frame", "fisheye"):
-        raise InputError(model, f"{label} is of type {kind!r}, which is not supported", UNDISTORT)
+        raise InputError(model, f"{title} is of type {kind!r}, which is not supported", UNDISTORT)
     found = {str(node.get("class", "adjusted")): node for node in sensor.iterfind("calibration")}
     calibration = found.get("adjusted", found.get("initial"))
     if calibration is None:
-        raise InputError(model, f"{label} has no calibration", "Align the photos, and export the cameras again")
+        raise InputError(model, f"{title} has no calibration", "Align the photos, and export the cameras again")
     value = {node.tag: float(node.text or 0) for node in calibration if node.tag != "resolution"}
     f = value.get("f") or value.get("fy") or 0.0
     if not (np.isfinite(list(value.values())).all() and f > 0):
-        raise ValueError(f"{label}: its focal length")
+        raise ValueError(f"{title}: its focal length")
     fx, cx, cy = f + value.get("b1", 0.0), value.get("cx", 0.0), value.get("cy", 0.0)
     cx, cy = width / 2 + cx - 0.5, height / 2 + cy - 0.5
     k1, k2, k3, k4, p1, p2, p3, p4, b2 = (
@@ -141,7 +141,7 @@ def _camera(model: Path, sensor: Element) -> Camera:
     for name, pixels in lost.items():
         if abs(pixels) > 0.01:
             raise InputError(
-                model, f"{label} has {name} (up to {abs(pixels):.2f} pixels), which is not supported", UNDISTORT
+                model, f"{title} has {name} (up to {abs(pixels):.2f} pixels), which is not supported", UNDISTORT
             )
     if kind == "fisheye":
         return Camera("fisheye", width, height, fx, f, cx, cy, (k1, k2, k3, k4))
@@ -150,7 +150,7 @@ def _camera(model: Path, sensor: Element) -> Camera:
         factor = np.polynomial.Polynomial([1, k1, k2, k3, k4])
         fitted, off = lens.radial(lambda r: np.asarray(factor(r * r)), _undistorted(factor, reach), f)
         if off > lens.EXACT:
-            raise InputError(model, f"{label}: k1 to k4 are {off:.3f} pixels off in OpenCV's model", UNDISTORT)
+            raise InputError(model, f"{title}: k1 to k4 are {off:.3f} pixels off in OpenCV's model", UNDISTORT)
         k1, k2, *rest = fitted.tolist()
         k = tuple(rest)
     return Camera("opencv", width, height, fx, f, cx, cy, (k1, k2, p2, p1, *k))
