@@ -162,13 +162,13 @@ def main() -> None:
         for one in streets:
             for kind, share in one["lost"].items():
                 worst[kind] = max(worst.get(kind, 0.0), share)
-        told = {
+        rounded = {
             "static_lost": max(one["static_lost"] for one in streets),
             "lost": worst,
             "moving_found": min(one["moving_found"] or 1.0 for one in streets),
             "seconds": max(one["seconds"] for one in streets),
         }
-        print("RESULT", json.dumps(told))
+        print("RESULT", json.dumps(rounded))
 
 
 if __name__ == "__main__":

@@ -71,8 +71,8 @@ def shape(out: Path, seeds: list[int], length: float, points: float) -> dict[str
             generate(street, length=length, points=points, photos=0, seed=seed)
         for name, values in _street(street, seed, length).items():
             found[name] += values
-        told = {name: f"{np.mean(values):.3f} of {len(values)}" for name, values in found.items() if values}
-        print(f"seed {seed}: {told}", flush=True)
+        line = {name: f"{np.mean(values):.3f} of {len(values)}" for name, values in found.items() if values}
+        print(f"seed {seed}: {line}", flush=True)
     return {
         "pole_recall": round(float(np.mean(found["pole"])), 3),
         "trunk_recall": round(float(np.mean(found["trunk"])), 3),

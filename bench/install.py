@@ -65,8 +65,8 @@ def packages(project: Path) -> dict[str, float]:
     down = sum(int(line.split()[2]) for line in lines if line.startswith("'")) / 1e6
     up = 0.0
     for name in names:
-        told = subprocess.run(["apt-cache", "show", "--no-all-versions", name], capture_output=True, text=True).stdout
-        up += next(int(x.split()[1]) for x in told.splitlines() if x.startswith("Installed-Size")) * 1024 / 1e6
+        shown = subprocess.run(["apt-cache", "show", "--no-all-versions", name], capture_output=True, text=True).stdout
+        up += next(int(x.split()[1]) for x in shown.splitlines() if x.startswith("Installed-Size")) * 1024 / 1e6
     print(f"{len(names)} packages of the system: {down:.0f} MB, {up:.0f} MB installed", flush=True)
     return {"packages": len(names), "packages_mb": down, "packages_installed_mb": up}
 

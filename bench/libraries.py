@@ -82,8 +82,8 @@ def main() -> None:
     lost = nowhere(wanted, here=here)
     for name, users in wanted.items():
         package = PACKAGE_OF.get(OTHER_NAMES.get(name, name), "every Debian")
-        told = "NOWHERE" if name in lost else NEVER_LOADED.get(name, package)
-        print(f"{name:32s}{told:40s} {users[0]}" + (f" and {len(users) - 1} more" if users[1:] else ""))
+        owner = "NOWHERE" if name in lost else NEVER_LOADED.get(name, package)
+        print(f"{name:32s}{owner:40s} {users[0]}" + (f" and {len(users) - 1} more" if users[1:] else ""))
     print("RESULT " + json.dumps({"objects": count, "of_the_system": len(wanted), "nowhere": sorted(lost)}))
     sys.exit(bool(lost))
 

@@ -27,9 +27,9 @@ def measure(command: list[str]) -> Measured:
     child = psutil.Popen(command)
     peak = 0
     while child.poll() is None:
-        looked = time.perf_counter()
+        began = time.perf_counter()
         peak = max(peak, _memory(child))
-        time.sleep(max(PERIOD, (time.perf_counter() - looked) / SHARE))
+        time.sleep(max(PERIOD, (time.perf_counter() - began) / SHARE))
     return Measured(time.perf_counter() - start, peak / 1e9, child.returncode)
 
 

@@ -139,15 +139,15 @@ def real(name: str, folder: Path) -> dict[str, Any]:
             shutil.copytree(folder / name / "never", at, symlinks=True)  # what is the same isn't made twice
         tile, run = street.made(street.STREETS[name], at, (f"refine.when={when}",))
         figures[when] = street.scored(street.STREETS[name], tile, run, folder / "pictures" / f"{name}_{when}")
-    told = json.loads((run / "report.json").read_text(encoding="utf-8"))["steps"]["refine"]
-    return compared(name, figures, told)
+    refined = json.loads((run / "report.json").read_text(encoding="utf-8"))["steps"]["refine"]
+    return compared(name, figures, refined)
 
 
-def compared(name: str, figures: dict[str, dict[str, Any]], told: dict[str, Any]) -> dict[str, Any]:
+def compared(name: str, figures: dict[str, dict[str, Any]], refined: dict[str, Any]) -> dict[str, Any]:
     """Figures of both worlds of a street, and of the step."""
     never, auto = figures["never"], figures["auto"]
     outlines = {when: float(np.median(f["displacements_px"])) for when, f in figures.items()}
-    facts = told["facts"]
+    facts = refined["facts"]
     print(
         f"{name}: matches {facts['displaced_px']:.2f} -> {facts.get('displaced_after_px')} pixels; held-out photos ",
         end="",
@@ -155,12 +155,12 @@ def compared(name: str, figures: dict[str, dict[str, Any]], told: dict[str, Any]
     print(
         f"{never['psnr_db']:.2f} -> {auto['psnr_db']:.2f} dB, SSIM {never['ssim']:.3f} -> {auto['ssim']:.3f}; ", end=""
     )
-    print(f"outlines {outlines['never']:.2f} -> {outlines['auto']:.2f} pixels; {told['seconds']:.1f} s")
+    print(f"outlines {outlines['never']:.2f} -> {outlines['auto']:.2f} pixels; {refined['seconds']:.1f} s")
     return {
         "matches_before_px": facts["displaced_px"], "matches_after_px": facts.get("displaced_after_px"),
         "psnr_before_db": never["psnr_db"], "psnr_after_db": auto["psnr_db"],
         "ssim_before": never["ssim"], "ssim_after": auto["ssim"],
-        "outline_before_px": outlines["never"], "outline_after_px": outlines["auto"], "seconds": told["seconds"],
+        "outline_before_px": outlines["never"], "outline_after_px": outlines["auto"], "seconds": refined["seconds"],
     }  # fmt: skip
 
 

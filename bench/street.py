@@ -222,9 +222,9 @@ def synthetic(folder: Path) -> dict[str, Any]:
         print(f"edge_cm: null, there is no {EDGES}")
         return out | {"edge_cm": None}
     command = [sys.executable, "-m", EDGES, str(folder / "tile"), str(folder / "run")]
-    told = subprocess.run(command, check=True, capture_output=True, text=True).stdout
-    print(told, end="")
-    result = next(line for line in reversed(told.splitlines()) if line.startswith("RESULT "))
+    output = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    print(output, end="")
+    result = next(line for line in reversed(output.splitlines()) if line.startswith("RESULT "))
     return out | {"edge_cm": json.loads(result.removeprefix("RESULT "))["edge_cm"]}
 
 

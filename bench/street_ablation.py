@@ -31,24 +31,24 @@ WITHOUT: dict[str, tuple[str, ...]] = {
     "refine": ("refine.when=never",),
 }
 """Settings that leave a part out."""
-TOLD = ("psnr_db", "ssim", "sharpness", "outline_px", "inside_mesh", "corridor_m2", "remains_m2", "seen_share")
+FIGURES = ("psnr_db", "ssim", "sharpness", "outline_px", "inside_mesh", "corridor_m2", "remains_m2", "seen_share")
 
 
 def figures(street: Street, folder: Path, pictures: Path, settings: tuple[str, ...]) -> dict[str, float]:
-    """Those of `TOLD`, of the street's world with these settings."""
+    """Those of `FIGURES`, of the street's world with these settings."""
     found: dict[str, Any] = scored(street, *made(street, folder, settings), pictures)
     found["outline_px"] = float(np.median(found["displacements_px"]))
     found["remains_m2"] = max(found["remains_m2"].values(), default=0.0)
-    return {name: round(float(found[name]), 3) for name in TOLD}
+    return {name: round(float(found[name]), 3) for name in FIGURES}
 
 
 def table(found: Mapping[str, Mapping[str, Mapping[str, float]]]) -> None:
     """Print a row for each part left out, by street."""
     for name in STREETS:
-        print(f"\n{name}, without: " + ", ".join(TOLD))
+        print(f"\n{name}, without: " + ", ".join(FIGURES))
         for part, streets in found.items():
             if name in streets:
-                print(f"  {part:10}" + "".join(f"{streets[name][key]:>9.2f}" for key in TOLD))
+                print(f"  {part:10}" + "".join(f"{streets[name][key]:>9.2f}" for key in FIGURES))
 
 
 def main() -> None:
@@ -66,9 +66,9 @@ def main() -> None:
                 print(f"{name}: left out, there is no {STREETS[name].data}")
                 continue
             shutil.rmtree(out / name / "run" / "world", ignore_errors=True)
-            told = figures(STREETS[name], out / name, out / "pictures" / part, WITHOUT[part])
-            found.setdefault(part, {})[name] = told
-            print(f"{name} without {part}: {told}", flush=True)
+            without = figures(STREETS[name], out / name, out / "pictures" / part, WITHOUT[part])
+            found.setdefault(part, {})[name] = without
+            print(f"{name} without {part}: {without}", flush=True)
     table(found)
     print("RESULT " + json.dumps(found))
 

@@ -74,17 +74,17 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="+", default=["kitti", "street_hard"])
     parser.add_argument("--out", type=Path, default=ROOT / "bench-out" / "texture")
     arguments = parser.parse_args()
-    told: dict[str, dict[str, dict[str, float]]] = {}
+    result: dict[str, dict[str, dict[str, float]]] = {}
     for name in arguments.scenes:
         if not available(name):
             continue
-        scene, told[name] = Scene(arguments.out / name), {}
+        scene, result[name] = Scene(arguments.out / name), {}
         for part, given in OFF.items():
             folder = paint(scene, given, scene.folder / "ablation")
             clean = scene.folder.with_name("street_clean") / "methods" / "ours" if name == "street_hard" else None
-            told[name][part] = figures(scene, folder, clean)
-            print(f"{name:12s} {part:26s} {told[name][part]}", flush=True)
-    print("RESULT " + json.dumps(told))
+            result[name][part] = figures(scene, folder, clean)
+            print(f"{name:12s} {part:26s} {result[name][part]}", flush=True)
+    print("RESULT " + json.dumps(result))
 
 
 if __name__ == "__main__":

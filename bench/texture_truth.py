@@ -85,8 +85,8 @@ def samples(scene: Scene) -> Samples:
         uv, _ = pixels(view.camera, view.T_world_cam, truth.xyz[better])
         photo = image.read_rgb(view.photo)
         for part in np.array_split(np.arange(len(better)), len(better) // 30_000 + 1):  # remap takes 32 767 rows
-            looked_up = cv2.remap(photo, uv[part][:, None], None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            colour[better[part]] = np.asarray(looked_up).reshape(-1, 3)
+            sampled = cv2.remap(photo, uv[part][:, None], None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            colour[better[part]] = np.asarray(sampled).reshape(-1, 3)
         best[better] = np.linalg.norm(places[better] - view.centre, axis=1)
     near = best < NEAR
     return Samples(truth.xyz[near], truth.rgb[near], colour[near])

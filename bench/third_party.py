@@ -120,11 +120,11 @@ NOT_HERE = ("dev", "meshlab")
 def project() -> dict[str, list[str]]:
     """What pyproject.toml asks for: "core", then each extra but those that `make test` makes no environment with."""
     about = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    extras = {name: asked for name, asked in about["optional-dependencies"].items() if name not in NOT_HERE}
+    extras = {name: requested for name, requested in about["optional-dependencies"].items() if name not in NOT_HERE}
     return {"core": about["dependencies"], **extras}
 
 
-def closure(asked: Iterable[str]) -> dict[str, Distribution]:
+def closure(requested: Iterable[str]) -> dict[str, Distribution]:
     """Requirements and all that they require, as installed, by name.
 
     Raises:
@@ -132,7 +132,7 @@ def closure(asked: Iterable[str]) -> dict[str, Distribution]:
     """
     extras = project()
     found: dict[tuple[str, frozenset[str]], Distribution] = {}
-    waiting = [Requirement(line) for line in asked]
+    waiting = [Requirement(line) for line in requested]
     while waiting:
         wanted = waiting.pop()
         name = canonicalize_name(wanted.name)
@@ -158,8 +158,8 @@ def licence(package: Distribution) -> str:
     """What a package says that it is under."""
     about = package.metadata.json
     classified = [line.split(" :: ")[-1] for line in about.get("classifier", ()) if line.startswith("License ::")]
-    told = about.get("license_expression") or ", ".join(classified) or about.get("license", "not told")
-    return str(told).split("\n")[0]
+    licence = about.get("license_expression") or ", ".join(classified) or about.get("license", "not told")
+    return str(licence).split("\n")[0]
 
 
 def brought(package: Distribution) -> list[str]:
@@ -175,9 +175,9 @@ def table(packages: dict[str, Distribution]) -> tuple[str, list[str]]:
     for name, package in packages.items():
         libraries = brought(package)
         unknown += [library for library in libraries if library not in BUNDLED]
-        told = [BUNDLED.get(library, "not looked up") for library in libraries]
+        kinds = [BUNDLED.get(library, "not looked up") for library in libraries]
         parts = [
-            f"{one}: {', '.join(compress(libraries, (other == one for other in told)))}" for one in sorted({*told})
+            f"{one}: {', '.join(compress(libraries, (other == one for other in kinds)))}" for one in sorted({*kinds})
         ]
         parts += [NOTES[name]] if name in NOTES else []
         rows.append(f"| {name} | {package.version.split('+')[0]} | {licence(package)} | {'; '.join(parts)} |")
@@ -189,8 +189,8 @@ def page() -> tuple[str, list[str]]:
     text = PAGE.format(attention="\n".join(f"| {' | '.join(row)} |" for row in ATTENTION))
     shown: set[str] = set()
     unknown: list[str] = []
-    for part, asked in project().items():
-        packages = {name: package for name, package in closure(asked).items() if name not in shown}
+    for part, requested in project().items():
+        packages = {name: package for name, package in closure(requested).items() if name not in shown}
         shown |= packages.keys()
         rows, missing = table(packages)
         unknown += missing

@@ -44,18 +44,18 @@ def study_compression(
     known = found(truth, "truth.csv")
     if known is None:
         raise SettingError("--truth", "is missing", "Give a trajectory, or a GPS track, to compare with")
-    asked = Study.of("", {
+    requested = Study.of("", {
         "source": source, "truth": known, "gps": found(gps, "gps.csv"), "mask": found(mask, "mask.png"),
         "heights": _numbers("--heights", heights, int), "bitrates": _numbers("--bitrates", bitrates, float),
         "rates": _numbers("--rates", rates, float),
     }, remedy="Give others")  # fmt: skip
-    table = study(asked, out, settings, jobs)
+    table = study(requested, out, settings, jobs)
     console.print(table.read_text(encoding="utf-8"), highlight=False, markup=False, soft_wrap=True)
     console.print(f"Table: {table}", highlight=False, soft_wrap=True, markup=False)
     return table
 
 
-def study(asked: Study, out: Path, settings: Settings, jobs: int = 1) -> Path:
+def study(requested: Study, out: Path, settings: Settings, jobs: int = 1) -> Path:
     """Run the cells that no earlier run has finished; returns `out/table.md`, which holds them all.
 
     A cell that fails is N/A with its reason; an interrupted study leaves the tables of what is there.
@@ -65,9 +65,9 @@ def study(asked: Study, out: Path, settings: Settings, jobs: int = 1) -> Path:
     """
     need("slam study", "av", "matplotlib")
     can_track(settings.params(TRACK))
-    video = asked.video()
-    segment = segment_of(video, read_truth(asked.truth))
-    nodes = recipe(asked, video, segment, settings)
+    video = requested.video()
+    segment = segment_of(video, read_truth(requested.truth))
+    nodes = recipe(requested, video, segment, settings)
     failed: Mapping[NodeId, ScanError] = {}
     with locked(out):
         store = Store(out / STORE)
@@ -79,8 +79,8 @@ def study(asked: Study, out: Path, settings: Settings, jobs: int = 1) -> Path:
             with log.errors(out):
                 failed = execute_shown(planned, store, log, jobs, to_the_end=True).failed
         finally:
-            backend, results = settings.params(TRACK).backend, _results(asked, video, planned, store, failed)
-            table = write(out, Tables(video, asked.gps is not None, backend, segment, cells(asked), results))
+            backend, results = settings.params(TRACK).backend, _results(requested, video, planned, store, failed)
+            table = write(out, Tables(video, requested.gps is not None, backend, segment, cells(requested), results))
             digests.save()
         for error in failed.values():
             if isinstance(error, SpaceError):  # no cell's fault
@@ -90,11 +90,11 @@ def study(asked: Study, out: Path, settings: Settings, jobs: int = 1) -> Path:
 
 
 def _results(
-    asked: Study, video: Video, planned: Iterable[Planned], store: Store, failed: Mapping[NodeId, ScanError]
+    requested: Study, video: Video, planned: Iterable[Planned], store: Store, failed: Mapping[NodeId, ScanError]
 ) -> dict[Cell, Result]:
     """Of the cells that are done, or can't be."""
-    results = {cell: Result(reason=refused(cell, video)) for cell in cells(asked) if refused(cell, video)}
-    for cell in cells(asked):
+    results = {cell: Result(reason=refused(cell, video)) for cell in cells(requested) if refused(cell, video)}
+    for cell in cells(requested):
         own = [item.node for item in planned if item.node.group == cell.name]
         keys = [item.key for item in planned if item.node.group == cell.name]
         made = [store.find(node.full_name, key) for node, key in zip(own, keys, strict=True)]

@@ -23,13 +23,13 @@ class Reason(Enum):
     CHANGED = "its input, settings or version changed"
     DAMAGED = "its result was damaged or deleted"
     FORCED = "forced"
-    ASKED = "asked for by --from"
+    REQUESTED = "asked for by --from"
     FOLLOWS = "follows what --from asks for"
 
     @property
     def again(self) -> bool:
         """Whether it holds though a result may be there."""
-        return self in (Reason.FORCED, Reason.ASKED, Reason.FOLLOWS)
+        return self in (Reason.FORCED, Reason.REQUESTED, Reason.FOLLOWS)
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ def plan(
         if force:
             reason = Reason.FORCED
         elif start is not None and node.step.name == start:
-            reason = Reason.ASKED
+            reason = Reason.REQUESTED
         elif any(planned[s.node].again for s in node.inputs.values() if isinstance(s, Output)):
             reason = Reason.FOLLOWS
         planned[node.id] = Planned(node, key, keys, reason)
