@@ -1,4 +1,4 @@
-"""Rays of a panorama, compiled: through which pixels, and where they meet the ground."""
+"""Rays of a panorama, compiled: through which pixels, and where they hit the ground."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def _ground(
 def hit_ground(
     ray: Array, distance: Array, face: Array, uv: Array, moved: Array, static: Any, other: Any, ground: Any, sun: Array
 ) -> tuple[Array, Array, Array]:
-    """Let rays that miss all things, or meet them underground, meet the ground; `distance` (N,) is updated.
+    """Let rays that miss all things, or hit them underground, hit the ground; `distance` (N,) is updated.
 
     Returns:
         What each meets (N,) uint8, the normal there (N, 3), and the ray (N, 6) from there to the sun (one that

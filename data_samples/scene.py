@@ -211,7 +211,7 @@ class Scene:
         return replace(answer, heading=heading)
 
     def _to_car(self, rays: F32, car: CarPoses) -> tuple[npt.NDArray[np.intp], F32]:
-        """Rays that may meet the moving car: their indices, and the rays in the car's coordinates."""
+        """Rays that may hit the moving car: their indices, and the rays in the car's coordinates."""
         if not car.present.any():
             return np.zeros(0, np.intp), np.zeros((0, 6), np.float32)
         middle = car.position + np.array([0, 0, 0.7], np.float32)

@@ -133,7 +133,7 @@ def paint(
     static: Any, other: Any, ground: Any, boxes: Array, sun: Array, sky: Array, centre: Array, pictures: Array,
     angle: float, gain: float, table: Array, seed: int,
 ) -> Array:  # fmt: skip
-    """(N, 3) uint8 sRGB of what rays meet.
+    """(N, 3) uint8 sRGB of what rays hit.
 
     Args:
         boxes: (K, 6) other vehicles, for the shade below them.

@@ -1,4 +1,4 @@
-"""Channels beside the colours: what a scan tells of each pixel's height, distance and slope.
+"""Channels beside the colours: what a scan measures of each pixel's height, distance and slope.
 
 A picture of them is (h, w, 4) uint8, at a `FRACTION`-th of the pixels that a network looks at:
 

@@ -63,7 +63,7 @@ SHOWN = (
     "road", "sidewalk", "terrain", "building", "road_sign", "pole", "low_vegetation", "high_vegetation", "vehicle",
     "person", "wall_or_fence", "sky",
 )  # fmt: skip
-"""The classes that networks tell of a photo's pixels, in the order of the step `label`'s probabilities."""
+"""The classes that networks predict for a photo's pixels, in the order of the step `label`'s probabilities."""
 NOISE = (7, 18)
 UNCLASSIFIED = CODE["unclassified"]
 UNKNOWN = (0, UNCLASSIFIED, 12)  # never classified, unclassified, legacy overlap

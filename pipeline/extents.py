@@ -439,14 +439,14 @@ def _without_chamfers(ring: F64, lines: list[Line], voxel: float) -> tuple[F64, 
 
 
 def _intersection(before: Line, after: Line) -> F64 | None:
-    """Where two lines meet, None where they hardly do."""
+    """Where two lines intersect, None where they hardly do."""
     (p, d, _), (q, e, _) = before, after
     cross = d[0] * e[1] - d[1] * e[0]
     return p + ((q - p)[0] * e[1] - (q - p)[1] * e[0]) / cross * d if abs(cross) > 0.3 else None
 
 
 def _corner(before: Line, after: Line, place: F64, voxel: float) -> F64:
-    """Where two sides meet near `place`; else the foot of `place` on the one that was fitted."""
+    """Where two sides intersect near `place`; else the foot of `place` on the one that was fitted."""
     (p, d, one), (q, e, two) = before, after
     crossing = _intersection(before, after)
     if crossing is not None and np.linalg.norm(crossing - place) < 3 * voxel:

@@ -128,7 +128,7 @@ class Rays:
 
     Attributes:
         origin: (N, 3) local metres, where the scanner was.
-        end: (N, 3) local metres, what it met.
+        end: (N, 3) local metres, what it hit.
         limit: (3,) of the elevation (radians) that its rays end at: of 1, cosine and sine of their azimuth. The
             uppermost rays are a cone, tilted as the scanner is.
     """
@@ -154,7 +154,7 @@ class Rays:
             return Rays(origin, end.astype(np.float64), np.array([np.pi / 2, 0.0, 0.0]))
         columns, values = np.array(terms), np.array(highest)
         limit, fits = np.zeros(3), np.ones(len(values), bool)
-        for _ in range(10):  # where nothing is high, the uppermost rays met nothing
+        for _ in range(10):  # where nothing is high, the uppermost rays hit nothing
             limit = np.linalg.lstsq(columns[fits], values[fits], rcond=None)[0]
             off = values - columns @ limit
             fits = off >= min(-LOOSE, float(np.sort(off)[-3]))

@@ -2,7 +2,7 @@
 
 Every return proves that its ray was empty up to it. Space is cut into voxels, time into windows about as long as a
 turn of a spinning scanner. In a window a voxel is *hit* where a return lies in it or beside it, else it is *passed*
-where so many rays went through it that they would have met a thing of its size. A place is free if it and all its
+where so many rays went through it that they would have hit a thing of its size. A place is free if it and all its
 neighbours were passed in several windows, and it was seldom hit. What no ray has been behind is never free: roads and
 walls stay however flatly they are seen, and whatever a pose is off by less than a voxel. Thin and see-through things
 stay as they are hit again and again. Each time that the scanner comes by is judged by itself: what it saw through once,
@@ -61,7 +61,7 @@ def in_free_space(
         voxel: metres; poses must be better than this.
         reach: metres from the scanner up to which rays count: beyond, what angles are off by may exceed a voxel.
         votes: windows that must have passed a place.
-        low, high: heights (local z, metres) between which points are asked about.
+        low, high: heights (local z, metres) between which points are classified.
     """
     first = np.flatnonzero(np.diff(windows, prepend=windows[:1] - 1))
     again = np.append(False, np.diff(windows[first]) > PAUSE)
@@ -134,7 +134,7 @@ def _span(places, first, end, reach):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _carve(xyz, origins, candidates, starts, again, ends, spans, box, voxel, reach, votes, out):  # type: ignore[no-untyped-def]
-    """Say in `out` which of the points that are asked about, and lie in the box, are `FREE` or `OPEN`."""
+    """Mark in `out` which of the candidates that lie in the box are `FREE` or `OPEN`."""
     corner = box[:3] - HALO * voxel
     shape = np.empty(3, np.int64)
     for k in range(3):
@@ -187,7 +187,7 @@ def _voxel(xyz, i, corner, voxel):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _overlap(span, corner, far):  # type: ignore[no-untyped-def]
-    """Whether two boxes meet."""
+    """Whether two boxes overlap."""
     apart = False
     for k in range(3):
         apart |= span[k] > far[k] or span[k + 3] < corner[k]

@@ -174,7 +174,7 @@ def _line(run: F64, along: F64) -> tuple[F64, F64]:
 
 
 def _corner(place: F64, before: tuple[F64, F64], after: tuple[F64, F64], tolerance: float) -> list[F64]:
-    """Where two lines meet, near `place`; where they don't, the feet of `place` on both."""
+    """Where two lines intersect, near `place`; where they don't, the feet of `place` on both."""
     (p, d), (q, e) = before, after
     cross = d[0] * e[1] - d[1] * e[0]
     if abs(cross) > np.sin(CORNER):

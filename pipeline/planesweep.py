@@ -1,8 +1,8 @@
 """What photos say of a wall beyond what was scanned of it.
 
-The wall's plane is looked at in photos from several places along the path (Gallup et al., "Real-time plane-sweeping
-stereo with multiple sweeping directions", CVPR 2007). What lies on it looks alike in all of them; what lies before or
-behind does so on a parallel plane. Where there is no pattern to compare, it has to look as the scanned wall below does.
+The wall's plane is rectified from photos at several places along the path (Gallup et al., "Real-time plane-sweeping
+stereo with multiple sweeping directions", CVPR 2007). What lies on it is alike in all of them; what lies before or
+behind does so on a parallel plane. Where there is no pattern to compare, it has to be as the scanned wall below is.
 Import late: it loads numba.
 """
 
@@ -32,11 +32,11 @@ OFFSETS = (-0.7, 0.7, 1.6, 3.5, 8.0)
 SAME = 0.05
 """Correlation by which another plane must be better to tell against the wall's own."""
 VIEWS = 8
-"""Photos that a wall is looked at in, spread along the path."""
+"""Photos that a wall is compared in, spread along the path."""
 GLANCE = 0.25
-"""Texels along a cell's side that tell whether a photo sees the wall at all."""
+"""Texels along a cell's side that decide whether a photo sees the wall at all."""
 NEAR = 60.0
-"""Metres from which photos are asked."""
+"""Metres from which photos are compared."""
 FLAT_ON = 0.1
 """Cosine of the angle between the wall's normal and a photo's ray, at least."""
 COARSE = 0.25
@@ -86,11 +86,11 @@ class Patch:
 
 
 def rectified(wall: Wall, photo: Photo, offset: float = 0.0, texels: float = TEXELS) -> Patch:
-    """What a photo shows of a wall's plane, moved back by `offset` metres.
+    """A photo rectified to a wall's plane, moved back by `offset` metres.
 
     Args:
-        wall: its rows and columns are looked at.
-        photo: to look into.
+        wall: its rows and columns are sampled.
+        photo: to sample.
         offset: metres behind the wall.
         texels: along a cell's side.
     """

@@ -1,4 +1,4 @@
-"""Ranges of parameters: the types that several share, and the sentence that tells a range.
+"""Ranges of parameters: the types that several share, and the sentence that describes a range.
 
 They are generous: what is outside would be a slip of the pen, or take more memory or time than any machine has. What
 takes memory by the data as well (texels of a surface, pixels of a map) is estimated and refused by its step.

@@ -48,7 +48,7 @@ class Image:
 
     Attributes:
         rgb: (H, W, 3) uint8.
-        hit: bool, whether the pixel's ray met a mesh.
+        hit: bool, whether the pixel's ray hit a mesh.
         seen: uint8 of the textures' masks (255 from a photo, 128 from points, 64 filled); 0 without textures.
         face: int32 within its body's mesh, -1 where nothing was hit.
         body: int16 index of the body, -1 where nothing was hit.
@@ -73,7 +73,7 @@ def textured(folder: Path) -> Body:
 
 
 class _Hits(NamedTuple):
-    """What N rays meet first: arrays (N,) as in `Image`."""
+    """First hits of N rays: arrays (N,) as in `Image`."""
 
     face: I32
     body: npt.NDArray[np.int16]
@@ -224,7 +224,7 @@ class Renderer:
         )  # fmt: skip
 
     def _intersect(self, origin: F64, direction: F64) -> _Hits:
-        """What rays from origins along directions (N, 3) meet first; a direction of NaN meets nothing."""
+        """First hits of rays from origins along directions (N, 3); a direction of NaN hits nothing."""
         cast, known = np.concatenate([origin, direction], axis=1, dtype=np.float32), np.isfinite(direction).all(axis=1)
         cast[~known] = 0
         answer = self._casting.cast_rays(_tensor(cast))
@@ -239,7 +239,7 @@ class Renderer:
         return _Hits(face, body, np.where(hit, t, np.inf).astype(np.float32), barycentric)
 
     def _shade_hits(self, hits: _Hits, direction: F64, shaded: bool, wireframe: bool) -> tuple[U8, U8]:
-        """Colours (N, 3) and masks (N,) of what rays met, black and 0 where that is nothing."""
+        """Colours (N, 3) and masks (N,) of what rays hit, black and 0 where that is nothing."""
         rgb, seen = np.zeros((len(hits.body), 3), np.uint8), np.zeros(len(hits.body), np.uint8)
         for i, body in enumerate(self.bodies):
             at = np.flatnonzero(hits.body == i)

@@ -1,8 +1,8 @@
-"""A mesh brought to the planes that its points lie on, with the edges in which planes meet.
+"""A mesh brought to the planes that its points lie on, with the edges in which planes intersect.
 
 Poisson rounds what is sharp. Vertices are laid onto their planes; an edge of the mesh that goes from one plane to
-another gets a vertex where both meet, a triangle that touches three gets their corner (Attene et al., "Edge-Sharpener",
-SGP 2003). What no plane explains stays as it is. Import late: it loads numba.
+another gets a vertex where both intersect, a triangle that touches three gets their corner (Attene et al.,
+"Edge-Sharpener", SGP 2003). What no plane explains stays as it is. Import late: it loads numba.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from scan2sim.pipeline.types import F32, F64, I32, Mesh
 NEAR = 16
 """Points around a vertex whose planes it may lie on."""
 REACH = 2.5
-"""Voxels within which they are looked for."""
+"""Voxels within which they are searched for."""
 ROUNDED = 1.5
 """Voxels from an edge within which Poisson rounds it: its kernel reaches over three cells of half a voxel."""
 FACING = float(np.cos(np.radians(40.0)))
-"""Turn by which a vertex that lies on a plane may look away from it."""
+"""Turn by which a vertex that lies on a plane may face away from it."""
 AMID = 0.75
 """Share of the points around that are one plane's, from which on a vertex amid them is turned by noise, so far:"""
 TURNED = float(np.cos(np.radians(75.0)))
@@ -42,7 +42,7 @@ ROUNDS = 8
 
 
 Edges = tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]
-"""Of a mesh, as `edges_of` tells them."""
+"""Of a mesh, as `edges_of` gives them."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Sharpened:
     Attributes:
         mesh: without density.
         which: (V,) plane of each vertex, -1 for none or several.
-        edge: (V,) bool, put where planes meet.
+        edge: (V,) bool, put where planes intersect.
     """
 
     mesh: Mesh
@@ -124,7 +124,7 @@ def plane_of(
 ) -> tuple[I32, npt.NDArray[np.bool_]]:
     """(V,) each vertex's plane, -1 for none; and whether it lies beside an edge.
 
-    A vertex's is the nearest point's, where it lies on it and looks as it does; beside an edge, which Poisson has
+    A vertex's is the nearest point's, where it lies on it and faces as it does; beside an edge, which Poisson has
     rounded, the nearer of the two that meet there.
     """
     own = np.full(len(mesh.vertices), -1, np.int32)
@@ -154,7 +154,7 @@ def vertex_normals(mesh: Mesh) -> F64:
 def intersect(places: F64, planes: Planes, which: npt.NDArray[np.integer]) -> tuple[F64, F64]:
     """The places (N, 3) on all of the planes `which` (N, K), K = 2 or 3, that are nearest to `places`.
 
-    And metres (N,) to them, infinite where planes hardly meet.
+    And metres (N,) to them, infinite where planes hardly intersect.
     """
     if not len(places):
         return places.reshape(-1, 3), np.zeros(0)

@@ -1,7 +1,7 @@
 """Who sees what: range images of meshes and points, and the test of a point against them.
 
 A range image holds, for every pixel of a scaled camera, the distance along the pixel's ray to
-what it meets first, whatever the camera model. Meshes are met by ray casting (Embree); for discs every
+its first hit, whatever the camera model. Meshes are hit by ray casting (Embree); for discs every
 pixel of their footprint asks exactly where its own ray meets the plane.
 
 What hides: the meshes where points bear them out (Poisson rounds off what is thin, and such a bulge hides nothing),

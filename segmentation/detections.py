@@ -1,4 +1,4 @@
-"""Signs that photos show: places where several photos agree that a sign hangs, told by a network's classes."""
+"""Signs that photos show: places where several photos agree that a sign hangs, detected by a network's classes."""
 
 from __future__ import annotations
 

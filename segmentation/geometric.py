@@ -312,7 +312,7 @@ def _poles(classification: U8, xyz: F32, shape: Shape) -> None:
 def _vehicles(classification: U8, xyz: F32, height: F32, shape: Shape, rough: F32) -> None:
     """Compact things of a car's size, smoother than bushes.
 
-    Parked cars touch what is beside them near the ground and crowns overhang them, so they are told
+    Parked cars touch what is beside them near the ground and crowns overhang them, so they are found
     apart in a band at the height of their doors; what is above and below it follows.
     """
     from scipy.spatial import cKDTree

@@ -2,7 +2,7 @@
 
 A vehicle is a box on the ground. Two kinds of clusters are offered: points that photos take for vehicles, and points
 at the height of doors, whatever their class; the first parts a car from the hedge that it touches, the second finds a
-car of which photos tell the half. A box is fitted to each (Zhang et al., "Efficient L-shape fitting for vehicle
+car of which photos classify the half. A box is fitted to each (Zhang et al., "Efficient L-shape fitting for vehicle
 detection using laser scanners", IV 2017: the rectangle that points lie nearest to the sides of), and what speaks for a
 vehicle is summed as logarithms of likelihood ratios: whether its size is one of `KINDS`, what photos say of all points
 in the box, and whether it stands free. What is accepted is taken whole: all that is above the ground in its box.
@@ -49,7 +49,7 @@ KINDS = (
 CELL = 0.2
 """Metres of the plan's cells by which points are one cluster: things half a metre apart are two."""
 BAND = (0.3, 2.6)
-"""Metres above ground in which points that are told to be vehicles make clusters: wheels and crowns touch others."""
+"""Metres above ground in which points that are classified as vehicles make clusters: wheels and crowns touch others."""
 DOORS = (0.3, 1.2)
 """The same for clusters of any class."""
 TALLEST = 4.3
@@ -64,7 +64,7 @@ LEAST = 12
 ONE_SIDE = 1.3
 """Metres: a vehicle that seems to be narrower was seen from one side, and goes on behind it."""
 WITNESSES = 2.0
-"""Points of one thing count as so many that tell by themselves: photos confuse a thing as a whole."""
+"""Points of one thing count as so many independent observations: photos confuse a thing as a whole."""
 FREE = (0.15, 0.6)
 """Share of cells at a box's ends that hold something: as few as where it stands free, as many as within a wall."""
 PRIOR = -3.0
@@ -82,7 +82,7 @@ LANE = 3.0
 CARVED = 0.3
 """Share of a thing's points near which others moved, from which on all of it moved."""
 MOSTLY = 0.5
-"""Share of a standing person's points that are told to be one's, at least: bins and posts are told so in part."""
+"""Share of a standing person's points that are classified as one's, at least: of bins and posts it is a part."""
 
 
 @dataclass(frozen=True)
@@ -153,7 +153,7 @@ class Scan:
         xyz: local metres.
         height: metres above ground.
         ground: which are of the ground.
-        classification: LAS codes told.
+        classification: LAS codes.
         odds: logarithm of the odds that photos, or shape alone, give to vehicle.
         weight: what that counts.
         moved: near points that moved.
@@ -195,9 +195,9 @@ def vehicles(scan: Scan) -> list[Thing]:
 
 
 def no_vehicles(scan: Scan, found: Sequence[Thing]) -> Ints:
-    """Indices of points that are told to be vehicles', but lie on the ground or in clusters of no vehicle's shape.
+    """Indices of points that are classified as vehicles, but lie on the ground or in clusters of no vehicle's shape.
 
-    What is told so below the vehicles that were `found` is theirs: wheels and sills.
+    What is classified so below the vehicles that were `found` is theirs: wheels and sills.
     """
     classified = scan.classification == CODE["vehicle"]
     if found:
@@ -230,12 +230,12 @@ def remains(scan: Scan) -> Ints:
 
 
 def people(scan: Scan) -> list[Thing]:
-    """Clusters of a person's size that are told to be persons, whole."""
+    """Clusters of a person's size that are classified as persons, whole."""
     return [thing for thing in _of_a_persons_size(scan) if _is_person(scan, thing)]
 
 
 def no_people(scan: Scan) -> Ints:
-    """Indices of points that are told to be persons', in things of their size that most votes take for another."""
+    """Indices of points that are classified as persons, in things of their size that most votes take for another."""
     classified = np.flatnonzero(scan.classification == CODE["person"])
     wrong = np.zeros(len(classified), bool)
     for thing in _of_a_persons_size(scan):
@@ -249,7 +249,7 @@ def _is_person(scan: Scan, thing: Thing) -> bool:
 
 
 def _of_a_persons_size(scan: Scan) -> list[Thing]:
-    """All of that size of which some points are told to be a person's."""
+    """All of that size of which some points are classified as a person's."""
     tree = cKDTree(scan.xyz[:, :2])
     found = []
     for cluster in clusters(scan.xyz, ~scan.ground & (scan.classification == CODE["person"]) & (scan.height < 2.3)):

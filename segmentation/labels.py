@@ -1,4 +1,4 @@
-"""The classes that networks tell, as LAS codes, and how the label sets of others map onto them by name."""
+"""The classes that networks predict, as LAS codes, and how the label sets of others map onto them by name."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def code_of_index() -> U8:
 
 
 def index_of_code() -> U8:
-    """(256,) index into `CLASSES` of a LAS code; code 0 is the sky, 255 and what networks don't tell `IGNORED`."""
+    """(256,) index into `CLASSES` of a LAS code; code 0 is the sky, 255 and what networks don't predict `IGNORED`."""
     table = np.full(256, IGNORED, np.uint8)
     for i, name in enumerate(CLASSES):
         table[CODE.get(name, 0)] = i

@@ -60,7 +60,7 @@ class _Merge(nn.Module):
 class StreetNet(nn.Module):
     """(B, 3 + 4, H, W) colours and `pipeline.channels` in [0, 1] to (B, classes, H / 4, W / 4) logits.
 
-    Once trained it looks twice, the second time at the picture mirrored, and tells the mean.
+    Once trained it predicts twice, the second time the picture mirrored, and gives the mean.
 
     Args:
         classes: number of them.

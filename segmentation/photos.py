@@ -18,20 +18,20 @@ OVERLAP = 128
 SMALLEST = 256
 """Pixels below which tiles aren't made smaller for want of memory."""
 STRIDE = 4
-"""Probabilities are kept at this fraction of the pixels looked at."""
+"""Probabilities are kept at this fraction of the pixels classified."""
 ENLARGED = 1.6
 """Photos are enlarged at most so many times."""
 
 
 class Classifier:
-    """A network, asked for the classes of photos.
+    """Classifies the pixels of photos by a network.
 
     Args:
         network: loaded.
         where: its weights' file, for messages.
 
     Attributes:
-        takes_channels: whether it asks for what a scan tells of a photo's pixels, too.
+        takes_channels: whether it takes what a scan measures at a photo's pixels, too.
         tile: pixels of a tile's side; made smaller when a device runs out of memory.
     """
 
@@ -45,7 +45,7 @@ class Classifier:
         self.tile = TILE
 
     def probabilities(self, rgb: U8, camera: Camera, channels: U8 | None = None) -> U8:
-        """(h, w, C) uint8, 255 for 1, by class of `CLASSES`, at about a `STRIDE`-th of the pixels looked at.
+        """(h, w, C) uint8, 255 for 1, by class of `CLASSES`, at about a `STRIDE`-th of the pixels classified.
 
         Args:
             rgb: (H, W, 3) of the whole photo.
@@ -69,7 +69,7 @@ class Classifier:
         return whole[:, cut : whole.shape[1] - cut] if wide else whole
 
     def size(self, camera: Camera) -> tuple[int, int]:
-        """Width and height in which a photo is looked at."""
+        """Width and height at which a photo is classified."""
         wanted, factor = self._network.facts.pixels_a_radian, 1.0
         if wanted is not None:
             has = camera.width / (2 * math.pi) if camera.model == "equirectangular" else min(camera.fx, camera.fy)

@@ -1,4 +1,4 @@
-"""Score: classes told against classes known."""
+"""Score: predicted classes against known ones."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ MEAN_OF = ("road", "terrain", "building", "low_vegetation", "high_vegetation")
 
 @dataclass(frozen=True)
 class Confusion:
-    """How many points of each class were told as each.
+    """How many points of each class were classified as each.
 
     Attributes:
         codes: (K,) LAS codes that occur.
-        count: (K, K) rows: known, columns: told.
+        count: (K, K) rows: known, columns: predicted.
     """
 
     codes: tuple[int, ...]
@@ -44,7 +44,7 @@ class Confusion:
         return sum(values) / len(values) if values else float("nan")
 
     def table(self) -> str:
-        """As text: a row a known class, shares of what it was told as, in per cent."""
+        """As text: a row a known class, shares of what it was classified as, in per cent."""
         names = {c.code: c.name for c in CLASSES}
         heads = [names.get(code, str(code))[:9] for code in self.codes]
         lines = [f"{'known as':16s}{'points':>11s}{'IoU':>7s} " + "".join(f"{head:>10s}" for head in heads)]

@@ -13,19 +13,19 @@ if TYPE_CHECKING:
     from scan2sim.pipeline.types import U8, PointCloud
 
 PHOTO, SHAPE, OWN = 1, 2, 3
-"""What a point's class is told from: photos that see it (with its shape and neighbours), those alone, the cloud."""
+"""What a point's class comes from: photos that see it (with its shape and neighbours), those alone, the cloud."""
 
 
 class SegmentParams(Params):
     """Where classes come from.
 
     Attributes:
-        overwrite: tell classes anew even if the cloud has some.
+        overwrite: classify anew even if the cloud has some.
         min_classified: share of points with a class (other than never classified and unclassified)
             from which on the cloud's own are kept.
         size: metres of the voxels that photos are asked about.
         voxel: metres, detail of the classification by shape (`segmentation.geometric`).
-        photos: use what the photos say; False tells classes from shape alone.
+        photos: use what the photos say; False classifies by shape alone.
     """
 
     overwrite: bool = False
@@ -36,7 +36,7 @@ class SegmentParams(Params):
 
 
 def segment(inputs: Inputs, params: SegmentParams, out: Path, report: Report) -> Done:
-    """Keep the classes of `cloud`, or tell them from `labels` (of the step `label`, for `views`) and shape.
+    """Keep the classes of `cloud`, or classify its points by `labels` (of the step `label`, for `views`) and shape.
 
     Inputs: `cloud`; `views` and `labels`; `path`, the scanner's, where it is known; `moving`, of `carve`: it hides what
     is behind it in photos.
@@ -94,7 +94,7 @@ SKY_LIMIT = 0.15
 def classify_points(
     cloud: PointCloud, inputs: Inputs, params: SegmentParams, report: Report
 ) -> tuple[U8, U8, U8, dict[str, Any]]:
-    """LAS codes, confidence (255: sure) and source of every point (N,), and facts where photos told something."""
+    """LAS codes, confidence (255: sure) and source of every point (N,), and facts where photos were used."""
     import numpy as np
 
     from scan2sim.pipeline.io import views as views_io

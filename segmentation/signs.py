@@ -154,7 +154,7 @@ def _listed(
 
     frame, out = terrain.frame, [dict(row) for row in rows]
     by_size = sorted(zip(plates, moved, strict=True), key=lambda one: one[0].width * one[0].height)
-    for plate, shift in by_size:  # the largest tells last
+    for plate, shift in by_size:  # the largest has the last word
         at = np.array([frame.to_local([row["x"], row["y"], row["z"]]) for row in out]).reshape(-1, 3)
         apart = np.hypot(*(at[:, :2] - plate.centre[:2]).T)
         apart[[row["kind"] == "trunk" for row in out]] = np.inf

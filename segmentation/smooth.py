@@ -1,6 +1,6 @@
 """Smooth: photos' votes and the points' shape together, so that classes end at real edges. Import late: loads numba.
 
-Shape is told without photos (`segmentation.geometric`): how likely it is for a point of each class to look so is a
+Shape is classified without photos (`segmentation.geometric`): how likely each class is to have a shape is a
 table. A mean field over each point's nearest neighbours (Krahenbuhl and Koltun, NIPS 2011, on a graph instead of a
 lattice) then lets alike neighbours agree: alike are those whose normals and colours are.
 """
@@ -37,7 +37,7 @@ REACH_GROUND, REACH, LENT, LENDERS = 4.0, 2.0, 1.0, 8
 ABOVE = 0.4
 """Metres above ground: what no built thing or plant is and photos take for ground there was seen through: it moved."""
 LIKELY: dict[str, dict[str, float]] = {
-    # what the shape says: how often a class looks so, against the others; what isn't named: 0.05
+    # what the shape says: how often a class has it, against the others; what isn't named: 0.05
     "terrain": dict.fromkeys(GROUND, 1.0) | {"low_vegetation": 0.15, "vehicle": 0.08, "wall_or_fence": 0.08},
     "building": {"building": 1.0, "wall_or_fence": 0.4, "road_sign": 0.15, "high_vegetation": 0.15, "vehicle": 0.15,
                  "pole": 0.15, "low_vegetation": 0.1},
@@ -64,11 +64,11 @@ def decide(
 
     Args:
         votes: of the photos.
-        shape: (N,) LAS codes told by shape alone.
+        shape: (N,) LAS codes classified by shape alone.
         height: (N,) metres above ground.
         moved: (N,) which points are of moving things (`segmentation.moving`).
         cloud: the points, with normals; colours are used where there are any.
-        knows_low_vegetation: whether the network tells low from high vegetation; else height does.
+        knows_low_vegetation: whether the network distinguishes low from high vegetation; else height does.
         normal_pull: sharpness by which neighbours with other normals count less.
     """
     from scipy.spatial import cKDTree
@@ -93,7 +93,7 @@ def decide(
 
 
 def likelihood(shape: U8) -> F32:
-    """(N, C) how likely points of each class look like `shape` (LAS codes told by shape alone)."""
+    """(N, C) how likely points of each class are to have `shape` (LAS codes classified by shape alone)."""
     plants = ("low_vegetation", "mid_vegetation", "high_vegetation")
     table = np.full((256, len(CLASSES)), 0.3, np.float32)
     for name, row in LIKELY.items():

@@ -21,15 +21,15 @@ NEAR = 0.3
 SHAPES_WORD = 0.6
 """What the word of shape alone counts beside a photo's, and how sure it is of itself."""
 LEAST_SURE, MOST_SURE = 0.67, 0.9
-"""Probabilities that a told class counts for: a photo's class is likelier than another, and never certain."""
+"""Probabilities that a predicted class counts for: a photo's class is likelier than another, and never certain."""
 
 
 class ThingsParams(Params):
     """How vehicles and people are found.
 
     Attributes:
-        find: decide them as whole things; False leaves points as their classes are told.
-        size: metres of the voxels that are looked at.
+        find: decide them as whole things; False leaves points as they were classified.
+        size: metres of the voxels that are classified.
     """
 
     find: bool = True

@@ -74,7 +74,7 @@ def _most_around(best: U8, xyz: F32, places: F32) -> U8:
 
 
 def with_feet(best: U8, normal: F32, near: I32) -> U8:
-    """The lowest rows of a wall, told as the ground before it, are the wall's: (N,) indices."""
+    """The lowest rows of a wall, classified as the ground before it, are the wall's: (N,) indices."""
     building = CLASSES.index("building")
     rows = np.flatnonzero(np.isin(best, [CLASSES.index(g) for g in GROUND]) & (np.abs(normal[:, 2]) < UPRIGHT))
     out = best.copy()
@@ -83,7 +83,7 @@ def with_feet(best: U8, normal: F32, near: I32) -> U8:
 
 
 def by_height(best: U8, height: F32, xyz: F32) -> U8:
-    """Vegetation told low or high against all reason is told anew: (N,) indices."""
+    """Vegetation classified low or high against all reason is classified anew: (N,) indices."""
     low, high = CLASSES.index("low_vegetation"), CLASSES.index("high_vegetation")
     plants = np.flatnonzero((best == low) | (best == high))
     if not len(plants):

@@ -1,7 +1,7 @@
 """Votes: what the photos' probabilities say of each point that they see. Import late: loads numba.
 
-A photo's word counts by how near and how squarely it sees the point; who sees it, `pipeline.visibility` tells, as for
-texturing. A vote for the sky on a point that is there proves a projection wrong: it is dropped, and its share told.
+A photo's word counts by how near and how squarely it sees the point; who sees it, `pipeline.visibility` decides, as for
+texturing. A vote for the sky on a point that is there proves a projection wrong: it is dropped, and its share reported.
 """
 
 from __future__ import annotations
@@ -53,11 +53,11 @@ def vote(
     moving: PointCloud | None = None,
     report: Report = silent,
 ) -> Votes:
-    """Ask all photos that have been labelled.
+    """Collect the votes of all photos that have been classified.
 
     Args:
         cloud: with normals; thinned to about one point a voxel.
-        views: all, by index; those without a file are not asked.
+        views: all, by index; those without a file have no vote.
         probabilities: folder of `<view index>.npy`, (h, w, C) uint8.
         radius: metres, of the discs that points hide by: about the voxel's size.
         moving: what the step `carve` found moving: it hides, too, while it is there.

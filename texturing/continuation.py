@@ -28,7 +28,7 @@ PATCH = 6
 NEAREST, FARTHEST = 6, 160
 """Coarse cells that a shift may span: nearer, everything is like itself; farther, another street."""
 QUERIES = 20_000
-"""Patches that are asked for one like them."""
+"""Patches for which one like them is searched."""
 FEATURES = 12
 """Principal components that patches are compared by."""
 SWEEPS = 6
@@ -175,7 +175,7 @@ def _shown(coarse: F32, whole: Bools, hole: Bools, kind: I32, shifts: I32) -> tu
 
 @njit(cache=True, fastmath=True)
 def _pass_messages(number, cells, shown, cost, sweeps):  # type: ignore[no-untyped-def]
-    """The label of each cell after so many sweeps (min-sum, in raster order and back); -1 where all are impossible."""
+    """The shift of each cell after so many sweeps (min-sum, in raster order and back); -1 where all are impossible."""
     height, width = number.shape
     n, count = cost.shape
     message = np.zeros((n, 4, count), np.float32)  # by the neighbour in each direction

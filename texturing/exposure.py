@@ -1,6 +1,6 @@
 """Exposure: what makes all photos of a tile alike, solved jointly.
 
-Places on the surface are looked up in every photo that sees them. In the encoded values' power law a change of
+Places on the surface are sampled in every photo that sees them. In the encoded values' power law a change of
 exposure or white balance is a factor, so its logarithm is a sum: photo's gain (per channel) + camera's vignetting
 (a polynomial of the distance to the middle) + the place's own colour. Least squares over all of them, made robust
 by reweighting (Huber), with the places eliminated, and a prior towards no change, or towards what an earlier tile
@@ -35,8 +35,8 @@ class ExposureParams(Params):
         solve: False leaves all photos as they are.
         vignetting: solve a camera's darkening towards the corners, too.
         prior: an earlier tile's `exposure.json`, whose photos and cameras keep what it found for them.
-        samples: places looked up for each photo.
-        max_distance: metres beyond which a photo is not asked.
+        samples: places sampled for each photo.
+        max_distance: metres beyond which a photo is not sampled.
         spread: stops (EV) by which exposures are expected to differ: the prior's standard deviation.
         tint: stops by which a channel's gain is expected to differ from the others'.
     """

@@ -1,8 +1,8 @@
 """Where photos show the same place of the surface: corners of one, found again in those around it. Import late: numba.
 
 A corner of a photo is a place on the surface that its depth map shows there, with the plane that the surface is
-about it. The plane tells where another photo should show the corner, and how its patch is deformed there; how far from
-there it is found is what poses (and the surface) are wrong by. Patches are compared with mean and contrast taken out,
+about it. The plane predicts where another photo should show the corner, and how its patch is deformed; how far from it
+the corner is found is what poses (and the surface) are wrong by. Patches are compared with mean and contrast taken out,
 coarse to fine (Lucas and Kanade 1981; Baker and Matthews 2004).
 """
 

@@ -1,6 +1,6 @@
-"""What the other photos say a photo should show: each is predicted from those around it. Import late: loads numba.
+"""Photos predicted from those around them: what each should show. Import late: loads numba.
 
-Through the depth map, every pixel of a photo is a place on the surface; the others that see that place tell
+Through the depth map, every pixel of a photo is a place on the surface; the others that see that place give
 its colour. Where a photo disagrees with what the others agree on, something stood there that is no part of the
 street (a ghost), or its pose is off.
 """
@@ -80,7 +80,7 @@ class Predictor:
 
     Args:
         surface: of the view that is predicted.
-        count: photos that will be asked.
+        count: photos that will be added.
         max_distance, min_cos, bias: as for texturing.
     """
 
@@ -103,7 +103,7 @@ class Predictor:
         self._added += 1
 
     def result(self) -> Prediction:
-        """What those asked agree on."""
+        """What those added agree on."""
         h, w = self._weight.shape[1:]
         rgb = np.zeros((h, w, 3), np.float32)
         support, others = np.zeros((h, w), np.uint8), np.zeros((h, w), np.uint8)

@@ -58,7 +58,7 @@ class RefineParams(Params):
         camera_shift: metres by which a camera's place on the vehicle is.
         camera_turn: milliradians likewise.
         wander: metres of the path over which the photos' error becomes another one.
-        corners: of a photo that are looked for in others.
+        corners: of a photo that are matched in others.
         max_distance: metres beyond which the surface isn't asked.
     """
 

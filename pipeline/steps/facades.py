@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from scan2sim.pipeline.planesweep import Photo
     from scan2sim.pipeline.types import F64, PointCloud
 
-MOST = 1_000_000  # pixels at which a photo is looked at: all of a tile are kept in memory
+MOST = 1_000_000  # pixels at which a photo is sampled: all of a tile are kept in memory
 PIXELS = 120_000  # of the range images that tell what hides a wall
 APART = 1.5  # cells from any point within which none is made up
 FILLING = 4  # points a cell
@@ -48,7 +48,7 @@ def facades(inputs: Inputs, params: FacadesParams, out: Path, report: Report) ->
     """Make up points on the walls of `cloud`: above the scanner's rays, where photos agree, and in gaps.
 
     `path` is the scanner's; `views` and `labels` (what a network saw in them, which may be nothing) tell how high walls
-    are, `other.*` the rest of the cloud: what hides walls, and what rays met through their openings.
+    are, `other.*` the rest of the cloud: what hides walls, and what rays hit through their openings.
     File: `made`, a `PointCloud` with normals and without colours.
     """
     import numba
@@ -136,7 +136,7 @@ def photos_of(inputs: Inputs, whole: PointCloud) -> list[Photo]:
 def raised(wall: Wall, rays: Rays, own: Numbers, through: Bools, photos: Callable[[], list[Photo]]) -> Bools:
     """(R, C) cells of a wall above its scan; its points are `own` of the rays' ends, which went `through` its cells.
 
-    Photos are asked of walls that somewhere end where the scanner's rays do.
+    Photos are compared for walls that somewhere end where the scanner's rays do.
     """
     import numpy as np
 

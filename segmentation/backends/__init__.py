@@ -18,7 +18,7 @@ class Facts:
 
     Attributes:
         name: of backend and weights.
-        labels: names of what it tells, in order of its channels.
+        labels: names of its classes, in order of its channels.
         sha256: of the weights' file.
         licence: of the weights, as far as the file tells.
         pixels_a_radian: angular resolution that photos should be resampled to; None: as they are.
