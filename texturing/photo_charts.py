@@ -45,7 +45,7 @@ class Charts:
 
 
 def cut(mesh: Mesh, view: I32, centres: F64, texel: float, largest: int) -> Charts:
-    """Charts of connected faces of one label; faces that can't be laid so are left out.
+    """Charts of connected faces of one view; faces that can't be laid so are left out.
 
     Args:
         mesh: to be cut.
@@ -148,7 +148,7 @@ def overlapping(flat: F32, page: Index, pages: list[tuple[int, int]]) -> npt.NDA
 
 
 def _components(mesh: Mesh, view: I32, cell: float) -> Index:
-    """(F,) connected faces of one label within one cell of a grid (metres); -1 without a label."""
+    """(F,) connected faces of one view within one cell of a grid (metres); -1 without a view."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
