@@ -20,6 +20,8 @@ from scan2sim.pipeline.io.las_csv import import_las
 from scan2sim.pipeline.steps.import_sweeps import tile_of
 
 app = App("Make a tile from your files.")
+Cameras = Annotated[list[str] | None, typer.Option("--camera", help="Its folder; several times for several.")]
+MaxRange = Annotated[float, typer.Option(help="Metres; returns from further away are left out.")]
 
 
 @app.command("kitti-raw")
@@ -27,8 +29,8 @@ def import_kitti(
     drive: Annotated[Path, typer.Argument(help="A drive's folder (..._sync), or one that holds it.")],
     out: TileOut,
     poses: Annotated[Path | None, typer.Option(help="Sweep poses instead of OXTS: row-major 3x4 a line.")] = None,
-    camera: Annotated[list[str] | None, typer.Option(help="Its folder; several times for several.")] = None,
-    max_range: Annotated[float, typer.Option(help="Metres; returns from further away are left out.")] = 50.0,
+    camera: Cameras = None,
+    max_range: MaxRange = 50.0,
     rigid: Annotated[bool, typer.Option("--rigid", help="Sweeps are motion-compensated already.")] = False,
     name: Name = None,
     link: Link = False,
@@ -48,8 +50,8 @@ def import_kitti_sequence(
     sequence: Annotated[Path, typer.Argument(help="A sequence's folder: velodyne, image_2, calib.txt, times.txt.")],
     out: TileOut,
     poses: Annotated[Path | None, typer.Option(help="Of camera 0, 3x4 a line; default: poses.txt in it.")] = None,
-    camera: Annotated[list[str] | None, typer.Option(help="Its folder; several times for several.")] = None,
-    max_range: Annotated[float, typer.Option(help="Metres; returns from further away are left out.")] = 50.0,
+    camera: Cameras = None,
+    max_range: MaxRange = 50.0,
     name: Name = None,
     link: Link = False,
     overwrite: Overwrite = False,

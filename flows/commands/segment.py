@@ -12,9 +12,9 @@ import typer
 from scan2sim.flows.commands.app import App, Config, Sets, TilePath, settings_of
 from scan2sim.flows.commands.display import console, progress
 from scan2sim.flows.commands.log import Log
-from scan2sim.flows.commands.shown import execute_shown, show_warnings
+from scan2sim.flows.commands.shown import run_shown, show_warnings
 from scan2sim.flows.engine.lock import locked
-from scan2sim.flows.engine.planning import STORE, drop_damaged, plan
+from scan2sim.flows.engine.planning import STORE
 from scan2sim.flows.recipes.graph import NodeId, needed
 from scan2sim.flows.recipes.settings import Settings
 from scan2sim.flows.recipes.tile import recipe
@@ -91,16 +91,11 @@ def segment_tile(path: Path, out: Path, settings: Settings) -> None:
         store = Store(out / STORE)
         nodes = recipe(tile, settings)
         last = "things" if any(node.step is THINGS for node in nodes) else "segment"
-        nodes = needed(nodes, [NodeId(last)])
-        planned = plan(nodes, store)
-        if drop_damaged(planned, store, {"ingest", "carve", "views", "label", "segment", "things"}):
-            planned = plan(nodes, store)
         log = Log(out / "run.log")
         log.write(f"segment {tile.path}, settings {json.dumps(settings.values)}")
+        read = {"ingest", "carve", "views", "label", "segment", "things"}
         with log.errors(out):
-            outcome = execute_shown(planned, store, log)
-            outcome.check()
-        done = outcome.of_tile()
+            planned, done = run_shown(needed(nodes, [NodeId(last)]), store, log, read)
         keys = {p.node.id.name: p.key for p in planned}
         files = {
             (node, name): store.folder(node, keys[node]) / file

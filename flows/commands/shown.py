@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 
 from scan2sim.flows.commands.display import RunDisplay, console, warn
 from scan2sim.flows.commands.log import Log
 from scan2sim.flows.engine.execution import execute
 from scan2sim.flows.engine.frontier import Event, Outcome
-from scan2sim.flows.engine.planning import Planned
+from scan2sim.flows.engine.planning import Planned, drop_damaged, plan
 from scan2sim.flows.recipes.graph import Node
 from scan2sim.flows.reports import gazebo
 from scan2sim.flows.reports.findings import findings
-from scan2sim.pipeline.store import Manifest, Store
+from scan2sim.pipeline.store import Manifest, Store, digest
 
 WORST = 3
 """Findings that are shown on the screen."""
@@ -43,6 +43,32 @@ def execute_shown(
         for line in lines + [f"warning: {text}" for text in manifest.warnings]:
             log.write(f"{node}: {line}")
     return outcome
+
+
+def run_shown(
+    nodes: list[Node], store: Store, log: Log, checked: Collection[str], digest: Callable[[Path], str] = digest
+) -> tuple[list[Planned], dict[str, Manifest]]:
+    """Plan nodes and run them, as `execute_shown`; what is damaged of the results of those `checked` is made again.
+
+    Args:
+        nodes: of one tile.
+        store: that keeps their results.
+        log: for what runs.
+        checked: names of nodes whose results will be read.
+        digest: of a source file.
+
+    Returns:
+        The plan, and results by the nodes' labels.
+
+    Raises:
+        ScanError: see `pipeline.errors`; earlier results stay.
+    """
+    planned = plan(nodes, store, digest=digest)
+    if drop_damaged(planned, store, checked):
+        planned = plan(nodes, store, digest=digest)
+    outcome = execute_shown(planned, store, log)
+    outcome.check()
+    return planned, outcome.of_tile()
 
 
 def show_results(world: Path, report: Path) -> None:

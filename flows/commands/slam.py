@@ -14,10 +14,10 @@ from scan2sim.flows.commands.app import App, Config, Sets, settings_of
 from scan2sim.flows.commands.display import console, warn
 from scan2sim.flows.commands.log import Log
 from scan2sim.flows.commands.options import options
-from scan2sim.flows.commands.shown import execute_shown
+from scan2sim.flows.commands.shown import run_shown
 from scan2sim.flows.commands.study import study_compression
 from scan2sim.flows.engine.lock import locked
-from scan2sim.flows.engine.planning import STORE, Planned, drop_damaged, plan
+from scan2sim.flows.engine.planning import STORE, Planned
 from scan2sim.flows.recipes.settings import Settings
 from scan2sim.flows.recipes.video import ALONE, STEPS, Video, recipe
 from scan2sim.pipeline.errors import SettingError
@@ -105,15 +105,10 @@ def slam_video(video: Video, out: Path, settings: Settings) -> dict[str, Manifes
     with locked(out):
         store = Store(out / STORE)
         digests = Digests(store.root / "digests.json")
-        planned = plan(nodes, store, digest=digests)
-        if drop_damaged(planned, store, {node.id.name for node in nodes}):
-            planned = plan(nodes, store, digest=digests)
         log = Log(out / "run.log")
         log.write(f"slam {video.video}, settings {json.dumps(settings.values)}")
         with log.errors(out):
-            outcome = execute_shown(planned, store, log)
-            outcome.check()
-            done = outcome.of_tile()
+            planned, done = run_shown(nodes, store, log, {node.id.name for node in nodes}, digests)
             publish_path(planned, done, store, out)
         store.sweep({item.node.id.name: item.key for item in planned})
         digests.save()
