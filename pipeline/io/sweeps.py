@@ -14,11 +14,11 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import ValidationError
+from pydantic import Field, ValidationError
 
 from scan2sim.pipeline.errors import DataError, InputError, SettingError
 from scan2sim.pipeline.io import clouds as cloud_io
@@ -32,7 +32,8 @@ from scan2sim.pipeline.io.merging import borrow_colours, colour, phase_of, read_
 from scan2sim.pipeline.io.points import sixteen_bits
 from scan2sim.pipeline.io.tile import DISTORTION_LENGTHS, CameraEntry, read_tile, tile_name, write_tile
 from scan2sim.pipeline.poses import interpolate, nearest_rotation
-from scan2sim.pipeline.step import Report, silent
+from scan2sim.pipeline.ranges import Metres, Range, Shift, Voxel
+from scan2sim.pipeline.step import Params, Report, silent
 from scan2sim.pipeline.types import F32, F64, U8, Camera, Frame, PointCloud, Trajectory
 
 Bools = npt.NDArray[np.bool_]
@@ -70,23 +71,45 @@ class Pictures:
     extrinsics: F64 | None = None
 
 
+class Placing(Params):
+    """How sweeps are placed.
+
+    Attributes:
+        scanner_poses: the poses are the scanner's; by default they are the camera's if there are extrinsics.
+        time_offset: seconds to add to all times of sweeps and photos.
+        max_range, min_range: metres from the scanner: farther returns, and those of the car itself, are left out.
+        deskew: "kitti": place each point by the pose of its own moment, for sweeps as KITTI's, which aren't
+            compensated for motion: the scanner turns clockwise and faces forward (x) at the sweep's time.
+        period: seconds of a turn, for `deskew`; by default the time between sweeps.
+        voxel: keep one point a voxel of so many metres (that which was measured from nearest by), or None: all.
+        keep_unsure: keep what was taken where poses are unsure.
+        crs: of the trajectory, a projected one; "local" without georeference.
+    """
+
+    scanner_poses: bool = Field(False, description="Poses are the scanner's all the same.")
+    time_offset: Shift = Field(0.0, description="Seconds to add to times of sweeps and photos.")
+    max_range: Range = Field(50.0, description="Metres; returns from further away are left out.")
+    min_range: Metres = Field(1.0, description="Metres; nearer returns, the car's own, are left out.")
+    deskew: Literal["none", "kitti"] = Field(
+        "none", description="kitti: points by the pose of their own moment; or none."
+    )
+    period: Annotated[float, Field(ge=0.0001, le=1000)] | None = Field(
+        None, description="Seconds of the scanner's turn; default: between sweeps."
+    )
+    voxel: Voxel | None = Field(None, description="Keep one point in so many metres.")
+    keep_unsure: bool = Field(False, description="Take unsure stretches of the path, too.")
+    crs: str = Field("local", description='CRS of the poses: "EPSG:32633", or "local".')
+
+
 def import_sweeps(
     sweeps: Path,
     poses: Path,
     out: Path,
+    placing: Placing,
     *,
     extrinsics: F64 | None = None,
-    of: Literal["camera", "scanner"] | None = None,
     times: Path | None = None,
-    offset: float = 0.0,
     photos: Pictures | None = None,
-    max_range: float = 50.0,
-    min_range: float = 1.0,
-    deskew: Literal["none", "kitti"] = "none",
-    period: float | None = None,
-    voxel: float | None = None,
-    keep_unsure: bool = False,
-    crs: str = "local",
     link: bool = False,
     overwrite: bool = False,
     name: str | None = None,
@@ -103,18 +126,10 @@ def import_sweeps(
         sweeps: folder of sweeps, or one sweep.
         poses: trajectory file (.csv, .tum, .kitti), z-up, CRS coordinates.
         out: the tile's folder to make.
+        placing: how.
         extrinsics: (4, 4) T_camera_scanner, the scanner's axes to the camera's; see `read_extrinsics`.
-        of: whose the poses are; by default the camera's if there are extrinsics, else the scanner's.
         times: file of the sweeps' times, seconds, one a line.
-        offset: seconds to add to all times of sweeps and photos.
         photos: to colour the points, and to be views of the tile; needs `extrinsics`.
-        max_range, min_range: metres from the scanner: farther returns, and those of the car itself, are left out.
-        deskew: "kitti": place each point by the pose of its own moment, for sweeps as KITTI's, which aren't
-            compensated for motion: the scanner turns clockwise and faces forward (x) at the sweep's time.
-        period: seconds of a turn, for `deskew`; by default the time between sweeps.
-        voxel: keep one point a voxel of so many metres (that which was measured from nearest by), or None: all.
-        keep_unsure: keep what was taken where poses are unsure.
-        crs: of the trajectory, a projected one; "local" without georeference.
         link: link to photos instead of copying them.
         warn: receives what was left out, and what looks wrong.
 
@@ -126,31 +141,29 @@ def import_sweeps(
         SettingError: `out` is not empty, or options that make no sense.
         DataError: nothing is left.
     """
-    _check(extrinsics, of, photos, max_range, min_range, voxel, period)
+    _check(placing, extrinsics, photos)
     files = _files(sweeps, SWEEPS, "sweeps")
-    path, frame = _read_poses(poses, crs)
+    path, frame = _read_poses(poses, placing.crs)
     T_camera_scanner = np.eye(4) if extrinsics is None else extrinsics
-    of = of or ("scanner" if extrinsics is None else "camera")
-    T = path.poses if of == "scanner" else path.poses @ T_camera_scanner  # scanner to world
+    T = path.poses if placing.scanner_poses else path.poses @ T_camera_scanner  # scanner to world
     if T[:, 2, 2].mean() < 0.3:
         warn(
             "the scanner's z axis doesn't point upwards: are the poses z-up, and the extrinsics the right way round "
             "(the scanner's axes to the camera's)?"
         )
-    way = _Way(path, T, keep_unsure)
-    moments = _moments(files, times, path, sweeps, "sweeps", offset)
-    half = 0.0
-    if deskew == "kitti":
-        spacing = np.diff(np.unique(moments)) if len(files) > 1 else np.diff(path.times)
-        half = (period if period is not None else float(np.median(spacing)) if len(spacing) else 0.1) / 2
+    way = _Way(path, T, placing.keep_unsure)
+    moments = _moments(files, times, path, sweeps, "sweeps", placing.time_offset)
+    half = _half_turn(placing, moments, path.times)
     good = way.judge(moments, half, f"{len(files)} sweeps", poses, warn)
-    shots = _shots(photos, way, path, poses, offset, T_camera_scanner, warn) if photos is not None else _NONE
+    shots = (
+        _shots(photos, way, path, poses, placing.time_offset, T_camera_scanner, warn) if photos is not None else _NONE
+    )
 
-    merged = _Merged(voxel)
+    merged = _Merged(placing.voxel)
     chosen = np.flatnonzero(good)
     for done, i in enumerate(chosen):
         report(0.8 * done / len(chosen), files[i].name)
-        merged.add(_placed(files[i], float(moments[i]), half, way, shots, photos, max_range, min_range))
+        merged.add(_placed(files[i], float(moments[i]), half, way, shots, photos, placing))
     whole = merged.all()
     if not len(whole["xyz"]):
         raise DataError(sweeps, "has no points within range", "Widen --max-range, or look at the files")
@@ -170,7 +183,7 @@ def import_sweeps(
         write_tile(
             work,
             name=tile_name(name or Path(out).name),
-            crs=crs,
+            crs=placing.crs,
             clouds=["cloud.laz"],
             cameras={"camera": photos.camera} if photos is not None else {},
             photos=_entries(shots, photos, frame, work, link),
@@ -306,24 +319,22 @@ def _numbers(text: str) -> F64:
     return np.array(text.replace(",", " ").split(), np.float64)
 
 
-def _check(
-    extrinsics: F64 | None,
-    of: str | None,
-    photos: Pictures | None,
-    max_range: float,
-    min_range: float,
-    voxel: float | None,
-    period: float | None,
-) -> None:
-    if extrinsics is None and of == "camera":
-        raise SettingError("extrinsics", "poses of a camera need its place at the scanner", "Give T_camera_scanner")
+def _check(placing: Placing, extrinsics: F64 | None, photos: Pictures | None) -> None:
     if extrinsics is None and photos is not None:
         raise SettingError("extrinsics", "photos need the camera's place at the scanner", "Give T_camera_scanner")
-    if not 0 <= min_range < max_range:
-        raise SettingError("max_range", f"{max_range:g} m doesn't exceed min_range, {min_range:g} m", "Widen the range")
-    for key, value in (("voxel", voxel), ("period", period)):
-        if value is not None and not value > 0:
-            raise SettingError(key, f"{value:g} is not positive", "Give a positive number, or leave it out")
+    near, far = placing.min_range, placing.max_range
+    if near >= far:
+        raise SettingError("max_range", f"{far:g} m doesn't exceed min_range, {near:g} m", "Widen the range")
+
+
+def _half_turn(placing: Placing, moments: F64, poses: F64) -> float:
+    """Seconds by which a sweep's points are older and younger than its time, by times of sweeps and of poses."""
+    if placing.deskew == "none":
+        return 0.0
+    if placing.period is not None:
+        return placing.period / 2
+    spacing = np.diff(np.unique(moments)) if len(moments) > 1 else np.diff(poses)
+    return (float(np.median(spacing)) if len(spacing) else 0.1) / 2
 
 
 def _natural(path: Path) -> list[Any]:
@@ -507,13 +518,12 @@ def _placed(
     way: _Way,
     shots: _Shots,
     photos: Pictures | None,
-    max_range: float,
-    min_range: float,
+    placing: Placing,
 ) -> dict[str, Any]:
     """A sweep's points in local coordinates, coloured by the photo that was taken beside it."""
     xyz, intensity, own = read_sweep(file)
     distance = np.linalg.norm(xyz, axis=1)
-    near = (distance <= max_range) & (distance >= min_range)
+    near = (distance <= placing.max_range) & (distance >= placing.min_range)
     xyz, intensity, distance = xyz[near], intensity[near], distance[near]
     here = way.at(np.array([moment]))[0]
     times = np.full(len(xyz), moment)

@@ -4,34 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Literal
 
 from pydantic import Field
 
 from scan2sim.pipeline.io import sweeps as io
-from scan2sim.pipeline.ranges import Focal, Metres, Pixels, Range, Shift, Voxel
-from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.ranges import Focal, Pixels
+from scan2sim.pipeline.step import Done, Inputs, Report, Step
 
 
-class SweepsParams(Params):
+class SweepsParams(io.Placing):
     """How sweeps are placed, and photos taken along."""
 
     camera: str = Field("auto", description="auto, pinhole, equirectangular, or a TOML like a tile's.")
     focal: Focal | None = Field(None, description="Pixels, of a pinhole camera.")
     centre: tuple[Pixels, Pixels] | None = Field(None, description="Pixels; default: the middle.")
-    scanner_poses: bool = Field(False, description="Poses are the scanner's all the same.")
-    time_offset: Shift = Field(0.0, description="Seconds to add to times of sweeps and photos.")
-    max_range: Range = Field(50.0, description="Metres; returns from further away are left out.")
-    min_range: Metres = Field(1.0, description="Metres; nearer returns, the car's own, are left out.")
-    deskew: Literal["none", "kitti"] = Field(
-        "none", description="kitti: points by the pose of their own moment; or none."
-    )
-    period: Annotated[float, Field(ge=0.0001, le=1000)] | None = Field(
-        None, description="Seconds of the scanner's turn; default: between sweeps."
-    )
-    voxel: Voxel | None = Field(None, description="Keep one point in so many metres.")
-    keep_unsure: bool = Field(False, description="Take unsure stretches of the path, too.")
-    crs: str = Field("local", description='CRS of the poses: "EPSG:32633", or "local".')
 
 
 def import_sweeps(inputs: Inputs, params: SweepsParams, out: Path, report: Report) -> Done:
@@ -77,12 +63,9 @@ def tile_of(
         beside = None if extrinsics is None else io.photo_extrinsics(extrinsics, photos)
         pictures = io.Pictures(photos, camera, inputs.get("photo_times"), inputs.get("mask"), beside)
     return io.import_sweeps(
-        inputs["sweeps"], inputs["poses"], out, photos=pictures, times=inputs.get("times"),
-        extrinsics=None if extrinsics is None else io.read_extrinsics(extrinsics),
-        of="scanner" if params.scanner_poses else None, offset=params.time_offset, max_range=params.max_range,
-        min_range=params.min_range, deskew=params.deskew, period=params.period, voxel=params.voxel,
-        keep_unsure=params.keep_unsure, crs=params.crs, link=link, overwrite=overwrite, name=name, warn=warn,
-        report=report,
+        inputs["sweeps"], inputs["poses"], out, params, photos=pictures, times=inputs.get("times"),
+        extrinsics=None if extrinsics is None else io.read_extrinsics(extrinsics), link=link, overwrite=overwrite,
+        name=name, warn=warn, report=report,
     )  # fmt: skip
 
 

@@ -15,7 +15,7 @@ from scan2sim.pipeline.io.import_model import import_model
 from scan2sim.pipeline.io.kitti import import_kitti_raw
 from scan2sim.pipeline.io.kitti_odometry import import_kitti_odometry
 from scan2sim.pipeline.io.merging import read_bin
-from scan2sim.pipeline.io.sweeps import Pictures, import_sweeps, read_sweep
+from scan2sim.pipeline.io.sweeps import Pictures, Placing, import_sweeps, read_sweep
 from scan2sim.pipeline.steps.views import _problem
 from scan2sim.pipeline.types import Camera, View
 from scan2sim.slam.video import open_video
@@ -112,7 +112,7 @@ def read_drive(folder: Path) -> object:
     out = folder / "tile"
     pictures = Pictures(folder / "photos", sweeps.CAMERA)
     return import_sweeps(
-        folder / "sweeps", folder / "camera.csv", out, extrinsics=sweeps.T_CAMERA_SCANNER, photos=pictures,
+        folder / "sweeps", folder / "camera.csv", out, Placing(), extrinsics=sweeps.T_CAMERA_SCANNER, photos=pictures,
         overwrite=out.exists(),
     )  # fmt: skip
 

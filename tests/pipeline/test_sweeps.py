@@ -21,6 +21,7 @@ from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.sweeps import (
     Pictures,
+    Placing,
     camera_of_photos,
     import_sweeps,
     photo_extrinsics,
@@ -142,6 +143,12 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
     return make(tmp_path_factory.mktemp("drive"))
 
 
+def imported(**asked: Any) -> Path:
+    """`import_sweeps`, its parameters and all else by their names."""
+    own = {name: asked.pop(name) for name in Placing.model_fields.keys() & asked.keys()}
+    return import_sweeps(**asked, placing=Placing(**own))
+
+
 def cloud_of(path: Path) -> tuple[Tile, PointCloud, np.ndarray]:
     """A tile, its cloud, and the points in the CRS."""
     tile = read_tile(path)
@@ -151,28 +158,32 @@ def cloud_of(path: Path) -> tuple[Tile, PointCloud, np.ndarray]:
 
 def test_a_turning_scanners_walls_come_out_sharp(tmp_path: Path) -> None:
     drive = make(tmp_path, turning=True)
-    _, cloud, xyz = cloud_of(import_sweeps(**drive.asked, out=tmp_path / "tile", deskew="kitti"))
+    _, cloud, xyz = cloud_of(imported(**drive.asked, out=tmp_path / "tile", deskew="kitti"))
     assert len(xyz) == SWEEPS * 600 * 24 and walls(xyz)[0].max() < 0.003
     assert cloud.time is not None
     assert np.allclose([cloud.time.min(), cloud.time.max()], [0.05, 0.65], atol=1e-3)
     assert cloud.intensity is not None and (cloud.intensity == 32768).all()
-    smeared = cloud_of(import_sweeps(**drive.asked, out=tmp_path / "smeared"))[2]
+    smeared = cloud_of(imported(**drive.asked, out=tmp_path / "smeared"))[2]
     assert walls(smeared)[0].max() > 0.2
 
 
 @pytest.mark.parametrize("write", [to_bin, to_laz, to_open3d(".pcd"), to_open3d(".ply")])
 def test_sweeps_of_all_formats(tmp_path: Path, write: Callable[[Path, F64], None]) -> None:
     drive = make(tmp_path, write=write)
-    _, cloud, xyz = cloud_of(import_sweeps(**drive.asked, out=tmp_path / "tile"))
+    _, cloud, xyz = cloud_of(imported(**drive.asked, out=tmp_path / "tile"))
     assert len(xyz) == SWEEPS * 600 * 24 and walls(xyz)[0].max() < 0.003
     assert cloud.intensity is not None and np.abs(cloud.intensity.astype(int) - 32768).max() < 300
 
 
 def test_poses_may_be_the_scanners_own(drive: Drive, tmp_path: Path) -> None:
-    given: dict[str, Any] = {"extrinsics": T_CAMERA_SCANNER, "of": "scanner"}
+    given: dict[str, Any] = {"extrinsics": T_CAMERA_SCANNER, "scanner_poses": True}
     for extra in ({}, given):
-        path = import_sweeps(
-            drive.folder / "sweeps", drive.folder / "scanner.kitti", tmp_path / "tile", overwrite=True, **extra
+        path = imported(
+            sweeps=drive.folder / "sweeps",
+            poses=drive.folder / "scanner.kitti",
+            out=tmp_path / "tile",
+            overwrite=True,
+            **extra,
         )
         tile, _, xyz = cloud_of(path)
         assert walls(xyz)[0].max() < 0.003 and tile.trajectory is not None
@@ -180,7 +191,7 @@ def test_poses_may_be_the_scanners_own(drive: Drive, tmp_path: Path) -> None:
 
 
 def test_points_take_the_colour_of_their_wall_and_photos_their_pose(drive: Drive, tmp_path: Path) -> None:
-    tile, cloud, xyz = cloud_of(import_sweeps(**drive.asked, out=tmp_path / "tile", photos=drive.pictures, link=True))
+    tile, cloud, xyz = cloud_of(imported(**drive.asked, out=tmp_path / "tile", photos=drive.pictures, link=True))
     assert cloud.rgb is not None
     off = np.abs(np.concatenate([xyz - LOW, xyz - HIGH], axis=1))
     inner = np.sort(off, axis=1)[:, 1] > 0.5  # away from the edges between walls
@@ -197,7 +208,7 @@ def test_a_mask_goes_with_the_photos_and_its_pixels_colour_nothing(drive: Drive,
     mask[128:] = 0
     cv2.imwrite(str(tmp_path / "mask.png"), mask)
     pictures = Pictures(drive.folder / "photos", CAMERA, mask=tmp_path / "mask.png")
-    tile, cloud, xyz = cloud_of(import_sweeps(**drive.asked, out=tmp_path / "tile", photos=pictures))
+    tile, cloud, xyz = cloud_of(imported(**drive.asked, out=tmp_path / "tile", photos=pictures))
     assert cloud.rgb is not None and (cloud.rgb[xyz[:, 2] < 0.3] == 128).mean() > 0.8
     assert {view.mask for view in tile.views} == {tile.path.parent / "masks" / "mask.png"}
 
@@ -210,15 +221,15 @@ def test_what_is_unsure_is_left_out_and_told(drive: Drive, tmp_path: Path) -> No
     trajectory_io.write(tmp_path / "lost.csv", Trajectory(drive.times, positions, rotations, unsure))
     told: list[str] = []
     asked = drive.asked | {"poses": tmp_path / "lost.csv", "photos": drive.pictures, "warn": told.append}
-    tile, _, xyz = cloud_of(import_sweeps(**asked, out=tmp_path / "tile"))
+    tile, _, xyz = cloud_of(imported(**asked, out=tmp_path / "tile"))
     assert len(xyz) == (SWEEPS - 2) * 600 * 24 and walls(xyz)[0].max() < 0.003 and len(tile.views) == SWEEPS - 2
     assert [text.partition(":")[0] for text in told] == [f"2 of 6 {what} are left out" for what in ("sweeps", "photos")]
     told.clear()
-    tile, _, xyz = cloud_of(import_sweeps(**asked, out=tmp_path / "all", keep_unsure=True))
+    tile, _, xyz = cloud_of(imported(**asked, out=tmp_path / "all", keep_unsure=True))
     assert len(xyz) == SWEEPS * 600 * 24 and walls(xyz)[0].max() > 0.3 and not told
     trajectory_io.write(tmp_path / "lost.csv", Trajectory(drive.times, positions, rotations, ~np.zeros(SWEEPS, bool)))
     with pytest.raises(DataError, match=r"none of 6 sweeps has a sure pose.*--keep-unsure"):
-        import_sweeps(**asked, out=tmp_path / "none")
+        imported(**asked, out=tmp_path / "none")
 
 
 def test_times_come_from_a_file_from_names_or_from_the_order(drive: Drive, tmp_path: Path) -> None:
@@ -239,17 +250,17 @@ def test_times_come_from_a_file_from_names_or_from_the_order(drive: Drive, tmp_p
     for names, extra in (
         (["1.bin", "3.bin"], {}),  # frames' numbers
         (["0.2.bin", "0.4.bin"], {}),
-        (["1700000000200000000.bin", "1700000000400000000.bin"], {"offset": -1700000000.0}),
+        (["1700000000200000000.bin", "1700000000400000000.bin"], {"time_offset": -1700000000.0}),
         (["a.bin", "b.bin"], {"times": tmp_path / "times.txt"}),
     ):
-        _, _, xyz = cloud_of(import_sweeps(**asked | {"sweeps": given(names), "warn": told.append} | extra))
+        _, _, xyz = cloud_of(imported(**asked | {"sweeps": given(names), "warn": told.append} | extra))
         assert len(xyz) == 2 * 600 * 24 and walls(xyz)[0].max() < 0.003, names
     assert not told
     with pytest.raises(InputError, match=r"few: has 2 sweeps for 6 poses.*Give their times"):
-        import_sweeps(**asked | {"sweeps": given(["a.bin", "b.bin"])})
+        imported(**asked | {"sweeps": given(["a.bin", "b.bin"])})
     with pytest.raises(InputError, match=r"camera.csv: spans 0.10 to 0.60 s, the 2 sweeps 70.20 to 70.40 s.*offset"):
-        import_sweeps(**asked | {"sweeps": given(["70.2.bin", "70.4.bin"])})
-    import_sweeps(**asked | {"sweeps": given(["0.2.bin", "70.4.bin"]), "warn": told.append})
+        imported(**asked | {"sweeps": given(["70.2.bin", "70.4.bin"])})
+    imported(**asked | {"sweeps": given(["0.2.bin", "70.4.bin"]), "warn": told.append})
     assert told == ["1 of 2 sweeps are left out: outside the trajectory's times"]
 
 
@@ -260,22 +271,22 @@ def test_nothing_is_placed_within_a_gap_of_the_trajectory(drive: Drive, tmp_path
     (tmp_path / "times.txt").write_text("0.1 0.2 0.3 3.0 5.5 5.6".replace(" ", "\n"))
     told: list[str] = []
     asked = drive.asked | {"poses": tmp_path / "gap.csv", "times": tmp_path / "times.txt", "warn": told.append}
-    import_sweeps(**asked, out=tmp_path / "tile")
+    imported(**asked, out=tmp_path / "tile")
     assert told == ["1 of 6 sweeps are left out: in gaps of the trajectory"]
 
 
 def test_a_projected_crs_keeps_its_large_coordinates(tmp_path: Path) -> None:
     shift = np.array([500_000.0, 5_400_000.0, 200.0])
     drive = make(tmp_path, shift=shift)
-    tile, cloud, xyz = cloud_of(import_sweeps(**drive.asked, out=tmp_path / "tile", crs="EPSG:32633"))
+    tile, cloud, xyz = cloud_of(imported(**drive.asked, out=tmp_path / "tile", crs="EPSG:32633"))
     assert tile.frame.crs == "EPSG:32633" and walls(xyz - shift)[0].max() < 0.003 and np.abs(cloud.xyz).max() < 100
 
 
 def test_thinning_keeps_a_point_a_voxel(drive: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = cloud_of(import_sweeps(**drive.asked, out=tmp_path / "whole"))[2]
-    thin = cloud_of(import_sweeps(**drive.asked, out=tmp_path / "thin", voxel=0.37))[2]
+    whole = cloud_of(imported(**drive.asked, out=tmp_path / "whole"))[2]
+    thin = cloud_of(imported(**drive.asked, out=tmp_path / "thin", voxel=0.37))[2]
     monkeypatch.setattr("scan2sim.pipeline.io.sweeps.PENDING", 20_000)  # the same on the way
-    often = cloud_of(import_sweeps(**drive.asked, out=tmp_path / "often", voxel=0.37))[2]
+    often = cloud_of(imported(**drive.asked, out=tmp_path / "often", voxel=0.37))[2]
     origin = np.floor(drive.camera.positions[0])
     cells = [np.unique(np.floor((xyz - origin) / 0.37), axis=0) for xyz in (whole, thin)]
     assert 0.97 * len(cells[0]) < len(thin) < 1.03 * len(cells[0]) < 0.2 * len(whole) and len(often) == len(thin)
@@ -284,8 +295,8 @@ def test_thinning_keeps_a_point_a_voxel(drive: Drive, tmp_path: Path, monkeypatc
 def test_range_is_bounded(drive: Drive, tmp_path: Path) -> None:
     asked = drive.asked | {"out": tmp_path / "tile", "overwrite": True}
     with pytest.raises(DataError, match="no points within range"):
-        import_sweeps(**asked, max_range=1.5)
-    xyz = cloud_of(import_sweeps(**asked, min_range=3.0, max_range=6.0))[2]
+        imported(**asked, max_range=1.5)
+    xyz = cloud_of(imported(**asked, min_range=3.0, max_range=6.0))[2]
     away = np.linalg.norm(xyz[:, None] - way(drive.times).positions, axis=2)
     assert 2.99 < away.min(axis=1).max() < 6.01
 
@@ -293,7 +304,7 @@ def test_range_is_bounded(drive: Drive, tmp_path: Path) -> None:
 def test_extrinsics_the_wrong_way_round_are_noticed(drive: Drive, tmp_path: Path) -> None:
     told: list[str] = []
     wrong = drive.asked | {"extrinsics": np.linalg.inv(T_CAMERA_SCANNER)}
-    import_sweeps(**wrong, out=tmp_path / "tile", warn=told.append)
+    imported(**wrong, out=tmp_path / "tile", warn=told.append)
     assert any("right way round" in text for text in told)
 
 
@@ -332,7 +343,7 @@ def test_photos_of_kittis_second_camera_stand_beside_the_first(drive: Drive, tmp
     centres = []
     for i, extrinsics in enumerate((None, beside)):
         pictures = Pictures(own, CAMERA, extrinsics=extrinsics)
-        tile = read_tile(import_sweeps(**drive.asked, out=tmp_path / str(i), photos=pictures, link=True))
+        tile = read_tile(imported(**drive.asked, out=tmp_path / str(i), photos=pictures, link=True))
         centres.append((tile.views[0].T_world_cam, tile.views[0].centre))
     moved = centres[0][0][:3, :3].T @ (centres[1][1] - centres[0][1])
     np.testing.assert_allclose(moved, -offset, atol=1e-6)
@@ -415,7 +426,7 @@ def test_bad_input_is_named_and_leaves_nothing(
     (drive.folder / "t7.txt").write_text("\n".join(f"{0.1 + 0.08 * i:.2f}" for i in range(7)))
     (drive.folder / "flat.csv").write_text("time,x,y,z\n0,0,0,0\n1,1,0,0\n")
     with pytest.raises(kind, match=message):
-        import_sweeps(**change(drive), out=tmp_path / "tile")
+        imported(**change(drive), out=tmp_path / "tile")
     assert [p.name for p in tmp_path.iterdir()] == ["drive"]
 
 
@@ -425,7 +436,7 @@ def test_a_sweeps_own_colours_are_kept_without_photos(tmp_path: Path) -> None:
     las.write(tmp_path / "a.laz", PointCloud(Frame(), xyz, rgb))
     assert np.array_equal(read_sweep(tmp_path / "a.laz")[2], rgb)  # type: ignore[arg-type]
     (tmp_path / "poses.tum").write_text("0 0 0 0 0 0 0 1\n")
-    cloud = cloud_of(import_sweeps(tmp_path / "a.laz", tmp_path / "poses.tum", tmp_path / "tile"))[1]
+    cloud = cloud_of(imported(sweeps=tmp_path / "a.laz", poses=tmp_path / "poses.tum", out=tmp_path / "tile"))[1]
     assert cloud.rgb is not None and (cloud.rgb == [10, 20, 30]).all()
 
 
