@@ -86,7 +86,7 @@ def test_a_cell_that_sees_nothing_is_na_with_its_reason(corridor: Drive, drive: 
 def test_a_cell_that_fails_is_na_and_takes_no_other_with_it(drive: Path, tmp_path: Path) -> None:
     (drive / "mask.png").write_bytes(b"no picture")
     said = studied(drive, tmp_path / "out", "--heights", "64", "--bitrates", "1,2", "--rates", "5")
-    assert "no readable picture: 64 px 1 Mbit/s 5 fps, 64 px 2 Mbit/s 5 fps" in said.replace("\n", "")
+    assert "kind, or damaged): 64 px 1 Mbit/s 5 fps, 64 px 2 Mbit/s 5 fps" in said.replace("\n", "")
 
 
 def test_a_lower_rate_drops_frames_and_keeps_their_times(corridor: Drive, tmp_path: Path) -> None:

@@ -40,7 +40,7 @@ def pixels(path: Path, grey: bool = False, box: Box | None = None) -> npt.NDArra
     except cv2.error as error:
         raise InputError(path, f"can't be read ({error.err})", AGAIN) from None
     if found is None:
-        raise InputError(path, "can't be read (OpenCV knows no such picture, or it is damaged)", AGAIN)
+        raise InputError(path, "can't be read (no picture of a known kind, or damaged)", AGAIN)
     x0, y0, x1, y1 = box or (0, 0, found.shape[1], found.shape[0])
     part = found[y0:y1, x0:x1]
     return np.ascontiguousarray(part if grey else part[..., ::-1])
@@ -53,11 +53,13 @@ def opened(path: Path) -> Iterator[Any]:
     Raises:
         InputError: it can't be read, here or while it is open.
     """
-    from PIL import Image
+    from PIL import Image, UnidentifiedImageError
 
     Image.MAX_IMAGE_PIXELS = None  # `image.MAX_PIXELS` is the limit: Pillow's own is below what 360 cameras make
     try:
         with Image.open(path) as image:
             yield image
+    except UnidentifiedImageError:  # it cites the path alone
+        raise InputError(path, "can't be read (no picture of a known kind, or damaged)", AGAIN) from None
     except Exception as error:  # its decoders raise whatever the damage leads to
         raise InputError(path, f"can't be read ({error})", AGAIN) from None
