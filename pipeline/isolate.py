@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import importlib
 import os
 import pickle
@@ -58,8 +59,6 @@ def call(target: str, *args: Any, timeout: float, threads: int | None = None) ->
 def die_with_parent() -> None:
     """Have the kernel end this process when the one that started it dies (Linux; elsewhere nothing)."""
     if sys.platform == "linux":
-        import ctypes
-
         PR_SET_PDEATHSIG = 1
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from scan2sim.pipeline.classes import known
 from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.io import image
+from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.ranges import Device, File, Name, Share, Voxel
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.steps.voxel import sample
+from scan2sim.pipeline.types import U8, PointCloud
 
 if TYPE_CHECKING:
-    from scan2sim.pipeline.types import U8, PointCloud
     from scan2sim.segmentation.drawn import Drawn
 
 FEW = 30
@@ -44,13 +51,6 @@ def label(inputs: Inputs, params: LabelParams, out: Path, report: Report) -> Don
     Folder: `labels`, with `<view index>.npy`: (h, w, C) uint8 probabilities by class of `segmentation.labels`, and
     `network.json`: what is known of the network.
     """
-    import json
-
-    import numpy as np
-
-    from scan2sim.pipeline.io import image
-    from scan2sim.pipeline.io import views as views_io
-    from scan2sim.pipeline.types import PointCloud
     from scan2sim.segmentation.backends import load
     from scan2sim.segmentation.photos import Classifier
 
@@ -88,7 +88,6 @@ def label(inputs: Inputs, params: LabelParams, out: Path, report: Report) -> Don
 
 def scanned(cloud: PointCloud, size: float, report: Report) -> Drawn | None:
     """The cloud, to be drawn into photos; None if it has hardly any points."""
-    from scan2sim.pipeline.steps.voxel import sample
     from scan2sim.segmentation.drawn import Drawn
 
     report(0.0, "thinning")
@@ -98,8 +97,6 @@ def scanned(cloud: PointCloud, size: float, report: Report) -> Drawn | None:
 
 def classified(classification: U8 | None) -> float:
     """Share of points whose class says what they are: not "unclassified", nor a code that has no meaning."""
-    from scan2sim.pipeline.classes import known
-
     if classification is None or not len(classification):
         return 0.0
     return float(known()[classification].mean())

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+
+from scan2sim.pipeline.classes import group_of, name_of
+from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.files import pass_on
 from scan2sim.pipeline.ranges import Share, Voxel
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-
-if TYPE_CHECKING:
-    from scan2sim.pipeline.types import U8, PointCloud
+from scan2sim.pipeline.steps.voxel import sample, voxel_groups
+from scan2sim.pipeline.types import U8, PointCloud, Trajectory
+from scan2sim.segmentation.label import classified
 
 PHOTO, SHAPE, OWN = 1, 2, 3
 """What a point's class comes from: photos that see it (with its shape and neighbours), those alone, the cloud."""
@@ -43,14 +49,6 @@ def segment(inputs: Inputs, params: SegmentParams, out: Path, report: Report) ->
     Files: `cloud`; `confidence`, .npz with `confidence` (N,) uint8, 255 sure, and `source` (N,) uint8
     (`PHOTO`, `SHAPE` or `OWN`).
     """
-    from dataclasses import replace
-
-    import numpy as np
-
-    from scan2sim.pipeline.classes import group_of, name_of
-    from scan2sim.pipeline.types import PointCloud
-    from scan2sim.segmentation.label import classified
-
     report(0.0, "reading")
     cloud = PointCloud.load(inputs["cloud"])
     file, beside = out / "cloud.npz", out / "confidence.npz"
@@ -95,12 +93,7 @@ def classify_points(
     cloud: PointCloud, inputs: Inputs, params: SegmentParams, report: Report
 ) -> tuple[U8, U8, U8, dict[str, Any]]:
     """LAS codes, confidence (255: sure) and source of every point (N,), and facts where photos were used."""
-    import numpy as np
-
-    from scan2sim.pipeline.io import views as views_io
     from scan2sim.pipeline.normals import oriented_normals
-    from scan2sim.pipeline.steps.voxel import sample, voxel_groups
-    from scan2sim.pipeline.types import PointCloud, Trajectory
     from scan2sim.segmentation.geometric import classify
 
     n = len(cloud)
@@ -133,10 +126,6 @@ def _from_photos(
     report: Report,
 ) -> tuple[U8, U8, U8, dict[str, Any]]:
     """LAS codes, confidence and whether a photo sees it, by voxel; and facts."""
-    import json
-
-    import numpy as np
-
     from scan2sim.segmentation.geometric import split_ground
     from scan2sim.segmentation.labels import code_of_index
     from scan2sim.segmentation.moving import moving

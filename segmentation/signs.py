@@ -8,17 +8,20 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
+import numpy.typing as npt
 from pydantic import Field
 
+from scan2sim.pipeline.cells import Cell
+from scan2sim.pipeline.io import image
+from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.ranges import Place
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.steps.furniture import BORDER, listed, of_plate
+from scan2sim.pipeline.types import F32, F64, U8, Frame, Mesh, View
 
 if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
     from scan2sim.pipeline.plates import Plate
-    from scan2sim.pipeline.types import F32, F64, U8, Frame, Mesh, View
 
     Bools = npt.NDArray[np.bool_]
 
@@ -53,12 +56,7 @@ def signs(inputs: Inputs, params: SignsParams, out: Path, report: Report) -> Don
     Files: `building` and `vegetation`, meshes with the plates, and without what points of plates made before them;
     `geojson` and `csv` as of `furniture`. Facts: `from_points`, plates; `fitted` to photos, of these `new`.
     """
-    import numpy as np
-
-    from scan2sim.pipeline.io import views as views_io
     from scan2sim.pipeline.plates import Plate
-    from scan2sim.pipeline.steps.furniture import listed
-    from scan2sim.pipeline.types import Mesh
     from scan2sim.segmentation.hanging import behind, cleared, with_plates, without
 
     groups = [group for group in ("terrain", "building", "vegetation") if f"mesh.{group}" in inputs]
@@ -87,19 +85,12 @@ def signs(inputs: Inputs, params: SignsParams, out: Path, report: Report) -> Don
 
 def _probabilities(inputs: Inputs, used: Sequence[int]) -> dict[int, U8]:
     """A network's probabilities by index of view, of those that it looked at."""
-    import numpy as np
-
     files = {i: inputs["labels"] / f"{i}.npy" for i in used} if "labels" in inputs else {}
     return {i: np.load(file) for i, file in files.items() if file.is_file()}
 
 
 def _own(place: F64, frame: Frame, params: SignsParams) -> bool:
     """Whether what hangs at a place (3,) is this tile's to fit."""
-    import numpy as np
-
-    from scan2sim.pipeline.cells import Cell
-    from scan2sim.pipeline.steps.furniture import BORDER
-
     if params.seed is None:
         return True
     world = place[None, :2] + np.asarray(frame.origin[:2])
@@ -115,9 +106,6 @@ def _found(
     report: Report,
 ) -> list[Plate]:
     """Plates that photos agree on, around those of points and where photos show signs."""
-    import numpy as np
-
-    from scan2sim.pipeline.io import image
     from scan2sim.segmentation.detections import hanging
     from scan2sim.segmentation.outlines import beside, close_ups, fitted
 
@@ -147,10 +135,7 @@ def _listed(
     rows: Sequence[Mapping[str, Any]], plates: Sequence[Plate], moved: Sequence[F64], terrain: Mesh
 ) -> list[dict[str, Any]]:
     """The list's rows with the plates: those of the pole that each hangs on, or of a sign whose pole isn't known."""
-    import numpy as np
-
     from scan2sim.pipeline.furniture import AROUND
-    from scan2sim.pipeline.steps.furniture import of_plate
 
     frame, out = terrain.frame, [dict(row) for row in rows]
     by_size = sorted(zip(plates, moved, strict=True), key=lambda one: one[0].width * one[0].height)
@@ -172,8 +157,6 @@ def _listed(
 
 def _ground(vertices: F32, place: F64) -> float:
     """Height of the ground's vertex next to a place, on the plan."""
-    import numpy as np
-
     return float(vertices[np.hypot(*(vertices[:, :2] - place[:2]).T).argmin(), 2]) if len(vertices) else float(place[2])
 
 

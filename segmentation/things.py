@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from scan2sim.pipeline.classes import CODE, group_of
 from scan2sim.pipeline.io.files import pass_on
 from scan2sim.pipeline.ranges import Voxel
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.steps.voxel import voxel_groups
+from scan2sim.pipeline.types import F32, F64, U8, Frame, PointCloud, Trajectory
+from scan2sim.segmentation.segment import OWN, SHAPE
 
 if TYPE_CHECKING:
-    from scan2sim.pipeline.types import F32, F64, U8, Frame, PointCloud
     from scan2sim.segmentation.instances import Ints, Scan, Thing
 
 PASSING, AROUND, NEIGHBOURS = 1.0, 0.5, 16
@@ -46,12 +52,6 @@ def things(inputs: Inputs, params: ThingsParams, out: Path, report: Report) -> D
     `width_m`, `height_m`, `heading_deg` (from x, anticlockwise), `ground_z`, `points`, `moved` and `confidence`.
     Facts: `vehicles`, of these `moved`, `people`; points that were `added` to them, and `given_back` to other classes.
     """
-    from dataclasses import replace
-
-    import numpy as np
-
-    from scan2sim.pipeline.types import PointCloud
-
     file, listed = out / "cloud.npz", out / "things.geojson"
     report(0.0, "reading")
     found: list[tuple[Thing, int]] = []
@@ -88,13 +88,7 @@ def decide(
     cloud: PointCloud, inputs: Inputs, params: ThingsParams, report: Report
 ) -> tuple[list[tuple[Thing, int]], U8]:
     """Things with their numbers of points, and the class of every point (N,)."""
-    import numpy as np
-
-    from scan2sim.pipeline.classes import CODE
-    from scan2sim.pipeline.steps.voxel import voxel_groups
-    from scan2sim.pipeline.types import PointCloud, Trajectory
     from scan2sim.segmentation import instances
-    from scan2sim.segmentation.segment import OWN
 
     assert cloud.classification is not None
     with np.load(inputs["confidence"]) as data:
@@ -140,13 +134,10 @@ def scan_of(thin: PointCloud, sure: U8, source: U8, moving: F32, moments: tuple[
         moments: (N,) each, seconds: when the voxel's points were scanned first and last; None where nothing tells.
         path: (T, 3) of the scanner.
     """
-    import numpy as np
     from scipy.spatial import cKDTree
 
-    from scan2sim.pipeline.classes import CODE
     from scan2sim.segmentation.geometric import split_ground
     from scan2sim.segmentation.instances import Scan
-    from scan2sim.segmentation.segment import SHAPE
 
     assert thin.classification is not None
     height, ground = split_ground(thin.xyz)
@@ -172,10 +163,7 @@ def scan_of(thin: PointCloud, sure: U8, source: U8, moving: F32, moments: tuple[
 
 def other_class(scan: Scan, index: Ints) -> U8:
     """The classes (K,) of points that are of no thing: of the nearest on the ground, or above it, that is of none."""
-    import numpy as np
     from scipy.spatial import cKDTree
-
-    from scan2sim.pipeline.classes import CODE, group_of
 
     terrain = group_of()[scan.classification] == 0
     out = scan.classification[index].copy()
@@ -191,8 +179,6 @@ def other_class(scan: Scan, index: Ints) -> U8:
 
 def _write_list(path: Path, found: Sequence[tuple[Thing, int]], frame: Frame | None) -> None:
     """A polygon a thing."""
-    import numpy as np
-
     from scan2sim.pipeline.io import geojson
 
     features = []
@@ -216,8 +202,6 @@ def _write_list(path: Path, found: Sequence[tuple[Thing, int]], frame: Frame | N
 
 
 def _movable() -> tuple[int, int]:
-    from scan2sim.pipeline.classes import CODE
-
     return CODE["vehicle"], CODE["person"]
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from numba import njit, prange
 
 from scan2sim.pipeline.cameras import EQUIRECTANGULAR
+from scan2sim.pipeline.io import image
 from scan2sim.pipeline.projection import eye, incidence, is_visible, pixel_of, to_camera, turned
 from scan2sim.pipeline.sampling import allows, mixed, rescaled, taps
 from scan2sim.pipeline.step import Report, silent
@@ -81,8 +82,6 @@ def vote(
 
 
 def _mask(view: View) -> np.ndarray:
-    from scan2sim.pipeline.io import image
-
     mask = image.read_mask(view)
     return np.zeros((0, 0), np.uint8) if mask is None else mask
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from scan2sim.pipeline.cameras import project
 from scan2sim.pipeline.extras import need
 from scan2sim.pipeline.io.colmap_writer import SparseMap
 from scan2sim.pipeline.io.colmap_writer import write as write_colmap
@@ -37,8 +38,6 @@ def adjust(mapped: Mapped) -> dict[str, float]:
     """
     need("--adjust", "pycolmap")
     import pycolmap
-
-    from scan2sim.pipeline.cameras import project
 
     keyframes = mapped.map.keyframes
     poses = np.stack([k.T_world_cam for k in keyframes])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -102,8 +103,6 @@ def _av() -> Any:
 
 
 def _start(written: str | None) -> float | None:
-    from datetime import datetime
-
     try:
         return datetime.fromisoformat(written).timestamp() if written else None
     except ValueError:

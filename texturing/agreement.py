@@ -15,17 +15,18 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+import numpy.typing as npt
 from pydantic import Field
 
 from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.io import image
+from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.ranges import Cosine, Depth, Reach
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.types import F32, U8, View
 
 if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
-    from scan2sim.pipeline.types import F32, U8, View
     from scan2sim.pipeline.visibility import DepthMap
     from scan2sim.texturing.photos import Exposures, Photos
     from scan2sim.texturing.predict import Prediction
@@ -110,17 +111,11 @@ class Agreement:
 
     def mask(self, i: int, view: View) -> U8:
         """(h, w) uint8, 0 where photo `i` must not be used: its own mask, ghosts and sky; (0, 0) for nowhere."""
-        import numpy as np
-
-        from scan2sim.pipeline.io import image
-
         path = self.folder / f"mask_{i}.png"
         return image.read_levels(path) if path.is_file() else np.zeros((0, 0), np.uint8)
 
     def warp(self, i: int) -> F32:
         """(h, w, 2) float32 pixels to be added to where photo `i` is looked up; (0, 0, 2) for none."""
-        import numpy as np
-
         path = self.folder / f"warp_{i}.npy"
         return np.load(path) if path.is_file() else np.zeros((0, 0, 2), np.float32)
 
@@ -131,10 +126,6 @@ def agreement(inputs: Inputs, params: AgreementParams, out: Path, report: Report
     Inputs: `views`, `depth` (folder of depth maps), `exposures`.
     Folder: `agreement`, with `agreement.json` (a row a view), and `mask_<i>.png` where a photo has some, ghosts or sky.
     """
-    import numpy as np
-
-    from scan2sim.pipeline.io import image
-    from scan2sim.pipeline.io import views as views_io
     from scan2sim.pipeline.visibility import load_depth_map
     from scan2sim.texturing.photos import Exposures, Photos, camera_of
 
@@ -180,8 +171,6 @@ def neighbours(
     views: Sequence[View], used: Sequence[int], depth: Callable[[int], DepthMap], params: AgreementParams
 ) -> dict[int, list[int]]:
     """The views that see most of what each one sees, at no much lower resolution."""
-    import numpy as np
-
     from scan2sim.pipeline.cameras import pixel_angle
     from scan2sim.pipeline.visibility import visible
     from scan2sim.texturing.predict import surface
@@ -236,7 +225,6 @@ def compare(
 ) -> Compared:
     """Predict photo `i` from `others`, and tell how it differs."""
     import cv2
-    import numpy as np
 
     from scan2sim.texturing.predict import Predictor, corrected_photo, surface
 
@@ -273,7 +261,6 @@ def _shift(
 ) -> tuple[dict[str, float], F32 | None]:
     """How a photo is displaced against its prediction by optical flow: figures (pixels of the photo), and its warp."""
     import cv2
-    import numpy as np
 
     grey = cv2.cvtColor(mine, cv2.COLOR_RGB2GRAY)
     other = np.where(sure, cv2.cvtColor(predicted.rgb, cv2.COLOR_RGB2GRAY), grey)
@@ -306,7 +293,6 @@ def warp_of(flow: F32, slope: F32, scale: float) -> F32:
         scale: pixels of the photo per pixel of the compared size.
     """
     import cv2
-    import numpy as np
 
     length = np.linalg.norm(flow, axis=2)
     weight = np.where(length < MAX_WARP, np.minimum(slope, 200), 0).astype(np.float32)
@@ -325,7 +311,6 @@ def ghost_mask(mine: F32, predicted: Prediction, white: npt.NDArray[np.bool_]) -
         white: (h, w, 3) where it is overexposed: as bright as it shows, or brighter.
     """
     import cv2
-    import numpy as np
 
     sure = predicted.support >= 2
     theirs = np.where(sure[..., None], predicted.rgb, mine)
@@ -345,8 +330,6 @@ def ghost_mask(mine: F32, predicted: Prediction, white: npt.NDArray[np.bool_]) -
 
 def without_sky(view: View, rgb: U8, mask: U8, depth: DepthMap) -> tuple[U8, float]:
     """A photo's mask, (0, 0) for none, 0 also where it shows sky, and how large a share that is."""
-    import numpy as np
-
     from scan2sim.pipeline.cameras import pixel_angle, pixel_rays
     from scan2sim.texturing.sky import sky
 
@@ -361,7 +344,6 @@ def without_sky(view: View, rgb: U8, mask: U8, depth: DepthMap) -> tuple[U8, flo
 def combined(ghosts: npt.NDArray[np.bool_] | None, mask: U8) -> U8 | None:
     """The photo's own mask and its ghosts as one, 0 where it must not be used; None where that is nowhere."""
     import cv2
-    import numpy as np
 
     if ghosts is None or not ghosts.any():
         return np.where(mask > 0, 255, 0).astype(np.uint8) if mask.size else None
@@ -375,8 +357,6 @@ def combined(ghosts: npt.NDArray[np.bool_] | None, mask: U8) -> U8 | None:
 
 def _judge(rows: list[dict[str, Any]], params: AgreementParams) -> None:
     """Decide from the figures which photos are left out, and how much blurred ones count."""
-    import numpy as np
-
     for row in rows:
         if not row["usable"]:
             continue

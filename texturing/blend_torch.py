@@ -6,23 +6,19 @@ Line for line what `blend.accumulate` does to one texel; a test holds both to on
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from scan2sim.pipeline.cameras import ALIKE, EQUIRECTANGULAR, FISHEYE, OPENCV, ORTHOGRAPHIC
 from scan2sim.pipeline.errors import SettingError
 from scan2sim.pipeline.projection import MAX_SLOPE, SLOPE_SHARE
-from scan2sim.texturing.blend import EDGE, WHITE
+from scan2sim.pipeline.types import F32, F64, U8
+from scan2sim.texturing.blend import EDGE, WHITE, Laid, Source, Weighing
 from scan2sim.texturing.photos import OFFSET
-
-if TYPE_CHECKING:
-    import numpy.typing as npt
-
-    from scan2sim.pipeline.types import F32, F64, U8
-    from scan2sim.texturing.blend import Laid, Source, Weighing
 
 CHUNK = 2_000_000
 """Texels that are worked on at a time: some 500 MB."""

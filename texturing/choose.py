@@ -11,16 +11,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+import numpy.typing as npt
 from pydantic import Field
 
+from scan2sim.pipeline.classes import CODE
+from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.ranges import Cosine, Depth, Reach
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.types import F32, I32, U8, Mesh, View
+from scan2sim.texturing.agreement import Agreement
 
 if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
-    from scan2sim.pipeline.types import F32, I32, U8, Mesh, View
     from scan2sim.pipeline.visibility import DepthMap
 
 
@@ -64,15 +66,11 @@ class Choice:
 
     def save(self, path: Path) -> None:
         """Write as .npz."""
-        import numpy as np
-
         np.savez(path, view=self.view, quality=self.quality, label=self.detail_view)
 
     @classmethod
     def load(cls, path: Path) -> Choice:
         """Read what `save` wrote."""
-        import numpy as np
-
         with np.load(path) as data:
             return cls(data["view"], data["quality"], data["label"])
 
@@ -84,10 +82,7 @@ def choose(inputs: Inputs, params: ChooseParams, out: Path, report: Report) -> D
     File: `choice`, a `Choice`.
     """
     from scan2sim.pipeline.cameras import pixel_angle
-    from scan2sim.pipeline.io import views as views_io
-    from scan2sim.pipeline.types import Mesh
     from scan2sim.pipeline.visibility import load_depth_map
-    from scan2sim.texturing.agreement import Agreement
 
     mesh = Mesh.load(inputs["mesh"])
     views = views_io.load(inputs["views"])
@@ -143,9 +138,6 @@ def with_whole_signs(choice: Choice, mesh: Mesh, pixel: Sequence[float]) -> Choi
         mesh: with their classes.
         pixel: radians that a pixel of each view spans.
     """
-    import numpy as np
-
-    from scan2sim.pipeline.classes import CODE
     from scan2sim.texturing.mrf import adjacent
 
     if mesh.classification is None or not (mesh.classification == CODE["road_sign"]).any():
@@ -167,7 +159,6 @@ def with_whole_signs(choice: Choice, mesh: Mesh, pixel: Sequence[float]) -> Choi
 
 def _sides(mesh: Mesh, faces: npt.NDArray[np.int64], pairs: I32) -> list[npt.NDArray[np.int64]]:
     """Faces (N,) in connected pieces that look one way; `pairs` (E, 2) of neighbours, indices into them."""
-    import numpy as np
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -180,8 +171,6 @@ def _sides(mesh: Mesh, faces: npt.NDArray[np.int64], pairs: I32) -> list[npt.NDA
 
 def seams(mesh: Mesh, smoothness: float) -> tuple[I32, F32, F32]:
     """Neighbouring faces (E, 2), the lengths (E,) of their edges in metres, and what a seam there costs (E,)."""
-    import numpy as np
-
     from scan2sim.texturing.mrf import adjacent
 
     pairs, edge = adjacent(mesh.faces)

@@ -12,11 +12,11 @@ import numpy as np
 import numpy.typing as npt
 
 from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.types import F32, F64, U8
+from scan2sim.pipeline.io import image
+from scan2sim.pipeline.types import F32, F64, U8, View
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.render import Image, Renderer
-    from scan2sim.pipeline.types import View
 
 Mask = npt.NDArray[np.bool_]
 
@@ -195,8 +195,6 @@ def held_out(world: Renderer, views: Sequence[View], depths: Sequence[Path] | No
             out; None: every pixel with a surface counts.
     """
     import cv2
-
-    from scan2sim.pipeline.io import image
 
     files: list[Path | None] = list(depths) if depths is not None else [None] * len(views)
     for view, depth in zip(views, files, strict=True):

@@ -14,16 +14,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+import numpy.typing as npt
 from pydantic import Field
 
+from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.ranges import FileName, Reach, Stops
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.types import F64, View
 
 if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
-    from scan2sim.pipeline.types import F64, View
     from scan2sim.pipeline.visibility import DepthMap
     from scan2sim.texturing.photos import Exposures
 
@@ -71,9 +71,6 @@ def exposure(inputs: Inputs, params: ExposureParams, out: Path, report: Report) 
     Inputs: `views`, `depth` (folder of depth maps), `prior` (an earlier tile's exposures) or none.
     File: `exposures`, JSON of `texturing.photos.Exposures`.
     """
-    import numpy as np
-
-    from scan2sim.pipeline.io import views as views_io
     from scan2sim.texturing.photos import Exposures, camera_of
 
     views = views_io.load(inputs["views"])
@@ -119,8 +116,6 @@ def observe(
     report: Report,
 ) -> Observed:
     """Sample random places of every photo in all photos that see them; read photo by photo."""
-    import numpy as np
-
     from scan2sim.pipeline.visibility import load_depth_map
     from scan2sim.texturing.photos import Photos
     from scan2sim.texturing.predict import surface
@@ -163,7 +158,6 @@ def _observe(
 ) -> tuple[npt.NDArray[np.int64], F64, F64]:
     """Indices of the places (P, 3) that a photo sees well, their log values (N, 3), and q (N,)."""
     import cv2
-    import numpy as np
 
     from scan2sim.pipeline.projection import pixels
     from scan2sim.pipeline.visibility import DepthMap as Map
@@ -205,8 +199,6 @@ def solve(
     A camera's vignetting is kept only where it explains much: surfaces that look brighter against the sun, which
     are in a photo's middle when far away, look like a little of it.
     """
-    import numpy as np
-
     from scan2sim.texturing.photos import camera_of
 
     if len(seen.photo) == 0:
@@ -223,7 +215,6 @@ def _least_squares(
     seen: Observed, views: Sequence[View], lenses: Sequence[str], params: ExposureParams, prior: Exposures
 ) -> tuple[Exposures, tuple[float, float]]:
     """Solve gains, and the vignetting of the cameras named `lenses`."""
-    import numpy as np
     import scipy.sparse as sp
 
     from scan2sim.texturing.photos import GAMMA, Exposures, camera_of
@@ -278,8 +269,6 @@ def _prior(
     params: ExposureParams,
 ) -> tuple[F64, F64]:
     """Centre (U,) and precision (U, U) of the unknowns, in units of an observation's own precision."""
-    import numpy as np
-
     from scan2sim.texturing.photos import GAMMA
 
     stop = np.log(2) / GAMMA  # a stop, in logarithms of encoded values

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
+from scan2sim.pipeline.classes import colour_of
 from scan2sim.pipeline.heightfield import spacing
 from scan2sim.pipeline.types import F32, I32, U8
 from scan2sim.texturing.texels import box, frame
@@ -215,8 +216,6 @@ def texel_places(owner, flat, corners, rows, columns):  # type: ignore[no-untype
 
 def shaded(classification: U8, normal: npt.NDArray[np.floating] | None) -> U8:
     """(N, 3) display colours of classes (N,), a little darker where normals (N, 3) turn from above."""
-    from scan2sim.pipeline.classes import colour_of
-
     rgb = colour_of()[classification].astype(np.float32)
     if normal is not None:
         rgb *= (0.75 + 0.25 * np.clip(normal @ np.array([0.3, 0.2, 0.93]), 0, 1))[:, None]

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.io import image
 from scan2sim.pipeline.types import F64, U8, View
 
 CACHE = 300_000_000
@@ -122,8 +123,6 @@ class Photos:
 
     def mask(self, i: int) -> U8 | None:
         """The mask of view `i` at its photo's size, (0, 0) for none; None if it can't be used."""
-        from scan2sim.pipeline.io import image
-
         view = self._views[i]
         try:
             mask = image.read_mask(view)
@@ -133,8 +132,6 @@ class Photos:
         return np.zeros((0, 0), np.uint8) if mask is None else mask
 
     def _read(self, i: int) -> Photo | None:
-        from scan2sim.pipeline.io import image
-
         view = self._views[i]
         try:
             whole = image.read_photo(view)

@@ -20,7 +20,7 @@ from scan2sim.pipeline.sampling import allows, halving, read
 from scan2sim.pipeline.types import F32, F64, U8, Camera
 from scan2sim.pipeline.visibility import DepthMap
 from scan2sim.texturing.blend import corrected, vignette
-from scan2sim.texturing.photos import Photo
+from scan2sim.texturing.photos import OFFSET, Photo
 
 ALIKE = 28.0
 """Grey levels within which photos agree on a colour."""
@@ -234,8 +234,6 @@ def _apart(a, b):  # type: ignore[no-untyped-def]
 
 def corrected_photo(photo: npt.NDArray[np.uint8], camera: Camera, exposure: F64) -> F32:
     """The photo (H, W, 3), of a camera scaled to it, with its exposure corrected; (H, W, 3) float32, unclipped."""
-    from scan2sim.texturing.photos import OFFSET
-
     v, u = np.mgrid[: camera.height, : camera.width].astype(np.float32)
     cx, cy = (camera.width - 1) / 2, (camera.height - 1) / 2
     q = ((u - cx) ** 2 + (v - cy) ** 2) / (cx * cx + cy * cy)

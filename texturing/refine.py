@@ -13,16 +13,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
+import numpy.typing as npt
 from pydantic import Field
 
+from scan2sim.pipeline.io import image
+from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.ranges import Reach
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.types import F64, Camera, Mesh, PointCloud, View
+from scan2sim.texturing.agreement import AgreementParams, neighbours
 
 if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
-    from scan2sim.pipeline.types import F64, Camera, View
     from scan2sim.pipeline.visibility import DepthMap, Scene
     from scan2sim.texturing.bundle import Corrections, Priors
     from scan2sim.texturing.matches import Matches, Picture
@@ -80,9 +82,6 @@ def refine(inputs: Inputs, params: RefineParams, out: Path, report: Report) -> D
     `displaced_px` and `displaced_after_px`, medians over them; whether poses were `moved`; `cameras` and `photos`, what
     each was moved by.
     """
-    import numpy as np
-
-    from scan2sim.pipeline.io import views as views_io
     from scan2sim.texturing import bundle
 
     views, held = views_io.load(inputs["views"]), views_io.load_held_out(inputs["views"])
@@ -134,8 +133,6 @@ def lenses(views: Sequence[View]) -> tuple[list[str], Numbers]:
 
     Photos of a stereo pair have the same model, and a folder each.
     """
-    import numpy as np
-
     keys = [(view.camera, view.name.rpartition("/")[0]) for view in views]
     known = list(dict.fromkeys(keys))
     names = [folder or f"{camera.model} {camera.width} x {camera.height}" for camera, folder in known]
@@ -149,8 +146,6 @@ def small(camera: Camera) -> Camera:
 
 
 def _median(values: F64) -> float:
-    import numpy as np
-
     return float(np.nanmedian(values)) if len(values) else 0.0
 
 
@@ -162,7 +157,6 @@ def _priors(params: RefineParams) -> Priors:
 
 def _pictures(photos: Sequence[View], used: Sequence[int]) -> dict[int, Picture]:
     """Those that can be read, by index; what can't is told by the steps that paint with it."""
-    from scan2sim.pipeline.io import image
     from scan2sim.texturing.matches import picture
     from scan2sim.texturing.photos import Photos
 
@@ -177,10 +171,7 @@ def _pictures(photos: Sequence[View], used: Sequence[int]) -> dict[int, Picture]
 
 def _surface(inputs: Inputs) -> tuple[Scene, Scene]:
     """The meshes, all of them, and what can move of the clouds."""
-    import numpy as np
-
     from scan2sim.pipeline import visibility as kernel
-    from scan2sim.pipeline.types import Mesh, PointCloud
 
     meshes = [Mesh.load(path) for name, path in inputs.items() if name.startswith("mesh.")]
     clouds = [PointCloud.load(path) for name, path in inputs.items() if name.startswith("cloud.")]
@@ -201,10 +192,8 @@ def _matched(
 ) -> Matches:
     """Matches of all pictures, at the photos' poses."""
     import cv2
-    import numpy as np
 
     from scan2sim.pipeline import visibility as kernel
-    from scan2sim.texturing.agreement import AgreementParams, neighbours
     from scan2sim.texturing.matches import matches
 
     def drawn(k: int, scene: Scene) -> DepthMap:
@@ -234,8 +223,6 @@ def _believed(
     found: Corrections, cameras: Sequence[str], photos: Sequence[str], priors: Priors
 ) -> tuple[Corrections, list[str]]:
     """The corrections without those that are larger than poses can be wrong by, and sentences about these."""
-    import numpy as np
-
     from scan2sim.texturing.bundle import Corrections
 
     def beyond(rows: F64, turn: float, shift: float) -> npt.NDArray[np.bool_]:
@@ -259,7 +246,6 @@ def _by_photo(
     first: tuple[Matches, F64], last: tuple[Matches, F64], photos: Sequence[View], cameras: Sequence[Camera]
 ) -> tuple[dict[int, float], dict[int, float]]:
     """Median displacement of each photo, pixels of its own, before and after."""
-    import numpy as np
 
     def of(found: Matches, off: F64) -> dict[int, float]:
         scale = [view.camera.width / camera.width for view, camera in zip(photos, cameras, strict=True)]
@@ -269,8 +255,6 @@ def _by_photo(
 
 
 def _row(correction: F64) -> dict[str, float]:
-    import numpy as np
-
     return {
         "shift_cm": round(100 * float(np.linalg.norm(correction[3:])), 2),
         "turn_mrad": round(1000 * float(np.linalg.norm(correction[:3])), 2),

@@ -7,18 +7,19 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+import numpy.typing as npt
 from pydantic import Field
 
 from scan2sim.pipeline.classes import SURFACES
+from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.ranges import Reach
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.steps.pictures import Album
+from scan2sim.pipeline.types import F32, View
 
 if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
     from scan2sim.pipeline.render import Renderer
-    from scan2sim.pipeline.types import F32, View
 
 FIGURES = ("psnr_db", "psnr_gain_db", "ssim", "sharpness")
 CLEARANCE = 1.0
@@ -55,12 +56,8 @@ def score(inputs: Inputs, params: ScoreParams, out: Path, report: Report) -> Don
     (`count`), and metres to the nearest surface for those that are within `CLEARANCE` of one (`near_m`). Where `things`
     are listed, `remains_m2`: surface left of each vehicle that was taken out (`pipeline.remains`).
     """
-    import numpy as np
-
-    from scan2sim.pipeline.io import views as views_io
     from scan2sim.pipeline.remains import left_of_vehicles
     from scan2sim.pipeline.render import Renderer, textured
-    from scan2sim.pipeline.steps.pictures import Album
     from scan2sim.texturing import evaluate
 
     groups = [g for g in SURFACES if g in inputs]
@@ -127,8 +124,6 @@ def _caption(figures: dict[str, float | None]) -> str:
 
 def _band(distance: F32) -> npt.NDArray[np.int64]:
     """(H, W) which band a pixel is in, -1 where there is no surface."""
-    import numpy as np
-
     from scan2sim.texturing.evaluate import BANDS
 
     return np.where(np.isfinite(distance), np.digitize(distance, BANDS), -1)
@@ -136,8 +131,6 @@ def _band(distance: F32) -> npt.NDArray[np.int64]:
 
 def _cameras(world: Renderer, views: Sequence[View]) -> dict[str, Any]:
     """How many photos there are, and those taken within `CLEARANCE` of a surface, nearest first."""
-    import numpy as np
-
     taken = [view for view in views if view.camera.model != "orthographic"]  # orthophotos were taken from nowhere
     centres = np.array([view.centre for view in taken], np.float32).reshape(-1, 3)
     places, _ = world.nearest_places(centres)
@@ -151,8 +144,6 @@ def _truth(inputs: Inputs, world: Renderer, params: ScoreParams) -> dict[str, fl
 
     None where none did.
     """
-    import numpy as np
-
     from scan2sim.pipeline.io.clouds import las
     from scan2sim.texturing.evaluate import psnr
 
@@ -173,9 +164,6 @@ def _truth(inputs: Inputs, world: Renderer, params: ScoreParams) -> dict[str, fl
 
 def _seen_from_near(inputs: Inputs, places: F32, normals: F32, near: float) -> npt.NDArray[np.bool_]:
     """(N,) which places (N, 3) on the meshes a photo that was not held out sees from `near` metres or nearer."""
-    import numpy as np
-
-    from scan2sim.pipeline.io import views as views_io
     from scan2sim.pipeline.visibility import load_depth_map, visible
 
     seen = np.zeros(len(places), bool)

@@ -15,17 +15,20 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+import numpy.typing as npt
 from pydantic import Field
 
 from scan2sim.pipeline.extras import need
+from scan2sim.pipeline.io import image
+from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.ranges import Cosine, Depth, Device
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.types import F32, U8, Mesh, PointCloud
+from scan2sim.texturing.agreement import Agreement
+from scan2sim.texturing.choose import Choice
 
 if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
-    from scan2sim.pipeline.types import F32, U8, Mesh
     from scan2sim.texturing.baker import Baker
     from scan2sim.texturing.fill import Colours, Page
     from scan2sim.texturing.plan import Plan
@@ -73,9 +76,6 @@ def texture(inputs: Inputs, params: TextureParams, out: Path, report: Report) ->
     File: `textured`, a folder with `mesh.npz`, `page_<i>.png` and `page_<i>_seen.png` (255 seen by a photo,
     128 coloured from points, 64 filled from neighbours or by class, 0 no surface).
     """
-    import numpy as np
-
-    from scan2sim.pipeline.types import Mesh
     from scan2sim.texturing import fill
     from scan2sim.texturing.lent import colours_of, made_colours
     from scan2sim.texturing.writer import Writer
@@ -120,11 +120,8 @@ def texture(inputs: Inputs, params: TextureParams, out: Path, report: Report) ->
 
 def _baker(mesh: Mesh, inputs: Inputs, params: TextureParams) -> Baker:
     """What bakes the mesh's pages, with what the steps before have found."""
-    from scan2sim.pipeline.io import views as views_io
-    from scan2sim.texturing.agreement import Agreement
     from scan2sim.texturing.baker import Baker, best_device
     from scan2sim.texturing.blend import Weighing
-    from scan2sim.texturing.choose import Choice
     from scan2sim.texturing.photos import Exposures
 
     return Baker(
@@ -143,7 +140,6 @@ def _baker(mesh: Mesh, inputs: Inputs, params: TextureParams) -> Baker:
 def _plan(mesh: Mesh, sizes: Sequence[dict[str, int]], inputs: Inputs) -> Plan:
     """The picture from above of an unwrapped mesh, with the classes of the ground's points."""
     from scan2sim.pipeline.remains import outlines
-    from scan2sim.pipeline.types import PointCloud
     from scan2sim.texturing.lent import classes_of
     from scan2sim.texturing.plan import Plan
 
@@ -154,8 +150,6 @@ def _plan(mesh: Mesh, sizes: Sequence[dict[str, int]], inputs: Inputs) -> Plan:
 
 def _texel(mesh: Mesh, sizes: Sequence[dict[str, int]]) -> float:
     """Metres that a texel spans where they are fine: of the first quarter of the faces."""
-    import numpy as np
-
     assert mesh.uv is not None and mesh.page is not None
     pixels = np.array([size["width"] * size["height"] for size in sizes], np.float64)[mesh.page]
     u, v = mesh.uv[:, 1] - mesh.uv[:, 0], mesh.uv[:, 2] - mesh.uv[:, 0]
@@ -165,9 +159,6 @@ def _texel(mesh: Mesh, sizes: Sequence[dict[str, int]]) -> float:
 
 def _go_on(plan: Plan, folder: Path, mesh: Mesh, wanting: npt.NDArray[np.bool_], params: TextureParams) -> None:
     """Paint the pages of the faces that are `wanting` (F,), where the ground goes on, and pad their charts."""
-    import numpy as np
-
-    from scan2sim.pipeline.io import image
     from scan2sim.texturing import fill, texels
     from scan2sim.texturing.writer import Writer
 
@@ -200,8 +191,6 @@ def _filled(
 
     Where points have no colours of their own, texels that photos saw stand in, but for what was made up (`made`).
     """
-    import numpy as np
-
     from scan2sim.texturing import fill, texels
 
     area = float(mesh.face_area[faces].sum())
@@ -221,8 +210,6 @@ def _filled(
 
 def _facts(mesh: Mesh, texels: npt.NDArray[np.int64], sizes: Sequence[dict[str, int]], baker: Baker) -> dict[str, Any]:
     """Figures of a texture: areas (m2) by where their colour came from, photos and what each gave."""
-    import numpy as np
-
     area = mesh.face_area.astype(np.float64)
     share = texels[:, 1:] / np.maximum(texels[:, :1], 1)
     drawn = texels[:, 0] > 0  # a face too small for a texel counts neither way

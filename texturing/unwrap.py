@@ -14,18 +14,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
+import numpy.typing as npt
 from pydantic import Field
 
 from scan2sim.pipeline.classes import CODE
 from scan2sim.pipeline.errors import SettingError, StepError
+from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.ranges import Seconds, Texel
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.types import Mesh, View
+from scan2sim.texturing.choose import Choice
 
 if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
-    from scan2sim.pipeline.types import Mesh, View
     from scan2sim.texturing.atlas import Backend, Unwrapped
 
     Index = npt.NDArray[np.int64]
@@ -78,10 +79,6 @@ def unwrap(inputs: Inputs, params: UnwrapParams, out: Path, report: Report) -> D
         SettingError: texels are too fine for so large a surface.
         StepError: neither backend can unwrap a block.
     """
-    import numpy as np
-
-    from scan2sim.pipeline.types import Mesh
-
     mesh = Mesh.load(inputs["mesh"])
     laid = Laid(np.zeros((len(mesh), 3, 2), np.float32), np.full(len(mesh), -1, np.int16), [], 0, 0)
     if len(mesh):
@@ -150,11 +147,6 @@ class Laid:
 
 def _photos(inputs: Inputs) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """The view (F,) of every face's detail, the cameras' centres (V, 3), and metres a pixel (V,), 0 if by distance."""
-    import numpy as np
-
-    from scan2sim.pipeline.io import views as views_io
-    from scan2sim.texturing.choose import Choice
-
     views = views_io.load(inputs["views"])
     pixel = [1 / min(v.camera.fx, v.camera.fy) if v.camera.model == "orthographic" else 0.0 for v in views]
     centres = np.array([_eye(view) for view in views]).reshape(-1, 3)
@@ -180,8 +172,6 @@ def lay_by_photo(
         detail_view: (F,) the photo of every face, -1 for those that are not to be laid.
         centres: (V, 3) of the cameras.
     """
-    import numpy as np
-
     from scan2sim.texturing import photo_charts
 
     uv, page = laid.uv.copy(), laid.page.copy()
@@ -243,8 +233,6 @@ def split(mesh: Mesh, params: UnwrapParams, faces: Index) -> list[Index]:
 
 def halves(mesh: Mesh, block: Index) -> list[Index]:
     """A block cut across its longest side into two of about equal area; indices stay ascending."""
-    import numpy as np
-
     centre = mesh.vertices[mesh.faces[block]].mean(axis=1)
     order = np.argsort(centre[:, np.ptp(centre, axis=0).argmax()], kind="stable")
     area = np.cumsum(mesh.face_area[block][order], dtype=np.float64)
@@ -285,8 +273,6 @@ CHILD = "child process: "
 
 def _in_child(mesh: Mesh, blocks: list[Index], backend: Backend, params: UnwrapParams) -> list[Unwrapped | str]:
     """Unwrap blocks in one child process; a reason for each that failed."""
-    import numpy as np
-
     from scan2sim.pipeline import isolate
 
     parts = []
@@ -310,8 +296,6 @@ def _in_child(mesh: Mesh, blocks: list[Index], backend: Backend, params: UnwrapP
 
 def _facts(mesh: Mesh, pages: list[dict[str, int]]) -> dict[str, Any]:
     """Figures of an unwrapped mesh: pages, texels, utilisation, density achieved, stretch."""
-    import numpy as np
-
     if not pages:
         return {"faces": len(mesh), "pages": 0, "texels": 0}
     assert mesh.uv is not None and mesh.page is not None
@@ -339,8 +323,6 @@ def stretch(corners: npt.NDArray[Any], flat: npt.NDArray[Any]) -> npt.NDArray[An
         corners: (F, 3, 3) in space.
         flat: (F, 3, 2) in the texture.
     """
-    import numpy as np
-
     e1, e2 = (corners[:, k].astype(np.float64) - corners[:, 0] for k in (1, 2))
     length = np.linalg.norm(e1, axis=1)
     height = np.linalg.norm(np.cross(e1, e2), axis=1) / np.maximum(length, 1e-12)

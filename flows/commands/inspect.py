@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 from rich.markup import escape
 from rich.table import Table
@@ -73,15 +74,11 @@ def _reader(path: Path) -> Callable[[Path], tuple[str, Facts]]:
 
 
 def _bounds(low: object, high: object) -> str:
-    import numpy as np
-
     size = np.asarray(high) - np.asarray(low)
     return " x ".join(f"{v:,.2f}" for v in size) + "   from " + ", ".join(f"{v:,.2f}" for v in np.asarray(low))
 
 
 def _cloud(path: Path) -> tuple[str, Facts]:
-    import numpy as np
-
     header = clouds.read_header(path)
     low = tuple(np.floor(header.low).tolist())
     cloud = clouds.read(path, Frame(origin=low))
@@ -153,8 +150,6 @@ def _ply(path: Path) -> tuple[str, Facts]:
 
 
 def _result(path: Path) -> tuple[str, Facts]:
-    import numpy as np
-
     try:
         with np.load(path) as data:
             facts = [(name, f"{data[name].shape} {data[name].dtype}") for name in data.files]

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from scan2sim.pipeline.errors import SettingError, UnavailableError, from_os_error
+from scan2sim.pipeline.io.image import SUFFIXES
 
 if TYPE_CHECKING:
     from scan2sim.flows.engine.planning import Planned
@@ -25,8 +26,6 @@ PAUSE = 0.2  # seconds between looks for free memory
 
 def need(item: Planned, store: Store) -> float:
     """GB that a node is expected to need at its peak, from the sizes of what it reads."""
-    from scan2sim.pipeline.io.image import SUFFIXES
-
     least, share = item.node.step.memory
     # photos are read one after the other, and are no matter of the whole
     sizes = [_size(path) for path in item.inputs(store).values() if path.suffix.lower() not in SUFFIXES]

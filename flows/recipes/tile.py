@@ -6,6 +6,8 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from scan2sim.flows.recipes.graph import Node, NodeId, Output
 from scan2sim.flows.recipes.settings import Settings
 from scan2sim.pipeline.classes import GROUPS
@@ -410,6 +412,4 @@ def scanner_path(tile: Tile) -> dict[str, Any]:
 
 
 def _rows(positions: object) -> tuple[tuple[float, ...], ...]:
-    import numpy as np
-
     return tuple(tuple(row) for row in np.asarray(positions).round(4).tolist())

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from math import degrees
 from pathlib import Path
 from xml.sax.saxutils import escape
 
@@ -71,8 +72,6 @@ class Georeference:
     @classmethod
     def of(cls, frame: Frame) -> Georeference | None:
         """The georeference of a frame's origin; None for a local frame."""
-        from math import degrees
-
         here = crs.to_wgs84(frame)
         return None if here is None else cls(*here, -degrees(crs.convergence(frame)))
 

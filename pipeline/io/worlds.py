@@ -15,6 +15,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from scan2sim.pipeline.errors import DataError, InputError, from_os_error
 from scan2sim.pipeline.io import crs, sdf
 from scan2sim.pipeline.types import Frame
@@ -230,8 +232,6 @@ def _metadata(path: Path) -> dict[str, Any]:
 
 def _origin(tiles: Sequence[TileWorld]) -> sdf.Vector:
     """Origin, in whole metres, of the tile that is nearest to the middle of all: coordinates stay small."""
-    import numpy as np
-
     origins = np.array([tile.frame.origin for tile in tiles])
     middle = (origins.min(axis=0) + origins.max(axis=0)) / 2
     x, y, z = np.round(origins[np.argmin(np.linalg.norm(origins - middle, axis=1))]).tolist()
@@ -240,8 +240,6 @@ def _origin(tiles: Sequence[TileWorld]) -> sdf.Vector:
 
 def _place(tile: TileWorld, metadata: dict[str, Any], origin: sdf.Vector) -> sdf.Placed:
     """Where a tile's model is in the world, and the box around all its groups."""
-    import numpy as np
-
     groups = metadata["groups"].values()
     low = np.min([group["low_m"] for group in groups], axis=0).tolist()
     high = np.max([group["high_m"] for group in groups], axis=0).tolist()

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
+import numpy as np
+import numpy.typing as npt
 from pydantic import Field
 
+from scan2sim.pipeline.classes import CODE
 from scan2sim.pipeline.io.files import pass_on
 from scan2sim.pipeline.ranges import Coordinate
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.types import F64, Frame, PointCloud, Trajectory
 
-if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
-    from scan2sim.pipeline.types import F64, PointCloud, Trajectory
-
-    Bools = npt.NDArray[np.bool_]
+Bools = npt.NDArray[np.bool_]
 
 WINDOW = 0.1
 """Seconds: a turn of most spinning scanners."""
@@ -61,11 +59,7 @@ def carve(inputs: Inputs, params: CarveParams, out: Path, report: Report) -> Don
     `moving`, what moved, with time, normals towards the scanner and the class "vehicle"; `dropped`, .npy (N,) uint8 by
     point of the cloud, 0 where it is kept, else "vehicle" (it moved) or "low_noise"; empty where all are.
     """
-    import numpy as np
-
-    from scan2sim.pipeline.classes import CODE
     from scan2sim.pipeline.swept import in_first_metre, in_swept, swept
-    from scan2sim.pipeline.types import PointCloud, Trajectory
 
     if params.when == "never" or not (params.cameras or "path" in inputs):
         why = "carve.when=never" if params.when == "never" else "neither path nor cameras are known"
@@ -126,10 +120,6 @@ def carve(inputs: Inputs, params: CarveParams, out: Path, report: Report) -> Don
 
 def _untouched(cloud: Path, out: Path, why: str, facts: dict[str, object] | None = None) -> Done:
     """The cloud as it is, linked, and nothing that moved."""
-    import numpy as np
-
-    from scan2sim.pipeline.types import Frame, PointCloud
-
     file, moving = out / "cloud.npz", out / "moving.npz"
     pass_on(cloud, file)
     none = np.zeros((0, 3), np.float32)
@@ -140,8 +130,6 @@ def _untouched(cloud: Path, out: Path, why: str, facts: dict[str, object] | None
 
 def _origins(cloud: PointCloud, path: Trajectory) -> tuple[F64, str]:
     """(N, 3) where the scanner was at each point's time, NaN where that isn't known; and why it isn't at all, or ""."""
-    import numpy as np
-
     if cloud.time is None:
         return np.zeros((0, 3)), "the points have no times"
     known = np.isfinite(path.times)
@@ -167,8 +155,6 @@ def _origins(cloud: PointCloud, path: Trajectory) -> tuple[F64, str]:
 
 def _moved(cloud: PointCloud, origins: F64, path: Trajectory | None, params: CarveParams) -> tuple[Bools, float]:
     """(N,) which points other rays passed through, and the share of those that rays can tell of."""
-    import numpy as np
-
     from scan2sim.pipeline.freespace import in_free_space
 
     assert cloud.time is not None and path is not None

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from pydantic import Field
 
+from scan2sim.pipeline.cells import Cell
 from scan2sim.pipeline.ranges import Place
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-
-if TYPE_CHECKING:
-    from scan2sim.pipeline.cells import Cell
+from scan2sim.pipeline.types import Mesh
 
 
 class CellParams(Params):
@@ -28,15 +26,12 @@ class CellParams(Params):
     @property
     def cell(self) -> Cell:
         """The tile's cell."""
-        from scan2sim.pipeline.cells import Cell
-
         return Cell(self.seed, self.neighbours)
 
 
 def clip(inputs: Inputs, params: CellParams, out: Path, report: Report) -> Done:
     """Cut `mesh` to the tile's own cell, and tell which vertices lie on which border (`on`)."""
     from scan2sim.pipeline.borders.clip import clip as clip_mesh
-    from scan2sim.pipeline.types import Mesh
 
     mesh = Mesh.load(inputs["mesh"])
     clipped = clip_mesh(mesh, params.cell)

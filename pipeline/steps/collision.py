@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import numpy as np
 from pydantic import Field
 
 from scan2sim.pipeline.classes import SURFACES
 from scan2sim.pipeline.errors import DataError, StepError
 from scan2sim.pipeline.ranges import Seed
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-
-if TYPE_CHECKING:
-    from scan2sim.pipeline.types import Mesh
+from scan2sim.pipeline.steps.decimate import with_things
+from scan2sim.pipeline.types import Mesh
 
 SAMPLES = 100_000  # points at which the deviation is measured
 MOST = 200_000  # triangles, whatever the borders need
@@ -49,7 +48,6 @@ def collision(inputs: Inputs, params: CollisionParams, out: Path, report: Report
         StepError: the budget can't be met; with `keep_border`, the borders alone need over 200,000 triangles.
     """
     from scan2sim.pipeline.decimation import simplify
-    from scan2sim.pipeline.steps.decimate import with_things
 
     left_out = {"vegetation"} if not params.vegetation else set()
     groups = tuple(g for g in SURFACES if g not in left_out and (g in inputs or g != "vehicle"))
@@ -86,10 +84,6 @@ def collision(inputs: Inputs, params: CollisionParams, out: Path, report: Report
 
 def _joined(inputs: Inputs, groups: tuple[str, ...]) -> Mesh:
     """The meshes of `groups` that there are, as one."""
-    import numpy as np
-
-    from scan2sim.pipeline.types import Mesh
-
     read = {group: Mesh.load(inputs[group]) for group in SURFACES if group in inputs}
     parts = [mesh if group in groups else _parted(mesh, MOST)[1] for group, mesh in read.items()]
     meshes = [mesh for mesh in parts if len(mesh)]
@@ -112,8 +106,6 @@ def _joined(inputs: Inputs, groups: tuple[str, ...]) -> Mesh:
 
 def _parted(mesh: Mesh, budget: int) -> tuple[Mesh, Mesh]:
     """The surface, and the street furniture that stays as it is: none where it would take over half the budget."""
-    import numpy as np
-
     own = np.zeros(len(mesh), bool) if mesh.classification is None else mesh.classification > 0
     if own.sum() > budget / 2:
         own[:] = False
@@ -122,7 +114,6 @@ def _parted(mesh: Mesh, budget: int) -> tuple[Mesh, Mesh]:
 
 def deviation(source: Mesh, small: Mesh, seed: int) -> dict[str, float]:
     """Distances in metres from points of `source`, drawn evenly over its area, to `small`."""
-    import numpy as np
     import open3d as o3d
 
     rng = np.random.default_rng(seed)

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import numpy as np
 from pydantic import Field
 
 from scan2sim.pipeline.ranges import Name
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-
-if TYPE_CHECKING:
-    from scan2sim.pipeline.types import Mesh
+from scan2sim.pipeline.types import Mesh
 
 
 class DecimateParams(Params):
@@ -42,7 +40,6 @@ def decimate(inputs: Inputs, params: DecimateParams, out: Path, report: Report) 
         SettingError, UnavailableError: as `can_decimate`.
     """
     from scan2sim.pipeline.decimation import find, simplify
-    from scan2sim.pipeline.types import Mesh
 
     border_kept = find(params.backend, keep_border=params.keep_border).KEEPS_BORDER
 
@@ -64,10 +61,6 @@ def decimate(inputs: Inputs, params: DecimateParams, out: Path, report: Report) 
 
 def with_things(mesh: Mesh, things: Mesh) -> Mesh:
     """Both as one, the faces of `things` with their classes."""
-    import numpy as np
-
-    from scan2sim.pipeline.types import Mesh
-
     assert things.classification is not None
     return Mesh(
         mesh.frame,

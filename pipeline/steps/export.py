@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import numpy as np
 from pydantic import AfterValidator, Field
 
 from scan2sim.pipeline.backends import find
 from scan2sim.pipeline.classes import SURFACES
-from scan2sim.pipeline.errors import DataError, SettingError
+from scan2sim.pipeline.errors import DataError, InputError, SettingError
 from scan2sim.pipeline.extras import need
+from scan2sim.pipeline.io import image
 from scan2sim.pipeline.ranges import Coordinate, Name
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.types import Frame, Mesh
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.io.textured import Textured
-    from scan2sim.pipeline.types import Frame
 
 LISTS = {
     "plants": "plants.geojson", "plants_csv": "plants.csv",
@@ -81,12 +85,8 @@ def export(inputs: Inputs, params: ExportParams, out: Path, report: Report) -> D
         UnavailableError: a format can't be written here.
         InputError: a textured mesh is incomplete, or in another frame than the others.
     """
-    import json
-    import shutil
-
     from scan2sim.pipeline.io import textured
     from scan2sim.pipeline.io.meshes import obj
-    from scan2sim.pipeline.types import Mesh
 
     formats = _formats(params)
     shown = next((formats[name].SUFFIX for name in SHOWN if name in formats), None)
@@ -134,8 +134,6 @@ def export(inputs: Inputs, params: ExportParams, out: Path, report: Report) -> D
 
 def _common_frame(inputs: Inputs, surfaces: dict[str, Textured], solid: Any) -> Frame:
     """The frame of all meshes, which must be one."""
-    from scan2sim.pipeline.errors import InputError
-
     frame: Frame = solid.frame
     for group, surface in surfaces.items():
         if surface.mesh.frame != frame:
@@ -160,9 +158,6 @@ def _write_group(
     folder: Path, group: str, surface: Textured, params: ExportParams, formats: Iterable[Any]
 ) -> dict[str, int]:
     """Write a group's files in the formats that have some for each, and their images; triangles of every mesh file."""
-    import shutil
-
-    from scan2sim.pipeline.io import image
     from scan2sim.pipeline.io.meshes import PageNames
 
     formats = [form for form in formats if hasattr(form, "write")]
@@ -188,7 +183,6 @@ def _write_group(
 
 def _write_gazebo(world: Path, model: Path, visuals: dict[str, str], frame: Frame, params: ExportParams) -> None:
     from scan2sim.pipeline.io import sdf
-    from scan2sim.pipeline.types import Frame
 
     origin = params.world_origin or frame.origin
     x, y, z = (here - there for here, there in zip(frame.origin, origin, strict=True))
@@ -201,8 +195,6 @@ def _metadata(
     params: ExportParams, frame: Frame, surfaces: dict[str, Textured], files: dict[str, int]
 ) -> dict[str, Any]:
     """What a reader needs to put the meshes back on the map, and to check that they are whole."""
-    import numpy as np
-
     from scan2sim.pipeline.io import sdf
 
     place = sdf.Georeference.of(frame)

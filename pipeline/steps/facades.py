@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
 from pydantic import Field
 
+from scan2sim.pipeline.cells import Cell
+from scan2sim.pipeline.classes import CODE, SHOWN
+from scan2sim.pipeline.io import image
+from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.ranges import Place, Voxel
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.types import F64, UNCOLOURED, PointCloud, Trajectory
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.facades import Bools, Numbers, Rays, Wall
     from scan2sim.pipeline.planesweep import Photo
-    from scan2sim.pipeline.types import F64, PointCloud
 
 MOST = 1_000_000  # pixels at which a photo is sampled: all of a tile are kept in memory
 PIXELS = 120_000  # of the range images that tell what hides a wall
@@ -52,15 +58,12 @@ def facades(inputs: Inputs, params: FacadesParams, out: Path, report: Report) ->
     File: `made`, a `PointCloud` with normals and without colours.
     """
     import numba
-    import numpy as np
     from scipy.spatial import cKDTree
 
     from scan2sim.pipeline import facades as kernels
     from scan2sim.pipeline.borders.grid import on_grid
-    from scan2sim.pipeline.classes import CODE
     from scan2sim.pipeline.planes import detect
     from scan2sim.pipeline.planesweep import WINDOW
-    from scan2sim.pipeline.types import UNCOLOURED, PointCloud, Trajectory
 
     cloud = PointCloud.load(inputs["cloud"])
     whole = PointCloud.join([cloud, *(PointCloud.load(path) for name, path in inputs.items() if "other." in name)])
@@ -99,14 +102,8 @@ def facades(inputs: Inputs, params: FacadesParams, out: Path, report: Report) ->
 
 def photos_of(inputs: Inputs, whole: PointCloud) -> list[Photo]:
     """The photos from the ground that aren't held out, with what hides walls from them."""
-    from dataclasses import replace
-
     import cv2
-    import numpy as np
 
-    from scan2sim.pipeline.classes import SHOWN
-    from scan2sim.pipeline.io import image
-    from scan2sim.pipeline.io import views as views_io
     from scan2sim.pipeline.planesweep import Photo
     from scan2sim.pipeline.visibility import depth_map, scene
 
@@ -138,8 +135,6 @@ def raised(wall: Wall, rays: Rays, own: Numbers, through: Bools, photos: Callabl
 
     Photos are compared for walls that somewhere end where the scanner's rays do.
     """
-    import numpy as np
-
     from scan2sim.pipeline.facades import ceiling, highest, solid
     from scan2sim.pipeline.planesweep import BELOW, WINDOW, evidence
 
@@ -162,8 +157,6 @@ def raised(wall: Wall, rays: Rays, own: Numbers, through: Bools, photos: Callabl
 
 def filled(wall: Wall, cells: Bools) -> F64:
     """(N, 3) places that fill cells of a wall: four in each, so that its edges are told from their outermost."""
-    import numpy as np
-
     row, column = np.nonzero(cells)
     quarters = [wall.places(row + r, column + c) for r in (-0.25, 0.25) for c in (-0.25, 0.25)]
     return np.concatenate(quarters)
@@ -171,10 +164,6 @@ def filled(wall: Wall, cells: Bools) -> F64:
 
 def inland(xyz: F64, origin: tuple[float, ...], params: FacadesParams) -> Bools:
     """(N,) which local places (N, 3) aren't near a border of tiles."""
-    import numpy as np
-
-    from scan2sim.pipeline.cells import Cell
-
     if params.seed is None or not params.neighbours:
         return np.ones(len(xyz), bool)
     return np.asarray(Cell(params.seed, params.neighbours).outside(xyz[:, :2] + np.asarray(origin[:2])) < -INLAND)

@@ -7,19 +7,20 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
+import numpy.typing as npt
 from pydantic import Field
 
+from scan2sim.pipeline.cells import Cell
+from scan2sim.pipeline.classes import CODE, NOISE, group_of
 from scan2sim.pipeline.ranges import Place
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.types import F32, Frame, Mesh, PointCloud, Trajectory
 
 if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
     from scan2sim.pipeline.furniture import Thing
     from scan2sim.pipeline.plates import Plate
     from scan2sim.pipeline.standing import Columns
-    from scan2sim.pipeline.types import F32, Frame, Mesh
 
 CELL = 0.5  # metres, of the ground's heights
 BORDER = 4.0  # metres to either side of a border of tiles: what stands there stays with the surfaces, alike in both
@@ -51,13 +52,8 @@ def furniture(inputs: Inputs, params: FurnitureParams, out: Path, report: Report
     tile's CRS, kind, height above the ground, radius, and of plates the way that they face (of lamps, that they
     reach), clockwise from the CRS's north; `plates`, JSON list of all plates, local metres.
     """
-    import numpy as np
-
-    from scan2sim.pipeline.cells import Cell
-    from scan2sim.pipeline.classes import CODE, NOISE, group_of
     from scan2sim.pipeline.furniture import find
     from scan2sim.pipeline.standing import Columns
-    from scan2sim.pipeline.types import PointCloud, Trajectory
 
     cloud, path = PointCloud.load(inputs["cloud"]), Trajectory.load(inputs["path"])
     assert cloud.classification is not None
@@ -115,7 +111,6 @@ def listed(out: Path, crs: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, 
 
 def heights(ground: F32, xyz: F32) -> F32:
     """(N,) metres of points (N, 3) above the lowest ground (M, 3) near them."""
-    import numpy as np
     from scipy import ndimage
 
     from scan2sim.pipeline.heightfield import Raster
@@ -129,8 +124,6 @@ def heights(ground: F32, xyz: F32) -> F32:
 
 def _held(columns: Columns, things: list[Thing]) -> npt.NDArray[np.int64]:
     """Indices of the points that are one of the things' own."""
-    import numpy as np
-
     xyz = columns.xyz
     near = [columns.near(thing.stem.middle, 4.0) for thing in things]
     own = [index[thing.held(xyz[index])] for index, thing in zip(near, things, strict=True)]
@@ -139,10 +132,7 @@ def _held(columns: Columns, things: list[Thing]) -> npt.NDArray[np.int64]:
 
 def _mesh(frame: Frame, things: list[Thing]) -> Mesh:
     """All of the things' parts, each face with its class."""
-    import numpy as np
-
     from scan2sim.pipeline import primitives
-    from scan2sim.pipeline.types import Mesh
 
     parts = [part for thing in things for part in thing.meshes()]
     vertices, faces = primitives.join([triangles for triangles, _ in parts])
@@ -154,8 +144,6 @@ def _mesh(frame: Frame, things: list[Thing]) -> Mesh:
 
 def _row(thing: Thing, frame: Frame) -> dict[str, Any]:
     """What the lists tell of a thing."""
-    import numpy as np
-
     x, y, z = frame.to_crs(thing.foot[None])[0].tolist()
     row: dict[str, Any] = {"x": round(x, 3), "y": round(y, 3), "z": round(z, 3), "kind": thing.kind}
     row |= {"height_m": round(thing.height, 2), "radius_m": round(thing.stem.thickness, 3)}
@@ -168,8 +156,6 @@ def _row(thing: Thing, frame: Frame) -> dict[str, Any]:
 
 def of_plate(plate: Plate) -> dict[str, Any]:
     """What the lists tell of a plate."""
-    import numpy as np
-
     heading = float(np.degrees(np.arctan2(plate.normal[0], plate.normal[1]))) % 360
     size = {"plate_width_m": round(plate.width, 2), "plate_height_m": round(plate.height, 2)}
     return {"heading_deg": round(heading, 1), "shape": plate.shape, **size}

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
 from pydantic import Field
 
+from scan2sim.pipeline.cells import Cell
 from scan2sim.pipeline.classes import GROUPS, SURFACES, group_of
 from scan2sim.pipeline.ranges import Place
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-
-if TYPE_CHECKING:
-    from scan2sim.pipeline.types import F32, Mesh, PointCloud
+from scan2sim.pipeline.types import F32, Mesh, PointCloud
 
 FAR = 1.0  # metres from the mesh beyond which one point in twenty is worth a warning
 
@@ -39,11 +39,6 @@ def geometry(inputs: Inputs, params: GeometryParams, out: Path, report: Report) 
     the nearest place on the mesh); `truth_mean_m` (from the mesh to the true surface of its class). `made_up` is the
     share of the mesh's area that lies nearer to points that were made up (`made.*`) than to any of the cloud's.
     """
-    import numpy as np
-
-    from scan2sim.pipeline.cells import Cell
-    from scan2sim.pipeline.types import Mesh, PointCloud
-
     facts: dict[str, dict[str, Any]] = {}
     warnings: list[str] = []
     truth = Mesh.load(inputs["truth.mesh"]) if "truth.mesh" in inputs else None
@@ -111,8 +106,6 @@ def truth_error(mesh: Mesh, truth: Mesh, group: str, samples: int, *, whatever: 
         samples: how many.
         whatever: the true surface of any class counts, not just of the mesh's.
     """
-    import numpy as np
-
     assert truth.classification is not None
     if group not in GROUPS:
         return None  # no truth has what is parked
@@ -127,7 +120,6 @@ def truth_error(mesh: Mesh, truth: Mesh, group: str, samples: int, *, whatever: 
 
 def distances(points: F32, mesh: Mesh) -> F32:
     """(N,) metres from points (N, 3) to the nearest place on the mesh."""
-    import numpy as np
     import open3d as o3d
 
     scene = o3d.t.geometry.RaycastingScene()
@@ -137,8 +129,6 @@ def distances(points: F32, mesh: Mesh) -> F32:
 
 def spread(mesh: Mesh, count: int, seed: int = 0) -> F32:
     """(count, 3) points drawn evenly from the mesh's surface."""
-    import numpy as np
-
     random = np.random.default_rng(seed)
     area = np.cumsum(mesh.face_area, dtype=np.float64)
     face = np.searchsorted(area, random.uniform(0, area[-1], count)).clip(max=len(mesh) - 1)

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
+import numpy.typing as npt
 from pydantic import Field
 
+from scan2sim.pipeline.cells import Cell
+from scan2sim.pipeline.classes import CODE
 from scan2sim.pipeline.ranges import Place
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.steps.overlap import nearest
+from scan2sim.pipeline.types import UNCOLOURED, Frame, PointCloud
 
 if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
     from scan2sim.pipeline.heightfield import Raster
-    from scan2sim.pipeline.types import Frame, PointCloud
 
     Bools = npt.NDArray[np.bool_]
 
@@ -66,12 +69,8 @@ def ground(inputs: Inputs, params: GroundParams, out: Path, report: Report) -> D
     clouds (`terrain.NAME` and so on) are looked at as well: both tiles fill a hole on their border alike.
     File: `made`, a `PointCloud` with normals, as dense as the ground's own points are.
     """
-    import numpy as np
-
     from scan2sim.pipeline.borders.grid import on_grid
-    from scan2sim.pipeline.classes import CODE
     from scan2sim.pipeline.heightfield import Raster, closed, grown, membrane, spacing
-    from scan2sim.pipeline.types import UNCOLOURED, PointCloud
 
     terrain = united(inputs, params, "terrain")
     above = [united(inputs, params, part) for part in ("building", "vegetation", "rest") if part in inputs]
@@ -119,7 +118,6 @@ def gaps(has: Bools, stood: Bools, cell: float, gap: float) -> Bools:
         cell: metres.
         gap: metres; half the width that gaps may have.
     """
-    import numpy as np
     from scipy import ndimage
 
     from scan2sim.pipeline.heightfield import closed
@@ -136,8 +134,6 @@ def stood(inputs: Inputs, raster: Raster, frame: Frame) -> Bools:
 
     They are of `things`, and of the neighbours' `things.NAME`.
     """
-    import numpy as np
-
     from scan2sim.pipeline.heightfield import drawn, grown
     from scan2sim.pipeline.remains import outlines
 
@@ -148,18 +144,12 @@ def stood(inputs: Inputs, raster: Raster, frame: Frame) -> Bools:
 
 def from_above(building: PointCloud) -> bool:
     """Whether a scanner saw more of the buildings' roofs than of their walls; so it is without buildings, too."""
-    import numpy as np
-
     assert building.normal is not None
     return len(building) == 0 or float(np.mean(np.abs(building.normal[:, 2]) > FLAT)) >= 0.5
 
 
 def near_cell(xy: object, params: MadeUpParams, cloud: PointCloud) -> object:
     """(N,) which local places (N, 2) lie in the tile's cell or within its buffer."""
-    import numpy as np
-
-    from scan2sim.pipeline.cells import Cell
-
     assert params.seed is not None
     world = np.asarray(xy) + np.asarray(cloud.frame.origin[:2])
     return Cell(params.seed, params.neighbours).outside(world) <= params.buffer
@@ -167,13 +157,7 @@ def near_cell(xy: object, params: MadeUpParams, cloud: PointCloud) -> object:
 
 def united(inputs: Inputs, params: MadeUpParams, part: str) -> PointCloud:
     """The cloud `part` with what the neighbours' clouds `part.NAME` have where they own it, in the tile's own frame."""
-    from dataclasses import replace
-
-    import numpy as np
-
     from scan2sim.pipeline.borders.grid import on_grid
-    from scan2sim.pipeline.steps.overlap import nearest
-    from scan2sim.pipeline.types import PointCloud
 
     own = PointCloud.load(inputs[part])
     given = sorted(name for name in params.neighbours if f"{part}.{name}" in inputs)

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 from pydantic import Field
 
+from scan2sim.pipeline import classes
 from scan2sim.pipeline.errors import DataError
 from scan2sim.pipeline.ranges import Coordinate
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.types import Frame, PointCloud
 
 MIN_POINTS = 1000
 WIDEST = 5000.0
@@ -33,13 +37,7 @@ def ingest(inputs: Inputs, params: IngestParams, out: Path, report: Report) -> D
     Raises:
         DataError: fewer than 1000 points in all, or points that are further apart than 5 km.
     """
-    from dataclasses import replace
-
-    import numpy as np
-
-    from scan2sim.pipeline import classes
     from scan2sim.pipeline.io import clouds
-    from scan2sim.pipeline.types import Frame, PointCloud
 
     frame = Frame(params.crs, params.origin, params.unit)
     parts: list[PointCloud] = []

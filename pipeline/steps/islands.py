@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 from pydantic import Field
 
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.types import Mesh
 
 
 class IslandsParams(Params):
@@ -21,11 +23,8 @@ class IslandsParams(Params):
 
 def islands(inputs: Inputs, params: IslandsParams, out: Path, report: Report) -> Done:
     """Remove the pieces of `mesh` (faces connected by edges) that are smaller than `min_area`."""
-    import numpy as np
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
-
-    from scan2sim.pipeline.types import Mesh
 
     mesh = Mesh.load(inputs["mesh"])
     n = len(mesh.vertices)

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import numpy as np
+import numpy.typing as npt
 from pydantic import Field
 
+from scan2sim.pipeline.cells import Seed
 from scan2sim.pipeline.step import Done, Inputs, Report, Step
 from scan2sim.pipeline.steps.clip import CellParams
-
-if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
-    from scan2sim.pipeline.cells import Seed
-    from scan2sim.pipeline.types import F64
+from scan2sim.pipeline.types import F64, PointCloud
 
 
 class OverlapParams(CellParams):
@@ -38,12 +35,7 @@ def overlap(inputs: Inputs, params: OverlapParams, out: Path, report: Report) ->
     their border. Where the nearest tile's cloud is not given, the tile's own points stand in. Coordinates are
     rounded to `pipeline.borders.grid.GRID`: the same in every tile.
     """
-    from dataclasses import replace
-
-    import numpy as np
-
     from scan2sim.pipeline.borders.grid import on_grid
-    from scan2sim.pipeline.types import PointCloud
 
     seeds = dict(sorted({params.name: params.seed, **params.neighbours}.items()))
     given = [name for name in seeds if name == params.name or f"cloud.{name}" in inputs]
@@ -70,8 +62,6 @@ def overlap(inputs: Inputs, params: OverlapParams, out: Path, report: Report) ->
 
 def nearest(xy: F64, seeds: list[Seed]) -> npt.NDArray[np.int64]:
     """(N,) index of the nearest seed to each world place (N, 2), the first of several as near."""
-    import numpy as np
-
     index, least = np.zeros(len(xy), np.int64), np.full(len(xy), np.inf)
     for i, seed in enumerate(seeds):
         square = ((xy - seed) ** 2).sum(axis=1)

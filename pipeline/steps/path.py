@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 from pydantic import ConfigDict
 
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.types import Trajectory
 
 
 class PathParams(Params):
@@ -25,10 +27,6 @@ class PathParams(Params):
 
 def path(inputs: Inputs, params: PathParams, out: Path, report: Report) -> Done:
     """Write the path as a `Trajectory`, ordered by time; times are NaN where unknown."""
-    import numpy as np
-
-    from scan2sim.pipeline.types import Trajectory
-
     positions = np.array(params.positions, np.float64)
     times = np.full(len(positions), np.nan) if params.times is None else np.array(params.times)
     order = np.argsort(times, kind="stable")

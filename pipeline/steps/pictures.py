@@ -15,11 +15,12 @@ from pydantic import Field
 
 from scan2sim.pipeline.classes import SURFACES, colour_of
 from scan2sim.pipeline.io import image
+from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.types import F64, U8, Camera, Mesh, PointCloud, Trajectory
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.render import Image
-    from scan2sim.pipeline.types import F64, U8, Camera, PointCloud
 
 GROUP_RGB = {
     "terrain": (176, 158, 138),
@@ -76,8 +77,6 @@ def pictures(inputs: Inputs, params: PicturesParams, out: Path, report: Report) 
     path, that is a driver's eye, else a bird's that has the whole tile before it.
     """
     from scan2sim.pipeline import render
-    from scan2sim.pipeline.io import views as views_io
-    from scan2sim.pipeline.types import Mesh, PointCloud, Trajectory
 
     folder = out / "pictures"
     folder.mkdir()

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
+import numpy as np
 from pydantic import Field
 
+from scan2sim.pipeline.cells import Cell
 from scan2sim.pipeline.ranges import Place, Voxel
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-
-if TYPE_CHECKING:
-    from scan2sim.pipeline.types import F64, Mesh
+from scan2sim.pipeline.types import F64, Mesh, PointCloud
 
 KEPT, FADED = 2.5, 5.0  # voxels from a border up to which Poisson's surface stays, and up to which it partly does
 
@@ -42,11 +42,8 @@ def planes(inputs: Inputs, params: PlanesParams, out: Path, report: Report) -> D
     where one ends before a parallel one (a window's reveal), it gets the face between them; where one ends and nothing
     is behind, none of `other.*` either, so does the mesh.
     """
-    import numpy as np
-
     from scan2sim.pipeline import extents, sharpen
     from scan2sim.pipeline.planes import Planes, detect
-    from scan2sim.pipeline.types import Mesh, PointCloud
 
     mesh, cloud, voxel = Mesh.load(inputs["mesh"]), PointCloud.load(inputs["cloud"]), params.voxel
     assert cloud.normal is not None
@@ -105,10 +102,7 @@ def inland(mesh: Mesh, params: PlanesParams) -> F64:
 
     Beyond a tile's buffer its planes' points are missing, so its planes aren't quite the neighbour's.
     """
-    import numpy as np
-
     from scan2sim.pipeline.borders.grid import world
-    from scan2sim.pipeline.cells import Cell
 
     share = np.ones(len(mesh.vertices))
     if params.seed is not None and params.neighbours:

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import numpy as np
+import numpy.typing as npt
 from pydantic import Field
 
+from scan2sim.pipeline.cells import Cell
 from scan2sim.pipeline.ranges import Place
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-
-if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
-    from scan2sim.pipeline.types import F32
+from scan2sim.pipeline.types import F32, PointCloud
 
 CELL = 0.25  # metres, of the canopy raster
 
@@ -42,11 +39,7 @@ def plants(inputs: Inputs, params: PlantsParams, out: Path, report: Report) -> D
     Place and base are in the tile's CRS; height and crown radius (of the circle with the crown's
     area) in metres. Crowns are grown from the tops by watershed (Vincent and Soille 1991).
     """
-    import numpy as np
-
-    from scan2sim.pipeline.cells import Cell
     from scan2sim.pipeline.io import geojson
-    from scan2sim.pipeline.types import PointCloud
 
     cloud, ground = PointCloud.load(inputs["vegetation"]), PointCloud.load(inputs["terrain"])
     found = crowns(cloud.xyz, ground.xyz, params) if len(cloud) else np.empty((0, 5))
@@ -70,7 +63,6 @@ def plants(inputs: Inputs, params: PlantsParams, out: Path, report: Report) -> D
 
 def crowns(xyz: F32, ground: F32, params: PlantsParams) -> npt.NDArray[np.float64]:
     """(P, 5) x, y, z of the base, height, crown radius: metres, local."""
-    import numpy as np
     from scipy import ndimage
     from scipy.spatial import cKDTree
 

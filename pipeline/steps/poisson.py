@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import numpy as np
 from pydantic import Field
 
 from scan2sim.pipeline.errors import StepError
 from scan2sim.pipeline.ranges import Seconds, Voxel
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-
-if TYPE_CHECKING:
-    from scan2sim.pipeline.types import F32, I32
+from scan2sim.pipeline.types import F32, I32, Mesh, PointCloud
 
 MIN_POINTS = 50
 MARGIN = 1.02  # the octree's cube must be a little larger than the cloud
@@ -51,10 +49,7 @@ def poisson(inputs: Inputs, params: PoissonParams, out: Path, report: Report) ->
     Raises:
         StepError: all three failed.
     """
-    import numpy as np
-
     from scan2sim.pipeline import isolate
-    from scan2sim.pipeline.types import Mesh, PointCloud
 
     cloud = PointCloud.load(inputs["cloud"])
     if "made" in inputs and len(cloud) and len(made := PointCloud.load(inputs["made"])):
@@ -95,8 +90,6 @@ def poisson(inputs: Inputs, params: PoissonParams, out: Path, report: Report) ->
 
 def bounds(xyz: F32, origin: tuple[float, float, float], block: float) -> F32:
     """(2, 3) opposite corners of a cube around the points, its middle at a multiple of `block` in the world."""
-    import numpy as np
-
     low, high = xyz.min(axis=0) + np.asarray(origin), xyz.max(axis=0) + np.asarray(origin)
     middle = np.rint((low + high) / 2 / block) * block
     half = np.maximum(high - middle, middle - low).max()
@@ -113,7 +106,6 @@ def reconstruct(
     xyz: F32, normal: F32, depth: int, scale: float, point_weight: float, threads: int
 ) -> tuple[F32, I32, F32]:
     """Screened Poisson by Open3D: vertices (V, 3), faces (F, 3), density (V,) as octree depth; 0 threads: all cores."""
-    import numpy as np
     import open3d as o3d
 
     points = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(xyz.astype(np.float64)))

@@ -6,14 +6,16 @@ import base64
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from pydantic import Field
 
 from scan2sim.pipeline.classes import SURFACES
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.steps.pictures import bird_pose, bounds, driver_pose, whole_pose
+from scan2sim.pipeline.types import F64, Trajectory
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.io.textured import Textured
-    from scan2sim.pipeline.types import F64
 
 CALL = b"scan2simWorld"  # the function of flows/pages/walk.js that is given the GLB
 
@@ -39,13 +41,9 @@ def preview(inputs: Inputs, params: PreviewParams, out: Path, report: Report) ->
     `bytes`, and where eyes are at first, `walk` and `turn`: [eye, target], local metres; `start` is one of both, as in
     the report's first picture.
     """
-    import numpy as np
-
     from scan2sim.pipeline import render
     from scan2sim.pipeline.io import textured
     from scan2sim.pipeline.io.meshes.glb import write_world
-    from scan2sim.pipeline.steps.pictures import bird_pose, bounds, driver_pose, whole_pose
-    from scan2sim.pipeline.types import Trajectory
 
     read = {group: textured.read(inputs[group]) for group in SURFACES if group in inputs}
     surfaces: dict[str, Textured] = {group: surface for group, surface in read.items() if surface is not None}

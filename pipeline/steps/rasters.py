@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+import numpy.typing as npt
 from pydantic import Field
 
 from scan2sim.pipeline.classes import SURFACES
@@ -14,9 +16,6 @@ from scan2sim.pipeline.ranges import Name, Texel
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 
 if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
     from scan2sim.pipeline.render import Image, Renderer
 
 BAND = 2_000_000
@@ -51,8 +50,6 @@ def rasters(inputs: Inputs, params: RastersParams, out: Path, report: Report) ->
         DataError: no group has a face.
         SettingError: the raster would be too large.
     """
-    import numpy as np
-
     from scan2sim.pipeline import render
     from scan2sim.pipeline.io import geotiff
     from scan2sim.pipeline.io.crs import LOCAL

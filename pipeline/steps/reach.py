@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
+import numpy as np
+import numpy.typing as npt
 from pydantic import Field
 
+from scan2sim.pipeline.classes import GROUPS, group_of
+from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.files import pass_on
 from scan2sim.pipeline.ranges import Voxel
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.steps.voxel import sample, voxel_groups
+from scan2sim.pipeline.types import F64, PointCloud, Trajectory, View
 
-if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
-    from scan2sim.pipeline.types import F64, PointCloud, Trajectory, View
-
-    Bools = npt.NDArray[np.bool_]
+Bools = npt.NDArray[np.bool_]
 
 PATCH = 2.0
 """Voxels: a photo is asked for a pixel on every square of this side. Coarser, all that a voxel can show is a blur."""
@@ -53,14 +54,6 @@ def reach(inputs: Inputs, params: ReachParams, out: Path, report: Report) -> Don
     (`HIGH`). Facts: `points` kept, `left_out` points, about `left_out_m2` of surface, and `far_m`, how far from the
     path the farthest point is that is kept.
     """
-    from dataclasses import replace
-
-    import numpy as np
-
-    from scan2sim.pipeline.io import views as views_io
-    from scan2sim.pipeline.steps.voxel import sample, voxel_groups
-    from scan2sim.pipeline.types import PointCloud, Trajectory
-
     file = out / "cloud.npz"
     if "path" not in inputs or (params.limit == "auto" and "views" not in inputs):
         pass_on(inputs["cloud"], file)
@@ -102,9 +95,6 @@ def reach(inputs: Inputs, params: ReachParams, out: Path, report: Report) -> Don
 
 def _worth(thin: PointCloud, views: Sequence[View], path: Trajectory, size: float, report: Report) -> Bools:
     """(N,) which points photos show well enough, or lie by the path, or belong to what does."""
-    import numpy as np
-
-    from scan2sim.pipeline.classes import GROUPS, group_of
     from scan2sim.pipeline.normals import oriented_normals
     from scan2sim.pipeline.reach import along, around, closed, finest
 
@@ -126,7 +116,6 @@ def _worth(thin: PointCloud, views: Sequence[View], path: Trajectory, size: floa
 
 def _above(thin: PointCloud, path: F64) -> float:
     """Metres of the path above the ground beneath, in the middle."""
-    import numpy as np
     from scipy.spatial import cKDTree
 
     some = path[:: max(1, len(path) // 1000)]

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
 
 from scan2sim.pipeline.classes import CODE, GROUPS, NOISE, UNKNOWN, group_of, known, name_of
 from scan2sim.pipeline.errors import DataError
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-
-if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
-    from scan2sim.pipeline.types import PointCloud
+from scan2sim.pipeline.types import PointCloud
 
 FURNITURE, VEHICLE = len(GROUPS) + 1, len(GROUPS) + 2
 """Of a point, beside the groups' numbers: it is street furniture's."""
@@ -47,10 +46,6 @@ def split(inputs: Inputs, params: SplitParams, out: Path, report: Report) -> Don
     Raises:
         DataError: no point belongs to any surface.
     """
-    import numpy as np
-
-    from scan2sim.pipeline.types import PointCloud
-
     cloud = PointCloud.load(inputs["cloud"])
     assert cloud.classification is not None
     group = group_of()[cloud.classification]
@@ -98,10 +93,6 @@ def split(inputs: Inputs, params: SplitParams, out: Path, report: Report) -> Don
 
 def parked(cloud: PointCloud, things: Path) -> npt.NDArray[np.bool_]:
     """(N,) which points of the class vehicle are in a box of `things` (GeoJSON of the step) that didn't move."""
-    import json
-
-    import numpy as np
-
     inside = np.zeros(len(cloud), bool)
     vehicle = np.flatnonzero(cloud.classification == CODE["vehicle"])
     for feature in json.loads(things.read_text(encoding="utf-8"))["features"]:

@@ -5,13 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from scan2sim.pipeline.ranges import Reach, Voxel
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.types import F32, Mesh, PointCloud
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
-    from scan2sim.pipeline.types import F32
 
 MISSION_VOXEL = 0.10  # metres, the voxels that the limits are made for (D3.2)
 FULL_VOXELS = 1.4  # mean distance to six neighbours on a surface whose every voxel holds a point, in voxels
@@ -38,10 +40,7 @@ class TrimParams(Params):
 
 def trim(inputs: Inputs, params: TrimParams, out: Path, report: Report) -> Done:
     """Keep the triangles of `mesh` that the points of `cloud`, or those made up (`made`, optional), bear out."""
-    import numpy as np
     from scipy.spatial import cKDTree
-
-    from scan2sim.pipeline.types import Mesh, PointCloud
 
     mesh, cloud = Mesh.load(inputs["mesh"]), PointCloud.load(inputs["cloud"])
     if len(mesh) == 0:
@@ -77,8 +76,6 @@ def trim(inputs: Inputs, params: TrimParams, out: Path, report: Report) -> Done:
 
 def _spacing(tree: cKDTree, xyz: F32) -> float:
     """Median over points of the mean distance to six neighbours, metres, from a sample of the points."""
-    import numpy as np
-
     some = xyz[:: max(1, len(xyz) // 20_000)]
     distance, _ = tree.query(some, k=min(7, len(xyz)), workers=-1)
     return float(np.median(distance[:, 1:].mean(axis=1)))

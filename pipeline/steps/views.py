@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
+import numpy as np
 from pydantic import AfterValidator, Field
 
 from scan2sim.pipeline.errors import DataError, InputError
+from scan2sim.pipeline.io import image
+from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-
-if TYPE_CHECKING:
-    from scan2sim.pipeline.types import F32, View
+from scan2sim.pipeline.types import F32, PointCloud, View
 
 REACH = 100.0  # metres; a photo further than this from every point sees nothing of the tile
 MARGIN = 8  # pixels of an orthophoto around the points
@@ -49,13 +51,6 @@ def views(inputs: Inputs, params: ViewsParams, out: Path, report: Report) -> Don
         InputError: a photo's size is not its camera's; no photo can be read at all.
         DataError: no photo sees any point of the cloud.
     """
-    from dataclasses import replace
-
-    import numpy as np
-
-    from scan2sim.pipeline.io import views as views_io
-    from scan2sim.pipeline.types import PointCloud
-
     clouds = [PointCloud.load(path).xyz for name, path in inputs.items() if name.startswith("cloud")]
     points = np.concatenate(clouds)
     points = points[:: max(1, len(points) // SAMPLE)]
@@ -99,11 +94,6 @@ def views(inputs: Inputs, params: ViewsParams, out: Path, report: Report) -> Don
 
 def _cut(view: View, points: F32, folder: Path, index: int) -> View:
     """An orthophoto cut to what it shows of the points: a survey's may cover a town."""
-    from dataclasses import replace
-
-    import numpy as np
-
-    from scan2sim.pipeline.io import image
     from scan2sim.pipeline.projection import pixels
 
     camera = view.camera
@@ -137,8 +127,6 @@ def _problem(view: View) -> str | None:
     Raises:
         InputError: it opens, but is not of its camera's size.
     """
-    from scan2sim.pipeline.io import image
-
     wanted = view.camera.width, view.camera.height
     part = view.camera.model == "orthographic"  # what `_cut` reads
     for path in (view.photo, view.mask):
@@ -161,8 +149,6 @@ def _problem(view: View) -> str | None:
 
 def _sees(view: View, points: F32) -> bool:
     """Whether any of the points (N, 3) is inside the image and within reach."""
-    import numpy as np
-
     from scan2sim.pipeline.projection import pixels
 
     if view.camera.model != "orthographic":

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import numpy as np
+import numpy.typing as npt
 from pydantic import Field
 
 from scan2sim.pipeline.ranges import Voxel
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.types import F32, PointCloud, Trajectory
 
-if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
-    from scan2sim.pipeline.types import F32, PointCloud
-
-    Groups = tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]
+Groups = tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]
 
 
 class VoxelParams(Params):
@@ -37,10 +34,7 @@ def voxel(inputs: Inputs, params: VoxelParams, out: Path, report: Report) -> Don
     Without a path (an airborne cloud, say) normals point up, and those of walls away from what
     stands behind them.
     """
-    import numpy as np
-
     from scan2sim.pipeline.normals import oriented_normals
-    from scan2sim.pipeline.types import PointCloud, Trajectory
 
     cloud = PointCloud.load(inputs["cloud"])
     n = len(cloud)
@@ -62,10 +56,6 @@ def sample(cloud: PointCloud, size: float, groups: Groups | None = None) -> Poin
     Means are rounded to `pipeline.borders.grid.GRID`, so that tiles which know the same points around their border, in
     the same order (`overlap`), have the same samples there.
     """
-    from dataclasses import replace
-
-    import numpy as np
-
     from scan2sim.pipeline.borders.grid import on_grid
 
     if len(cloud) == 0:
@@ -98,8 +88,6 @@ def voxel_groups(xyz: F32, size: float) -> Groups:
     Returns:
         order (N,) int64 into `xyz`, stable within a voxel; starts (V,) int64 into `order`.
     """
-    import numpy as np
-
     from scan2sim.pipeline.ordering import first_of_each, ordered
 
     code = np.zeros(len(xyz), np.int64)

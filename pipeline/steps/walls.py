@@ -5,15 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 from pydantic import Field
 
+from scan2sim.pipeline.classes import CODE
 from scan2sim.pipeline.step import Done, Inputs, Report, Step
 from scan2sim.pipeline.steps.ground import FLAT, MadeUpParams, from_above, near_cell, united
+from scan2sim.pipeline.types import F32, F64, PointCloud
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.heightfield import Raster
     from scan2sim.pipeline.outlines import Places
-    from scan2sim.pipeline.types import F32, F64, PointCloud
 
 DENSE = 0.2  # metres between points of a wall
 SUNK = 0.3  # metres that walls reach into the ground
@@ -48,11 +50,8 @@ def walls(inputs: Inputs, params: WallsParams, out: Path, report: Report) -> Don
     up of it (`ground`); neighbours' clouds (`building.NAME` and so on) are looked at as by the step `ground`.
     File: `made`, a `PointCloud` with normals.
     """
-    import numpy as np
-
     from scan2sim.pipeline.heightfield import Raster, spacing
     from scan2sim.pipeline.outlines import Places, rings, roofs
-    from scan2sim.pipeline.types import PointCloud
 
     building = united(inputs, params, "building")
     floor = united(inputs, params, "terrain").xyz
@@ -103,7 +102,6 @@ class Heights:
     """
 
     def __init__(self, raster: Raster, top: F64, component: object, floor: F32) -> None:
-        import numpy as np
         from scipy.spatial import cKDTree
 
         self._raster, self._component = raster, np.asarray(component)
@@ -116,7 +114,6 @@ class Heights:
 
     def columns(self, places: Places, roof: int, least: float) -> tuple[F64, F64]:
         """Points (N, 3) of the walls at `places`, and their normals: below roof number `roof`, 0: below any."""
-        import numpy as np
         from scipy import ndimage
         from scipy.spatial import cKDTree
 
@@ -159,7 +156,6 @@ def _given(inputs: Inputs, building: PointCloud) -> list[F64]:
 
 def _apart(places: Places, given: F64) -> Places:
     """The places that no given footprint is beside."""
-    import numpy as np
     from scipy.spatial import cKDTree
 
     from scan2sim.pipeline.outlines import Places
@@ -170,12 +166,9 @@ def _apart(places: Places, given: F64) -> Places:
 
 def _cloud(xyz: F64, normal: F64, building: PointCloud, params: WallsParams) -> PointCloud:
     """The made-up points that no real one of the building is near to, and that are the tile's."""
-    import numpy as np
     from scipy.spatial import cKDTree
 
     from scan2sim.pipeline.borders.grid import on_grid
-    from scan2sim.pipeline.classes import CODE
-    from scan2sim.pipeline.types import PointCloud
 
     keep = ~np.isfinite(cKDTree(building.xyz).query(xyz, distance_upper_bound=SEEN * DENSE)[0])
     if params.seed is not None:
@@ -189,8 +182,6 @@ def _cloud(xyz: F64, normal: F64, building: PointCloud, params: WallsParams) -> 
 
 def _colour(building: PointCloud) -> F64:
     """(3,) of the walls' own points, where there are some, else a plaster's."""
-    import numpy as np
-
     assert building.normal is not None and building.rgb is not None
     steep = np.abs(building.normal[:, 2]) < 0.3
     return np.median(building.rgb[steep], axis=0) if steep.sum() >= 100 else np.array(PLASTER, np.float64)

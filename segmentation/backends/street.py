@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from scan2sim.pipeline import extras
 from scan2sim.pipeline.channels import COUNT
@@ -73,8 +76,6 @@ def save(network: StreetNet, path: Path, metadata: dict[str, object]) -> None:
 
 def _export(network: StreetNet, path: Path, facts: dict[str, Any]) -> None:
     """Write the network as ONNX, as `backends.onnx` reads it; it normalises photos itself."""
-    import warnings
-
     import onnx as files
     import torch
 
@@ -132,7 +133,6 @@ class Network:
 
     def probabilities(self, seen: U8) -> F32:
         """See `segmentation.backends.Network`."""
-        import numpy as np
         import torch
 
         with torch.inference_mode():

@@ -15,14 +15,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from pydantic import Field
 
+from scan2sim.pipeline.io import image
 from scan2sim.pipeline.io.files import pass_on
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.types import F32
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.io.textured import Textured
-    from scan2sim.pipeline.types import F32
     from scan2sim.texturing.borders.correspondences import Border
 
 NEIGHBOUR = "neighbour."
@@ -48,8 +50,6 @@ def level(inputs: Inputs, params: LevelParams, out: Path, report: Report) -> Don
     Raises:
         InputError: a page can't be read.
     """
-    import numpy as np
-
     from scan2sim.pipeline.io import textured
     from scan2sim.texturing.borders import correspondences, sampling
 
@@ -80,9 +80,6 @@ def _level_pages(
     Args:
         shown, target: (P, 3) grey levels of the places, as they are and as they are to be.
     """
-    import numpy as np
-
-    from scan2sim.pipeline.io import image
     from scan2sim.texturing import texels
     from scan2sim.texturing.borders import fading, sampling
 
@@ -113,8 +110,6 @@ def _level_pages(
 
 def _facts(border: Border, names: Sequence[str], shown: F32, target: F32, after: F32) -> dict[str, Any]:
     """Metres of border and the colour step there, grey levels, before and after (both tiles being levelled)."""
-    import numpy as np
-
     before, left = np.abs(shown[1:] - shown[0]), 2 * np.abs(after - target)
     neighbours = {
         name: {

@@ -5,12 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from scan2sim.pipeline.cells import Cell
 from scan2sim.pipeline.classes import SURFACES
 from scan2sim.pipeline.step import Done, Inputs, Report, Step
 from scan2sim.pipeline.steps.clip import CellParams
 
 if TYPE_CHECKING:
-    from scan2sim.pipeline.cells import Cell
     from scan2sim.pipeline.io.textured import Textured
 
 SPACING = 0.01
@@ -59,8 +61,6 @@ def colour_step(a: Textured, b: Textured) -> tuple[float, float, float]:
     Raises:
         InputError: a page can't be read.
     """
-    import numpy as np
-
     from scan2sim.texturing.borders.correspondences import rim, shared_border
     from scan2sim.texturing.borders.sampling import colours
 
