@@ -10,10 +10,10 @@ OUT ?= demo-out
 demo: .venv/.installed
 	$(BIN)/scan2sim run $(TILE) --out $(OUT) --hold-out 8 --set segment.overwrite=true
 
-test: .venv/.installed-dev lint
+test: .venv/.installed-dev .venv-ros lint
 	$(BIN)/python -m pytest -m "not slow" -n 2 --dist loadfile
 
-test-all: .venv/.installed-dev lint
+test-all: .venv/.installed-dev .venv-ros lint
 	$(BIN)/python -m pytest
 
 lint: .venv/.installed-dev
@@ -30,6 +30,12 @@ sample-tile: .venv/.installed
 # both install what the system lacks, where they may: see deploy/install.py
 .venv/.installed: pyproject.toml constraints.txt
 	@$(or $(PYTHON),$(error $(NO_PYTHON))) deploy/install.py
+	@touch $@
+
+# rclpy, in an environment of its own; tests that want it are skipped where there are no wheels for this Python
+.venv-ros: tests/services/ros-requirements.txt
+	@$(PYTHON) -m venv $@ && $@/bin/python -m pip install --quiet --disable-pip-version-check -r $< \
+	  || echo "No rclpy for this Python: tests between it and cyclonedds are skipped."
 	@touch $@
 
 .venv/.installed-dev: .venv/.installed

@@ -24,18 +24,20 @@ ROOT = Path(__file__).resolve().parent.parent
 
 FFMPEG, RUNTIME = "LGPL-2.1-or-later", "GPL-3.0-or-later WITH GCC-exception-3.1"
 NETTLE = "LGPL-3.0-or-later OR GPL-2.0-or-later"
+ECLIPSE = "EPL-2.0 OR BSD-3-Clause"
 BUNDLED = {
     "aec": "BSD-2-Clause", "aom": "BSD-2-Clause", "asound": "LGPL-2.1-or-later", "avcodec": FFMPEG,
     "avdevice": FFMPEG, "avfilter": FFMPEG, "avformat": FFMPEG, "avif": "BSD-2-Clause", "avutil": FFMPEG,
     "blosc": "BSD-3-Clause", "brotlicommon": "MIT", "brotlidec": "MIT", "crypto": "OpenSSL (1.1) or Apache-2.0 (3)",
-    "curl": "curl", "dav1d": "BSD-2-Clause", "deflate": "MIT", "drm": "MIT", "freetype": "FTL OR GPL-2.0-or-later",
+    "curl": "curl", "cycloneddsidl": ECLIPSE, "dav1d": "BSD-2-Clause", "ddsc": ECLIPSE,
+    "deflate": "MIT", "drm": "MIT", "freetype": "FTL OR GPL-2.0-or-later",
     "gdal": "MIT", "geos": "LGPL-2.1-or-later", "geos_c": "LGPL-2.1-or-later", "gfortran": RUNTIME, "gif": "MIT",
     "gmp": NETTLE, "gnutls": "LGPL-2.1-or-later", "gomp": RUNTIME, "harfbuzz": "MIT", "hdf5": "BSD-3-Clause",
     "hdf5_hl": "BSD-3-Clause", "hogweed": NETTLE, "jpeg": "IJG AND BSD-3-Clause", "json-c": "MIT", "lcms2": "MIT",
     "Lerc": "Apache-2.0", "lzma": "0BSD", "mp3lame": "LGPL-2.0-or-later", "netcdf": "BSD-3-Clause", "nettle": NETTLE,
     "nghttp2": "MIT", "opencore-amrnb": "Apache-2.0", "opencore-amrwb": "Apache-2.0", "openblasp": "BSD-3-Clause",
     "openjp2": "BSD-2-Clause", "opus": "BSD-3-Clause", "pcre2": "BSD-3-Clause", "png16": "libpng-2.0",
-    "proj": "MIT", "quadmath": "LGPL-2.1-or-later", "scipy_openblas": "BSD-3-Clause",
+    "proj": "MIT", "quadmath": "LGPL-2.1-or-later", "rdkafka": "BSD-2-Clause", "scipy_openblas": "BSD-3-Clause",
     "scipy_openblas64_": "BSD-3-Clause", "sharpyuv": "BSD-3-Clause", "sqlite3": "public domain",
     "ssl": "OpenSSL (1.1) or Apache-2.0 (3)", "SvtAv1Enc": "BSD-3-Clause-Clear", "swresample": FFMPEG,
     "swscale": FFMPEG, "sz": "BSD-2-Clause", "tbb": "Apache-2.0", "tiff": "libtiff", "unistring": NETTLE, "vpl": "MIT",

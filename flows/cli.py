@@ -27,6 +27,7 @@ COMMANDS = {
     "sample": ("sample", "Generate a synthetic street with its ground truth."),
     "import": ("imports", "Make a tile from your files."),
     "segment": ("segment", "Classes of a tile's points and photos: `segment TILE --out DIR`."),
+    "monitor": ("monitor", "The event bus: topics of ROS 2 watched, and what goes through them told."),
     "slam": ("slam", "Where the camera of a video went: `slam VIDEO --out DIR`."),
 }
 """Commands to their files in `flows.commands`, each with an `app`, and what they are for."""

@@ -23,6 +23,11 @@ EXTRA_OF = {
     "ray": "ray",
     "s3fs": "s3",
     "rasterio": "rasters",
+    "cyclonedds": "bus",
+    "rosbags": "bus",
+    "confluent_kafka": "bus",
+    "psutil": "bus",
+    "prometheus_client": "bus",
 }
 """A package's import name to the extra of `scan2sim` that installs it."""
 

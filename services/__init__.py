@@ -1,1 +1,1 @@
-"""Companion services."""
+"""Companion services: a room each, over one transport."""

@@ -1,0 +1,78 @@
+"""`scan2sim monitor`: nodes of the event bus (services/monitoring)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from scan2sim.flows.commands.app import App
+from scan2sim.flows.commands.display import console
+from scan2sim.flows.commands.options import options
+from scan2sim.services.monitoring.watched import DatasetParams, ListenerParams, TalkerParams, TopicParams
+
+app = App("The event bus: topics of ROS 2 watched, and what goes through them told.")
+
+NODE_OPTIONS = {
+    "window_size": "--window",
+    "kafka_bootstrap_servers": "--kafka",
+    "publisher_topic": "--to",
+    "log_file": "--log",
+    "prometheus_port": "--metrics",
+}
+"""Names of `Watched`'s fields on the command line, where they are shorter there."""
+
+
+@app.command("topic")
+@options(TopicParams, **NODE_OPTIONS)
+def monitor_topic(params: TopicParams) -> None:
+    """Watch a topic from outside, whoever publishes on it."""
+    from scan2sim.services.monitoring.topic_monitor import TopicMonitor
+
+    def made() -> Any:
+        node = TopicMonitor(params)
+        if not params.type:
+            node.find(params.timeout, lambda text: console.print(text, highlight=False, markup=False))
+        return node
+
+    _spin(made)
+
+
+@app.command("talker")
+@options(TalkerParams, **NODE_OPTIONS)
+def monitor_talker(params: TalkerParams) -> None:
+    """Send messages of a size at an interval, to try the bus with."""
+    from scan2sim.services.monitoring.nodes.talker import Talker
+
+    _spin(lambda: Talker(params))
+
+
+@app.command("dataset-talker")
+@options(DatasetParams, **NODE_OPTIONS)
+def monitor_dataset_talker(params: DatasetParams) -> None:
+    """Send messages when, and as large as, a file says."""
+    from scan2sim.services.monitoring.nodes.dataset_talker import DatasetTalker
+
+    _spin(lambda: DatasetTalker(params), lambda node: node.finished)
+
+
+@app.command("listener")
+@options(ListenerParams, **NODE_OPTIONS)
+def monitor_listener(params: ListenerParams) -> None:
+    """Hear strings, and say what was heard."""
+    from scan2sim.services.monitoring.nodes.listener import Listener
+
+    _spin(lambda: Listener(params))
+
+
+def _spin(made: Callable[[], Any], finished: Callable[[Any], bool] = lambda _: False) -> None:
+    """Run a node until it has finished, or Ctrl-C."""
+    from scan2sim.services.monitoring.monitor import ros
+
+    ros.init()
+    node = made()
+    try:
+        while not finished(node):
+            ros.spin_once(node, 0.2)
+    finally:
+        node.destroy_node()
+        ros.shutdown()

@@ -1,0 +1,72 @@
+"""How a node is watched: what a monitor is told, in its constructor as on the command line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import Field
+
+from scan2sim.pipeline.step import Params
+
+LARGEST = 16 * 2**20
+"""Bytes of a message of the test nodes, at most."""
+
+
+class Watched(Params):
+    """The names are D3.2's (code snippet 3), as far as it has them."""
+
+    period: Annotated[float, Field(ge=0.01, le=3600, description="Seconds between records.")] = 1.0
+    window_size: Annotated[int, Field(ge=1, le=1_000_000, description="Latencies that go into a record, at most.")] = (
+        100
+    )
+    kafka_bootstrap_servers: Annotated[
+        str | None, Field(description="Kafka for the records, as host:port,host:port; it need not be there yet.")
+    ] = None
+    publisher_topic: Annotated[str, Field(description="Topic of ROS 2 and of Kafka for the records.")] = "monitor_data"
+    log_file: Annotated[Path | None, Field(description="File for the records, a line each.")] = None
+    console: Annotated[bool, Field(description="Write records to standard error, too.")] = False
+    prometheus_port: Annotated[
+        int | None, Field(ge=0, le=65535, description="Port where the last figures are shown to Prometheus.")
+    ] = None
+    spool: Annotated[
+        Path | None, Field(description="File for records that wait for Kafka; default: among temporary files.")
+    ] = None
+
+    def monitored(self) -> dict[str, Any]:
+        """What a monitor's constructor takes of it."""
+        return {name: getattr(self, name) for name in Watched.model_fields}
+
+
+Topic = Annotated[str, Field(description="Its name, as /camera/image.")]
+
+
+class TopicParams(Watched):
+    """Of a node that watches a topic from outside."""
+
+    topic: Topic
+    type: Annotated[str | None, Field(description="Of its messages; default: as publishers say.")] = None
+    timeout: Annotated[float, Field(ge=0.1, le=86_400, description="Seconds to wait for a publisher.")] = 60.0
+
+
+class TalkerParams(Watched):
+    """Of a node that sends messages of a size at an interval."""
+
+    topic: Topic
+    size: Annotated[int, Field(ge=0, le=LARGEST, description="Characters of a message.")] = 1000
+    interval: Annotated[float, Field(ge=0.0001, le=3600, description="Seconds between messages.")] = 1.0
+
+
+class DatasetParams(Watched):
+    """Of a node that sends messages when, and as large as, a file says."""
+
+    topic: Topic
+    data: Annotated[Path, Field(description="CSV: seconds from the start, bytes.")]
+    speed: Annotated[float, Field(ge=0.001, le=10_000, description="So many times as fast as the file says.")] = 1.0
+    size_as_field: Annotated[bool, Field(description="Send sizes as JSON, not so many bytes.")] = False
+
+
+class ListenerParams(Watched):
+    """Of a node that listens."""
+
+    topic: Topic

@@ -1,0 +1,137 @@
+"""Who is on the network, for cyclonedds: endpoints from DDS's own discovery, names of their nodes from ROS 2's.
+
+ROS 2 announces nodes as `rmw_dds_common/msg/ParticipantEntitiesInfo` on `ros_discovery_info`: which endpoints each has.
+"""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription
+from cyclonedds.core import InstanceState, ReadCondition, SampleState, ViewState
+from cyclonedds.domain import DomainParticipant
+from cyclonedds.pub import DataWriter
+from cyclonedds.qos import Policy, Qos
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
+
+from scan2sim.services.transport.idl import STORE, sample_type
+from scan2sim.services.transport.names import dds_topic, ros_topic, ros_type
+from scan2sim.services.transport.policies import qos_of
+from scan2sim.services.transport.types import Endpoint, Kind
+
+ANNOUNCED = "ros_discovery_info"
+INFO = "rmw_dds_common/msg/ParticipantEntitiesInfo"
+BARE = "_CREATED_BY_BARE_DDS_APP_"
+"""What ROS 2 calls a node whose participant announces none."""
+ALIVE = ViewState.Any | SampleState.Any | InstanceState.Alive
+MOST = 10_000
+"""Endpoints read at once."""
+
+
+@dataclass
+class Entities:
+    """Endpoints of one node of this process: their GIDs."""
+
+    namespace: str
+    name: str
+    readers: list[bytes] = field(default_factory=list)
+    writers: list[bytes] = field(default_factory=list)
+
+
+class Graph:
+    """Discovery of one participant; may be asked from any thread."""
+
+    def __init__(self, participant: DomainParticipant) -> None:
+        self._gid = participant.guid.bytes
+        self._lock = threading.Lock()
+        self._nodes: list[Entities] = []
+        topic = Topic(participant, ANNOUNCED, sample_type(INFO))
+        kept = Qos(Policy.Reliability.Reliable(0), Policy.Durability.TransientLocal, Policy.History.KeepLast(1))
+        self._writer = DataWriter(participant, topic, kept)
+        all_of_them = Qos(Policy.Reliability.Reliable(0), Policy.Durability.TransientLocal, Policy.History.KeepAll)
+        self._reader = DataReader(participant, topic, all_of_them)
+        self._endpoints: dict[Kind, tuple[Any, Any]] = {
+            "PUBLISHER": _builtin(participant, BuiltinTopicDcpsPublication),
+            "SUBSCRIPTION": _builtin(participant, BuiltinTopicDcpsSubscription),
+        }
+        self._names: dict[bytes, dict[bytes, tuple[str, str]]] = {}
+
+    def announce(self, node: Entities) -> None:
+        """Tell all others of a node of this process, or of what it has now."""
+        with self._lock:
+            if node not in self._nodes:
+                self._nodes.append(node)
+            self._publish()
+
+    def withdraw(self, node: Entities) -> None:
+        """Tell all others that a node is gone."""
+        with self._lock:
+            self._nodes = [other for other in self._nodes if other is not node]
+            self._publish()
+
+    def endpoints(self, topic: str) -> tuple[Endpoint, ...]:
+        """Publishers and subscriptions of a topic, by its full name."""
+        with self._lock:
+            names = self._read_names()
+            wanted = dds_topic(topic)
+            return tuple(
+                Endpoint(
+                    *names.get(found.key.bytes, (BARE, BARE)),
+                    type_name=ros_type(found.type_name),
+                    kind=kind,
+                    gid=found.key.bytes,
+                    qos=qos_of(found.qos),
+                )
+                for kind in self._endpoints
+                for found in self._alive(kind)
+                if found.topic_name == wanted
+            )
+
+    def topics(self) -> dict[str, tuple[str, ...]]:
+        """ROS 2's topics, and the names of their types."""
+        found: dict[str, set[str]] = {}
+        with self._lock:
+            for kind in self._endpoints:
+                for endpoint in self._alive(kind):
+                    if name := ros_topic(endpoint.topic_name):
+                        found.setdefault(name, set()).add(ros_type(endpoint.type_name))
+        return {name: tuple(sorted(kinds)) for name, kinds in sorted(found.items())}
+
+    def _alive(self, kind: Kind) -> list[Any]:
+        reader, condition = self._endpoints[kind]
+        return list(reader.read(MOST, condition))
+
+    def _publish(self) -> None:
+        gid, node_info = STORE.types["rmw_dds_common/msg/Gid"], STORE.types["rmw_dds_common/msg/NodeEntitiesInfo"]
+
+        def gids(of: list[bytes]) -> list[Any]:
+            return [gid(_numbers(one)) for one in of]
+
+        nodes = [node_info(node.namespace, node.name, gids(node.readers), gids(node.writers)) for node in self._nodes]
+        told = STORE.types[INFO](gid(_numbers(self._gid)), nodes)
+        self._writer.write(sample_type(INFO)(bytes(STORE.serialize_cdr(told, INFO))))
+
+    def _read_names(self) -> dict[bytes, tuple[str, str]]:
+        """GIDs of endpoints to the name and namespace of their node."""
+        for sample in self._reader.take(MOST):
+            if sample.sample_info.valid_data:
+                told: Any = STORE.deserialize_cdr(sample.data, INFO)
+                self._names[bytes(told.gid.data)] = {
+                    bytes(one.data): (node.node_name, node.node_namespace)
+                    for node in told.node_entities_info_seq
+                    for one in (*node.reader_gid_seq, *node.writer_gid_seq)
+                }
+        return {gid: name for of_participant in self._names.values() for gid, name in of_participant.items()}
+
+
+def _builtin(participant: DomainParticipant, topic: Any) -> tuple[Any, Any]:
+    reader = BuiltinDataReader(participant, topic)
+    return reader, ReadCondition(reader, ALIVE)
+
+
+def _numbers(gid: bytes) -> Any:
+    return np.frombuffer(gid, np.uint8)

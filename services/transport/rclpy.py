@@ -1,0 +1,183 @@
+"""The transport over rclpy: ROS 2's own library, whatever middleware it is set to.
+
+DDS wraps every message in a header of its own that holds what monitoring needs: the publisher's GID, a number and the
+time of sending (DDSI-RTPS 2.5, sections 8.3.8.2 and 8.3.8.9), so messages go out as they are, at no cost.
+"""
+
+from __future__ import annotations
+
+import importlib
+import time
+from collections.abc import Callable
+from typing import Any
+
+import rclpy
+import rclpy.node
+from rclpy.duration import Duration, Infinite
+from rclpy.executors import ExternalShutdownException
+from rclpy.publisher import Publisher as RosPublisher
+from rclpy.qos import (
+    DurabilityPolicy,
+    HistoryPolicy,
+    LivelinessPolicy,
+    QoSProfile,
+    ReliabilityPolicy,
+)
+
+from scan2sim.pipeline.errors import SettingError
+from scan2sim.services.transport.cdr import size
+from scan2sim.services.transport.names import checked_type
+from scan2sim.services.transport.types import INFINITE, Arrival, Endpoint, Kind, QoS
+
+
+class _Publisher(RosPublisher):  # type: ignore[misc]
+    """Tells its node of what it sends."""
+
+    node: Node
+
+    def publish(self, msg: Any) -> None:
+        """Send, and tell."""
+        super().publish(msg)
+        self.node.published(self.topic_name, len(msg) if isinstance(msg, bytes) else size(msg))
+
+
+class Node(rclpy.node.Node):  # type: ignore[misc]
+    """A node of rclpy that tells of every message (`services.transport.Node`)."""
+
+    def __init__(self, node_name: str, *, namespace: str = "/", **others: Any) -> None:
+        super().__init__(node_name, namespace=namespace, **others)
+
+    def create_publisher(self, msg_type: Any, topic: str, qos_profile: Any, **others: Any) -> Any:
+        """As rclpy's; the profile may be ours."""
+        made = super().create_publisher(msg_type, topic, _profile(qos_profile), publisher_class=_Publisher, **others)
+        made.node = self
+        return made
+
+    def create_subscription(
+        self, msg_type: Any, topic: str, callback: Callable[..., None], qos_profile: Any, **others: Any
+    ) -> Any:
+        """As rclpy's; the profile may be ours."""
+        full = self.resolve_topic_name(topic)
+
+        def taken(message: Any, info: Any) -> None:
+            self.received(_arrival(full, message, info))
+            callback(message)
+
+        return super().create_subscription(msg_type, topic, taken, _profile(qos_profile), **others)
+
+    def endpoints(self, topic: str) -> tuple[Endpoint, ...]:
+        """Publishers and subscriptions of a topic, as rclpy tells them."""
+        return tuple(
+            [_endpoint(told, "PUBLISHER") for told in self.get_publishers_info_by_topic(topic)]
+            + [_endpoint(told, "SUBSCRIPTION") for told in self.get_subscriptions_info_by_topic(topic)]
+        )
+
+    def topics(self) -> dict[str, tuple[str, ...]]:
+        """Topics and the names of their types."""
+        return {name: tuple(kinds) for name, kinds in self.get_topic_names_and_types()}
+
+    def published(self, topic: str, size: int) -> None:
+        """To be overridden: a message was sent."""
+
+    def received(self, arrival: Arrival) -> None:
+        """To be overridden: a message has come."""
+
+
+def init(domain: int | None = None) -> None:
+    """Join the network."""
+    if not rclpy.ok():
+        rclpy.init(domain_id=domain)
+
+
+def message_type(name: str) -> Any:
+    """The class of messages of that name.
+
+    Raises:
+        SettingError: its package isn't installed.
+    """
+    package, kind, leaf = checked_type(name).split("/")
+    try:
+        return getattr(importlib.import_module(f"{package}.{kind}"), leaf)
+    except (ImportError, AttributeError) as error:
+        raise SettingError(
+            f"type {name}", f"not known here ({error})", "Source the workspace that defines it"
+        ) from None
+
+
+def message(name: str, **fields: Any) -> Any:
+    """A message of that type."""
+    return message_type(name)(**fields)
+
+
+def type_name(msg_type: Any) -> str:
+    """The name of a class of messages."""
+    package, kind = msg_type.__module__.split(".")[:2]
+    return f"{package}/{kind}/{msg_type.__name__}"
+
+
+def spin_once(node: Node, timeout_sec: float) -> None:
+    """Handle what comes within so long."""
+    try:
+        rclpy.spin_once(node, timeout_sec=timeout_sec)
+    except ExternalShutdownException:
+        raise KeyboardInterrupt from None
+
+
+def shutdown() -> None:
+    """Leave the network."""
+    rclpy.try_shutdown()
+
+
+def _arrival(topic: str, message: Any, info: Any) -> Arrival:
+    gid = info.get("publisher_gid")
+    return Arrival(
+        topic=topic,
+        size=len(message) if isinstance(message, bytes) else size(message),
+        received=time.time_ns(),
+        sent=info["source_timestamp"] or None,
+        publisher=gid["data"] if gid else None,
+        number=info.get("publication_sequence_number"),
+    )
+
+
+def _endpoint(told: Any, kind: Kind) -> Endpoint:
+    return Endpoint(
+        node_name=told.node_name,
+        node_namespace=told.node_namespace,
+        type_name=told.topic_type,
+        kind=kind,
+        gid=bytes(told.endpoint_gid),
+        qos=_qos(told.qos_profile),
+    )
+
+
+def _profile(qos: Any) -> Any:
+    """Rclpy's profile of ours; its own, and depths, stay as they are."""
+    if not isinstance(qos, QoS):
+        return qos
+    return QoSProfile(
+        reliability=ReliabilityPolicy[qos.reliability],
+        durability=DurabilityPolicy[qos.durability],
+        history=HistoryPolicy.KEEP_LAST if qos.depth else HistoryPolicy.KEEP_ALL,
+        depth=qos.depth,
+        lifespan=_duration(qos.lifespan),
+        deadline=_duration(qos.deadline),
+        liveliness=LivelinessPolicy[qos.liveliness],
+        liveliness_lease_duration=_duration(qos.lease),
+    )
+
+
+def _duration(nanoseconds: int) -> Any:
+    return Infinite if nanoseconds == INFINITE else Duration(nanoseconds=nanoseconds)
+
+
+def _qos(told: Any) -> QoS:
+    return QoS(
+        reliability=told.reliability.name,
+        durability=told.durability.name,
+        depth=told.depth,
+        lifespan=told.lifespan.nanoseconds,
+        deadline=told.deadline.nanoseconds,
+        liveliness=told.liveliness.name,
+        lease=told.liveliness_lease_duration.nanoseconds,
+    )

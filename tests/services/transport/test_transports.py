@@ -1,0 +1,50 @@
+"""Messages cross between nodes of both transports, each way, with what monitoring is to know of them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from scan2sim.pipeline.errors import SettingError
+from scan2sim.services.transport import load
+from tests.services.conftest import Start
+
+CROSSING = Path(__file__).with_name("crossing.py")
+SECONDS = "8"
+
+
+@pytest.mark.parametrize(("first", "second"), [("cyclone", "cyclone"), ("rclpy", "cyclone"), ("rclpy", "rclpy")])
+def test_messages_of_all_kinds_cross(first: str, second: str, start: Start) -> None:
+    running = [start(first, CROSSING, "one", "two", SECONDS), start(second, CROSSING, "two", "one", SECONDS)]
+    told = []
+    for process in running:
+        out, errors = process.communicate(timeout=60)
+        assert process.returncode == 0, errors
+        told.append(json.loads(out.splitlines()[-1]))
+    for (me, other), found in zip([(first, second), (second, first)], told, strict=True):
+        assert set(found["heard"]) == {"String", "Bool", "Image", "Imu", "PointCloud2", "Float64MultiArray"}
+        assert min(one["count"] for one in found["heard"].values()) > 10
+        assert found["text"] == "Straße, 画像"
+        assert all(abs(one["latency"]) < 5 for one in found["heard"].values())  # seconds: it is a time of sending
+        # rclpy numbers all messages for rclpy; cyclonedds those of any length, for both
+        numbered = {kind for kind, one in found["heard"].items() if one["numbered"]}
+        if me == "rclpy":
+            assert numbered == set(found["heard"])
+        elif other == "cyclone":
+            assert numbered == {"String", "Image", "Imu", "PointCloud2", "Float64MultiArray"}
+        publishers = found["endpoints"]
+        assert [one["type"] for one in publishers] == ["std_msgs/msg/String"]
+        if not (me == "rclpy" and other == "cyclone"):  # there, rclpy finds no name of the node
+            assert publishers[0]["node"] == ("node_two" if found is told[0] else "node_one")
+
+
+def test_a_transport_that_is_none_is_told() -> None:
+    with pytest.raises(SettingError, match="rclpy, cyclone"):
+        load("carrier pigeon")
+
+
+def test_a_type_of_unknown_definition_is_told() -> None:
+    with pytest.raises(SettingError, match="my_msgs/msg/Own"):
+        load("cyclone").message_type("my_msgs/msg/Own")
