@@ -24,18 +24,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from bench.texture_ablation import figures
 from bench.texture_scenes import ROOT, SCENES, WARM, Scene, available, fresh, make, run
-from scan2sim.pipeline.types import F32, I32, Mesh
+from scan2sim.pipeline.types import F32, F64, I32, Bools, Mesh
 from scan2sim.texturing import mrf
 from scan2sim.texturing.choose import CHOOSE, Choice, ChooseParams, seams
 
 SWEEPS = 3
 UNSEEN = 1e3
-Floats = npt.NDArray[np.float64]
-Cut = Callable[[Floats, Floats, I32, I32, Floats], npt.NDArray[np.bool_]]
+Cut = Callable[[F64, F64, I32, I32, F64], Bools]
 """Which nodes go over: costs of going and staying (N,), pairs p, q (E,), and what it costs if q goes and p stays."""
 Problem = tuple[I32, F32, I32, F32]
 """Candidates (F, K), their costs, pairs (E, 2), prices (E,)."""
@@ -108,7 +106,7 @@ def _expand(alpha: int, view: I32, cost: F32, current: I32, pairs: I32, price: F
     return len(moves)
 
 
-def by_pymaxflow(go: Floats, stay: Floats, p: I32, q: I32, weight: Floats) -> npt.NDArray[np.bool_]:
+def by_pymaxflow(go: F64, stay: F64, p: I32, q: I32, weight: F64) -> Bools:
     """In the source's segment a node stays, in the sink's it goes: cutting source -> node costs `go`."""
     import maxflow
 
@@ -120,7 +118,7 @@ def by_pymaxflow(go: Floats, stay: Floats, p: I32, q: I32, weight: Floats) -> np
     return graph.get_grid_segments(nodes)
 
 
-def by_scipy(go: Floats, stay: Floats, p: I32, q: I32, weight: Floats) -> npt.NDArray[np.bool_]:
+def by_scipy(go: F64, stay: F64, p: I32, q: I32, weight: F64) -> Bools:
     """The same on capacities in ten thousandths; nodes that the residual graph reaches from the source stay."""
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import breadth_first_order, maximum_flow

@@ -36,11 +36,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from bench import street_boxes, street_score, street_synthetic
 from bench.measure import measure
-from bench.street_world import BACKGROUND, U8, Bools, Photo, Seen, World, photos
+from bench.street_world import BACKGROUND, Photo, Seen, World, photos
+from scan2sim.pipeline.types import F64, I64, U8, Bools
 
 ROOT = Path(__file__).resolve().parent.parent
 DATA = ROOT.parent / "shared" / "data"
@@ -162,14 +162,12 @@ def _vehicles(street: Street, frame: int, photo: Photo) -> Bools:
     return masked | street_boxes.mask(street.labels, frame, photo.rgb.shape) if street.labels else masked
 
 
-def _shifts(
-    photo: U8, rendering: U8, line: Sequence[Sequence[float]]
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
+def _shifts(photo: U8, rendering: U8, line: Sequence[Sequence[float]]) -> tuple[F64, I64]:
     shift, at = street_score.displacements(photo, rendering, line)
     return shift, at.T
 
 
-def _reached(returns: npt.NDArray[np.float64], photo: Photo) -> Bools:
+def _reached(returns: F64, photo: Photo) -> Bools:
     """(H, W) pixels beside which any sweep's return within 60 m falls: what of the photo the lidar reached."""
     from scipy.ndimage import binary_dilation
 
@@ -179,9 +177,7 @@ def _reached(returns: npt.NDArray[np.float64], photo: Photo) -> Bools:
     return np.asarray(binary_dilation(out, iterations=BESIDE))
 
 
-def _pixels(
-    returns: npt.NDArray[np.float64], photo: Photo, far: float
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+def _pixels(returns: F64, photo: Photo, far: float) -> tuple[I64, I64]:
     """Columns and rows of the places (N, 3) in front of a photo, nearer than `far` metres, that fall into it."""
     local = (returns - photo.T[:3, 3]) @ photo.T[:3, :3]
     local = local[(local[:, 2] > 0.5) & (np.linalg.norm(local, axis=1) < far)] @ photo.K.T
@@ -191,7 +187,7 @@ def _pixels(
     return column[inside], row[inside]
 
 
-def _uncovered(own: npt.NDArray[np.float64], photo: Photo, seen: Seen, masked: Bools) -> float:
+def _uncovered(own: F64, photo: Photo, seen: Seen, masked: Bools) -> float:
     """Share of the returns of the photo's own sweep, on pixels that aren't masked, where the world shows nothing."""
     column, row = _pixels(own, photo, NEAR)
     free = ~masked[row, column]

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
-from bench.street_world import F64, Bools, Photo, World
+from bench.street_world import Photo, World
+from scan2sim.pipeline.types import F64, Bools
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -108,7 +108,7 @@ def corridor(world: World, path: F64) -> float:
     return float(out.sum() / SPACING)
 
 
-def spread(world: World) -> npt.NDArray[np.float64]:
+def spread(world: World) -> F64:
     """Places (N, 3) spread evenly over the world's surface."""
     rng = np.random.default_rng(0)
     corner = world.vertices[world.faces].astype(np.float64)

@@ -13,10 +13,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bench.street_world import U8, Bools
+from scan2sim.pipeline.types import F64, I64, U8, Bools
 
 TRUTH = Path(__file__).with_name("street_truth.json")
-Grey = npt.NDArray[np.float64]
 
 WINDOW = 1.5
 """Pixels: sigma of SSIM's Gaussian window (Wang et al. 2004)."""
@@ -68,7 +67,7 @@ def likeness(photo: U8, rgb: U8, counts: Bools) -> dict[str, float]:
     }
 
 
-def gained(photo: U8, rgb: U8, counts: Bools) -> npt.NDArray[np.float64]:
+def gained(photo: U8, rgb: U8, counts: Bools) -> F64:
     """The rendering with the gain a channel that makes it most like the photo where `counts`."""
     a, b = photo[counts].astype(np.float64), rgb[counts].astype(np.float64)
     return np.asarray(np.clip(rgb * ((a * b).sum(axis=0) / np.maximum((b * b).sum(axis=0), 1)), 0, 255))
@@ -84,14 +83,14 @@ def psnr(mse: float) -> float:
     return 10 * math.log10(255**2 / max(mse, 1e-3))
 
 
-def _grey(image: npt.NDArray[Any]) -> Grey:
+def _grey(image: npt.NDArray[Any]) -> F64:
     return np.asarray(image @ np.array([0.299, 0.587, 0.114]), np.float64)
 
 
-def _ssim(a: Grey, b: Grey, counts: Bools) -> float:
+def _ssim(a: F64, b: F64, counts: Bools) -> float:
     from scipy.ndimage import binary_erosion, gaussian_filter
 
-    def mean(values: Grey) -> Grey:
+    def mean(values: F64) -> F64:
         return np.asarray(gaussian_filter(values, WINDOW, truncate=3.5))
 
     ma, mb = mean(a), mean(b)
@@ -101,9 +100,7 @@ def _ssim(a: Grey, b: Grey, counts: Bools) -> float:
     return float(index[binary_erosion(counts, np.ones((11, 11)))].mean())
 
 
-def displacements(
-    photo: U8, rgb: U8, line: Sequence[Sequence[float]]
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
+def displacements(photo: U8, rgb: U8, line: Sequence[Sequence[float]]) -> tuple[F64, I64]:
     """Pixels by which a rendering shows an outline beside where the photo does, every second pixel along it.
 
     Returns:
@@ -135,7 +132,7 @@ def displacements(
     return np.array(out), np.array(at, np.int64).reshape(-1, 2)
 
 
-def _along(line: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+def _along(line: F64) -> tuple[F64, F64]:
     """Places every second pixel of a polyline, and the directions of it there."""
     places, ways = [], []
     for a, b in pairwise(line):
@@ -146,11 +143,11 @@ def _along(line: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.float64], npt.
     return np.concatenate(places), np.concatenate(ways)
 
 
-def _within(strip: npt.NDArray[np.float64], shape: tuple[int, ...]) -> bool:
+def _within(strip: F64, shape: tuple[int, ...]) -> bool:
     return bool((strip >= 0).all() and (strip <= np.array([shape[1] - 1, shape[0] - 1])).all())
 
 
-def _shift(mine: Grey, other: Grey) -> float:
+def _shift(mine: F64, other: F64) -> float:
     """Pixels by which profile `mine` (n,) lies beside its place in `other` (m > n, its middle in the same place)."""
     windows = np.lib.stride_tricks.sliding_window_view(other, len(mine))
     windows = windows - windows.mean(axis=1, keepdims=True)

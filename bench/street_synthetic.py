@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from bench.street_world import World
+from scan2sim.pipeline.types import F64, U8
 
 STREET: dict[str, Any] = {"length": 40.0, "points": 1.6e6, "photos": 16, "seed": 0}
 REACH = 0.1
@@ -52,7 +52,7 @@ def pole_recall(tile: Path, world: World) -> float:
 
     from scan2sim.pipeline.classes import CODE
 
-    def read(file: str) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8]]:
+    def read(file: str) -> tuple[F64, U8]:
         cloud = laspy.read(tile / file)
         return np.stack([cloud.x, cloud.y, cloud.z], axis=1) - world.origin, np.asarray(cloud.classification)
 

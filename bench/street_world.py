@@ -11,9 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-F64 = npt.NDArray[np.float64]
-U8 = npt.NDArray[np.uint8]
-Bools = npt.NDArray[np.bool_]
+from scan2sim.pipeline.types import F32, F64, U8, Bools
 
 SAMPLES = 3
 """Rays a pixel each way."""
@@ -45,7 +43,7 @@ class Seen:
     """What a photo's pixels see of the world: `rgb` (H, W, 3) uint8, `range` (H, W) metres, inf where nothing is."""
 
     rgb: U8
-    range: npt.NDArray[np.float32]
+    range: F32
 
     @property
     def hit(self) -> Bools:
@@ -111,7 +109,7 @@ class World:
 
     def _cast(
         self, photo: Photo, column: npt.NDArray[Any], row: npt.NDArray[Any], *, colours: bool = True
-    ) -> tuple[npt.NDArray[np.float32], F64]:
+    ) -> tuple[F32, F64]:
         """Metres (N,) to what rays through places in the photo meet, and its colours (N, 3), black where nothing is."""
         import open3d as o3d
 
@@ -130,7 +128,7 @@ class World:
                 rgb[at] = _sample(self._page[k], uv)
         return distance, rgb
 
-    def distance(self, places: F64) -> npt.NDArray[np.float32]:
+    def distance(self, places: F64) -> F32:
         """(N,) metres from places (N, 3), local, to the nearest surface."""
         return np.asarray(self.casting.compute_distance(np.ascontiguousarray(places, np.float32)).numpy())
 

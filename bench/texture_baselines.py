@@ -15,9 +15,9 @@ from numba import njit, prange
 from bench.texture_scenes import Scene
 from scan2sim.pipeline.cameras import EQUIRECTANGULAR
 from scan2sim.pipeline.io import image
-from scan2sim.pipeline.projection import eye, incidence, is_visible, pixel_of, to_camera, turned
+from scan2sim.pipeline.projection import Eye, Ranges, eye, incidence, is_visible, pixel_of, to_camera, turned
 from scan2sim.pipeline.sampling import bilinear
-from scan2sim.pipeline.types import U8, Mesh
+from scan2sim.pipeline.types import F32, I32, I64, U8, Mesh
 from scan2sim.pipeline.visibility import BIAS, load_depth_map
 from scan2sim.texturing import fill, texels
 
@@ -120,7 +120,7 @@ def _write(out: Path, page: int, rgb: U8, seen: U8) -> None:
 
 
 @njit(cache=True, parallel=True)
-def _places(flat, corners, face, rows, columns):  # type: ignore[no-untyped-def]
+def _places(flat: F32, corners: F32, face: I32, rows: I64, columns: I64) -> F32:
     """(N, 3) float32: where the texels lie in space."""
     out = np.empty((len(face), 3), np.float32)
     for i in prange(len(face)):
@@ -131,9 +131,19 @@ def _places(flat, corners, face, rows, columns):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, parallel=True)
-def _add(  # type: ignore[no-untyped-def]
-    total, places, normals, face, photo, eye, ranges, bias, max_distance, min_cos, only_nearest
-):
+def _add(
+    total: F32,
+    places: F32,
+    normals: F32,
+    face: I32,
+    photo: U8,
+    eye: Eye,
+    ranges: Ranges,
+    bias: float,
+    max_distance: float,
+    min_cos: float,
+    only_nearest: bool,
+) -> None:
     """Add a photo's weighted colour to the texels (N, 4) that it sees, or put it in the place of a farther one's."""
     for i in prange(len(places)):
         place, normal = places[i], normals[face[i]]

@@ -17,7 +17,7 @@ from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.projection import pixels
 from scan2sim.pipeline.render import Body, Renderer, textured
-from scan2sim.pipeline.types import F32, U8, Mesh, PointCloud, View
+from scan2sim.pipeline.types import F32, U8, Bools, Mesh, PointCloud, View
 from scan2sim.pipeline.visibility import load_depth_map, visible
 
 NEAR = 15.0
@@ -39,8 +39,6 @@ LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 _CODES = np.arange(256, dtype=np.float32) / 255
 _LINEAR = np.where(_CODES <= 0.04045, _CODES / 12.92, ((_CODES + 0.055) / 1.055) ** np.float32(2.4))
 """Linear light of an 8-bit sRGB value."""
-
-Bools = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

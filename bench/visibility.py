@@ -25,7 +25,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from bench.tile import ROOT
 from scan2sim.data_samples.layout import FRAME, lay_out
@@ -43,7 +42,7 @@ from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.projection import pixels
 from scan2sim.pipeline.steps.visibility import VisibilityParams
 from scan2sim.pipeline.store import Store
-from scan2sim.pipeline.types import F32, F64, U8, Frame, Mesh, PointCloud, Tile, View
+from scan2sim.pipeline.types import F32, F64, I64, U8, Bools, Frame, Mesh, PointCloud, Tile, View
 from scan2sim.pipeline.visibility import DepthMap
 
 OURS = "mesh + discs (ours)"
@@ -62,8 +61,6 @@ EDGE = 0.05
 RELIEF = 0.10
 """Metres, the voxel size: what stands out of the surface around a sample by less is its roughness and hides nothing."""
 
-Mask = npt.NDArray[np.bool_]
-Tally = npt.NDArray[np.int64]
 Method = Callable[[View], DepthMap]
 
 
@@ -89,8 +86,8 @@ class Samples:
 
     points: F32
     normals: F32
-    hidden: Mask
-    clear: Mask
+    hidden: Bools
+    clear: Bools
     blocker: U8
 
 
@@ -113,7 +110,7 @@ def main() -> None:
     truth = Truth(a.length, a.points, a.seed, tile.frame)
 
     methods = methods_of(made)
-    counts: dict[str, dict[str, Tally]] = {
+    counts: dict[str, dict[str, I64]] = {
         name: {group: np.zeros((2, 4), np.int64) for group in GROUPS} for name in methods
     }
     seconds: dict[str, list[float]] = {name: [] for name in methods}
@@ -249,24 +246,24 @@ def boxes(cloud: PointCloud, view: View) -> DepthMap:
     return DepthMap(camera, view.T_world_cam, splats + np.float32(SPLAT_BIAS))
 
 
-def tally(seen: Mask, hidden: Mask) -> Tally:
+def tally(seen: Bools, hidden: Bools) -> I64:
     """(4,) samples: hidden and seen, hidden, visible and not seen, visible."""
     return np.array([(hidden & seen).sum(), hidden.sum(), (~hidden & ~seen).sum(), (~hidden).sum()])
 
 
-def total(counts: dict[str, Tally]) -> Tally:
+def total(counts: dict[str, I64]) -> I64:
     """Tallies of all classes, summed: (2, 4), those of clear samples and those of all."""
     return np.sum(list(counts.values()), axis=0)
 
 
-def shares(tallied: Tally) -> tuple[float, float, float]:
+def shares(tallied: I64) -> tuple[float, float, float]:
     """Leak, false hiding, and wrong: see the top of this file."""
     leaked, hidden, missed, visible = (int(n) for n in tallied)
     seen = leaked + visible - missed
     return leaked / max(1, hidden), missed / max(1, visible), leaked / max(1, seen)
 
 
-def print_methods(counts: dict[str, dict[str, Tally]], seconds: dict[str, float]) -> None:
+def print_methods(counts: dict[str, dict[str, I64]], seconds: dict[str, float]) -> None:
     """A line a method and class, shares in percent: of the clear samples, and of all, those at edges too."""
     print(f"{'':<34}{'clear samples':>33}{'':>18} |{'those at edges too':>27}")
     titles = f"{'leak %':>8}{'false hiding %':>16}{'wrong %':>9}"
@@ -279,7 +276,7 @@ def print_methods(counts: dict[str, dict[str, Tally]], seconds: dict[str, float]
         print(f"{'':<22}{seconds[name]:.2f} s a view")
 
 
-def print_blockers(hidden: Tally, leaked: Tally) -> None:
+def print_blockers(hidden: I64, leaked: I64) -> None:
     """A line for every class of things that hides: what it hides, and what leaks through it."""
     print(f"\n{'hidden by':<22}{'samples':>10}{'leaked':>9}{'leak %':>8}{'of all leaks %':>16}")
     for c in CLASSES:

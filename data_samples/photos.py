@@ -11,7 +11,7 @@ import numpy.typing as npt
 from scan2sim.data_samples.layout import Layout
 from scan2sim.data_samples.scanner import Drive
 from scan2sim.data_samples.scene import Scene, srgb
-from scan2sim.pipeline.types import F32, F64, U8, Camera
+from scan2sim.pipeline.types import F32, F64, U8, Bools, Camera
 
 CAMERAS = ("front", "pano", "left", "right")
 STATION = 5.0  # metres of road between stations, at most (where there are photos enough)
@@ -172,7 +172,7 @@ def _blocks(n: int, size: int = 1 << 20) -> Iterator[slice]:
     return (slice(i, min(i + size, n)) for i in range(0, n, size))
 
 
-def _edges(light: F32) -> npt.NDArray[np.bool_]:
+def _edges(light: F32) -> Bools:
     """(H * W,) pixels that differ much from a neighbour."""
     shown = np.clip(light, 0, 1) ** np.float32(1 / 2.2)
     edge = np.zeros(light.shape[:2], bool)

@@ -13,7 +13,7 @@ from scan2sim.data_samples.paints import Material
 from scan2sim.data_samples.scene import FINE, CarPoses, Scene, srgb
 from scan2sim.pipeline.errors import DataError
 from scan2sim.pipeline.step import Report, silent
-from scan2sim.pipeline.types import F32, F64, PointCloud, Trajectory
+from scan2sim.pipeline.types import F32, F64, I32, Bools, PointCloud, Trajectory
 
 START = 412_300.0  # GPS time of week, seconds
 SPEED = 10.0
@@ -147,7 +147,7 @@ def _rays(drive: Drive, shots: F64, block: int) -> Iterator[tuple[F32, F32, F64]
         yield origins, d.reshape(-1, 3).astype(np.float32), np.repeat(time, BEAMS)
 
 
-def _valid(distance: F32) -> npt.NDArray[np.bool_]:
+def _valid(distance: F32) -> Bools:
     return np.isfinite(distance) & (distance < RANGE) & (distance > 0.8)
 
 
@@ -182,7 +182,7 @@ def _returns(
     return PointCloud(FRAME, **{name: np.concatenate([getattr(p, name) for p in parts]) for name in names})
 
 
-def _intensity(scene: Scene, face: npt.NDArray[np.int32], directions: F32, distance: F32) -> npt.NDArray[np.uint16]:
+def _intensity(scene: Scene, face: I32, directions: F32, distance: F32) -> npt.NDArray[np.uint16]:
     """Reflectivity in the near infrared times incidence, partly corrected for range."""
     p = scene.surface
     reflectivity = 0.15 + 0.75 * p.colour.mean(axis=1)

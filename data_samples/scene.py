@@ -12,7 +12,7 @@ from scan2sim.data_samples import objects, paints, signs
 from scan2sim.data_samples.layout import FRAME, HALF_WIDTH, Layout
 from scan2sim.data_samples.paints import Material, Paint, linear
 from scan2sim.data_samples.shapes import Part, join, sheet
-from scan2sim.pipeline.types import F32, F64, Mesh
+from scan2sim.pipeline.types import F32, F64, I32, U8, Bools, Mesh
 
 CAR_SPEED = 8.0
 SUN_COLOUR = np.array([1.06, 1.0, 0.88], np.float32)
@@ -71,7 +71,7 @@ def _upright(layout: Layout, mesh: Part, x: float, side: int, xy: F64, heading: 
     return mesh.moved(0.0, (x, 0, 0)).moved(turn, (*xy, float(layout.height(s, t))))
 
 
-def _slice(mesh: Part, keep: npt.NDArray[np.bool_]) -> Part:
+def _slice(mesh: Part, keep: Bools) -> Part:
     per_face = {
         name: getattr(mesh, name)[keep] for name in ("faces", "material", "classification", "colour", "seed", "size")
     }
@@ -118,7 +118,7 @@ def _ground(layout: Layout) -> list[Part]:
     return [_slice(p, ~_inside_houses(layout, p)) if p.classification[0] == paints.TERRAIN else p for p in parts]
 
 
-def _inside_houses(layout: Layout, mesh: Part) -> npt.NDArray[np.bool_]:
+def _inside_houses(layout: Layout, mesh: Part) -> Bools:
     """(F,) whether a face lies well inside a house."""
     middle = mesh.vertices[mesh.faces].mean(axis=1)[:, :2]
     inside = np.zeros(len(middle), bool)
@@ -143,12 +143,12 @@ class Hits:
     """
 
     distance: F32
-    face: npt.NDArray[np.int32]
+    face: I32
     bary: F32
     heading: F32
 
     @property
-    def hit(self) -> npt.NDArray[np.bool_]:
+    def hit(self) -> Bools:
         """(N,) whether anything was hit."""
         return self.face >= 0
 
@@ -179,7 +179,7 @@ class Scene:
         mesh = Mesh(FRAME, part.vertices, part.faces, classification=part.classification)
         return mesh.keep(np.arange(len(part.faces)) < self.static)
 
-    def car_at(self, time: npt.ArrayLike, centre: Any = 0.0, way: Any = 1.0) -> tuple[F64, F64, npt.NDArray[np.bool_]]:
+    def car_at(self, time: npt.ArrayLike, centre: Any = 0.0, way: Any = 1.0) -> tuple[F64, F64, Bools]:
         """Where the moving car is `time` seconds after it passes the street's middle.
 
         Returns:
@@ -303,7 +303,7 @@ class CarPoses:
 
     position: F32
     heading: F32
-    present: npt.NDArray[np.bool_]
+    present: Bools
 
     def repeated(self, times: int) -> CarPoses:
         """Each pose for that many rays in a row."""
@@ -336,13 +336,13 @@ def _cast(caster: Any, rays: F32) -> Hits:
     return Hits(distance, face, answer["primitive_uvs"].numpy().copy(), np.zeros(len(rays), np.float32))
 
 
-def _occluded(caster: Any, rays: F32, far: float = float("inf")) -> npt.NDArray[np.bool_]:
+def _occluded(caster: Any, rays: F32, far: float = float("inf")) -> Bools:
     if len(rays) == 0:
         return np.zeros(0, bool)
     return caster.test_occlusions(_tensor(rays), 0.0, far).numpy().copy()
 
 
-def srgb(light: npt.ArrayLike) -> npt.NDArray[np.uint8]:
+def srgb(light: npt.ArrayLike) -> U8:
     """Linear light to 8-bit sRGB, clipped."""
     x = np.clip(np.asarray(light, np.float32), 0, 1)
     return (255 * np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** np.float32(1 / 2.4) - 0.055) + 0.5).astype(np.uint8)

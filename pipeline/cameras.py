@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
-from scan2sim.pipeline.types import F32, F64, Camera
+from scan2sim.pipeline.types import F32, F64, Bools, Camera
 
 PINHOLE, OPENCV, FISHEYE, EQUIRECTANGULAR, ORTHOGRAPHIC = range(5)
 MODEL_ID: dict[str, int] = {
@@ -57,7 +57,7 @@ def _first_fold(x: F64, y: F64, never: float) -> float:
     return float(x[falls[0]]) if len(falls) else never
 
 
-def project(camera: Camera, points_cam: npt.ArrayLike) -> tuple[F32, npt.NDArray[np.bool_]]:
+def project(camera: Camera, points_cam: npt.ArrayLike) -> tuple[F32, Bools]:
     """Pixels of points given in camera coordinates.
 
     Args:
@@ -72,7 +72,7 @@ def project(camera: Camera, points_cam: npt.ArrayLike) -> tuple[F32, npt.NDArray
     return uv.astype(np.float32), valid
 
 
-def project_exactly(camera: Camera, points_cam: npt.ArrayLike) -> tuple[F64, npt.NDArray[np.bool_]]:
+def project_exactly(camera: Camera, points_cam: npt.ArrayLike) -> tuple[F64, Bools]:
     """`project` in float64, for differences of pixels."""
     points = np.ascontiguousarray(points_cam, np.float64).reshape(-1, 3)
     return _project(MODEL_ID[camera.model], parameters(camera), points)
@@ -97,7 +97,7 @@ def ray_origins(camera: Camera, uv: npt.ArrayLike) -> F64:
     return origins
 
 
-def inside(camera: Camera, uv: npt.NDArray[np.floating]) -> npt.NDArray[np.bool_]:
+def inside(camera: Camera, uv: npt.NDArray[np.floating]) -> Bools:
     """(N,) whether pixels (N, 2) lie within the image, its half-pixel border included; a panorama's sides are none."""
     u, v = uv[:, 0], uv[:, 1]
     across = (u >= -0.5) & (u < camera.width - 0.5) | (camera.model == "equirectangular")
@@ -112,7 +112,7 @@ def pixel_angle(camera: Camera) -> float:
 
 
 @njit(cache=True, inline="always")
-def _distort(p, x, y):  # type: ignore[no-untyped-def]
+def _distort(p: F64, x: float, y: float) -> tuple[float, float]:
     """Brown-Conrady distortion of normalised image coordinates."""
     r2 = x * x + y * y
     radial = (1 + r2 * (p[4] + r2 * (p[5] + r2 * p[8]))) / (1 + r2 * (p[9] + r2 * (p[10] + r2 * p[11])))
@@ -122,14 +122,14 @@ def _distort(p, x, y):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, inline="always")
-def _fisheye_radius(p, theta):  # type: ignore[no-untyped-def]
+def _fisheye_radius(p: F64, theta: float) -> float:
     """Distorted radius of a ray at `theta` radians from the axis."""
     t2 = theta * theta
     return theta * (1 + t2 * (p[4] + t2 * (p[5] + t2 * (p[6] + t2 * p[7]))))
 
 
 @njit(cache=True)
-def project_point(model, p, x, y, z):  # type: ignore[no-untyped-def]
+def project_point(model: int, p: F64, x: float, y: float, z: float) -> tuple[float, float, bool]:
     """(u, v, ok): the pixel of a point in camera axes; every kernel projects through this one."""
     if model == EQUIRECTANGULAR:
         r = math.sqrt(x * x + y * y + z * z)
@@ -158,7 +158,7 @@ def project_point(model, p, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def unproject_pixel(model, p, u, v):  # type: ignore[no-untyped-def]
+def unproject_pixel(model: int, p: F64, u: float, v: float) -> tuple[float, float, float]:
     """(x, y, z): the unit ray through a pixel, camera axes; NaN where there is none."""
     if model == EQUIRECTANGULAR:
         lon = ((u + 0.5) / p[12] - 0.5) * 2 * math.pi
@@ -182,7 +182,7 @@ def unproject_pixel(model, p, u, v):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _fisheye_angle(p, radius):  # type: ignore[no-untyped-def]
+def _fisheye_angle(p: F64, radius: float) -> float:
     """Inverse of `_fisheye_radius` by bisection on its monotonous part."""
     low, high = 0.0, p[14]
     if radius > _fisheye_radius(p, high):
@@ -197,7 +197,7 @@ def _fisheye_angle(p, radius):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _undistort(p, xd, yd):  # type: ignore[no-untyped-def]
+def _undistort(p: F64, xd: float, yd: float) -> tuple[float, float]:
     """Inverse of `_distort` by damped Newton steps with a numerical Jacobian, held within the valid field."""
     x, y = xd, yd
     r = math.sqrt(x * x + y * y)
@@ -227,7 +227,7 @@ def _undistort(p, xd, yd):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, parallel=True)
-def _project(model, p, points):  # type: ignore[no-untyped-def]
+def _project(model: int, p: F64, points: F64) -> tuple[F64, Bools]:
     uv = np.empty((len(points), 2))
     valid = np.empty(len(points), np.bool_)
     for i in prange(len(points)):
@@ -237,7 +237,7 @@ def _project(model, p, points):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, parallel=True)
-def _unproject(model, p, uv):  # type: ignore[no-untyped-def]
+def _unproject(model: int, p: F64, uv: F64) -> F64:
     rays = np.empty((len(uv), 3))
     for i in prange(len(uv)):
         rays[i, 0], rays[i, 1], rays[i, 2] = unproject_pixel(model, p, uv[i, 0], uv[i, 1])
@@ -245,7 +245,7 @@ def _unproject(model, p, uv):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, parallel=True)
-def _pixel_rays(model, p, height, width):  # type: ignore[no-untyped-def]
+def _pixel_rays(model: int, p: F64, height: int, width: int) -> F32:
     rays = np.empty((height, width, 3), np.float32)
     for v in prange(height):
         for u in range(width):

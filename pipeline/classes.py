@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scan2sim.pipeline.errors import SettingError
+from scan2sim.pipeline.types import U8, Bools
 
 Group = Literal["terrain", "building", "vegetation", "vehicle"]
 GROUPS: tuple[Group, ...] = ("terrain", "building", "vegetation")
@@ -69,7 +70,6 @@ UNCLASSIFIED = CODE["unclassified"]
 UNKNOWN = (0, UNCLASSIFIED, 12)  # never classified, unclassified, legacy overlap
 OF_THE_SURVEY = 64
 """From this code on each survey has classes of its own (LAS 1.4 R15, table 17)."""
-U8 = npt.NDArray[np.uint8]
 
 
 def code_of(text: str) -> int | None:
@@ -149,7 +149,7 @@ def meanings(ours: bool, names: Mapping[int, str], given: Mapping[int, int]) -> 
     return table
 
 
-def known() -> npt.NDArray[np.bool_]:
+def known() -> Bools:
     """Lookup table (256,): whether a LAS code says what a point is."""
     table = np.zeros(256, bool)
     table[list(CODE.values())] = True
@@ -186,7 +186,7 @@ def group_of() -> npt.NDArray[np.int8]:
     return table
 
 
-def colour_of() -> npt.NDArray[np.uint8]:
+def colour_of() -> U8:
     """Lookup table (256, 3): LAS code to a display colour."""
     table = np.full((256, 3), 128, np.uint8)
     for c in CLASSES:

@@ -15,12 +15,11 @@ import numpy.typing as npt
 
 from scan2sim.pipeline.cells import Seed
 from scan2sim.pipeline.errors import DataError
-from scan2sim.pipeline.types import F64, Frame, Trajectory, View
+from scan2sim.pipeline.types import F64, I64, Frame, Trajectory, View
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
-I64 = npt.NDArray[np.int64]
 Warn = Callable[[str], None]
 
 NEAREST = 12

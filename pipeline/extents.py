@@ -16,9 +16,7 @@ from scipy.spatial import cKDTree
 from scan2sim.pipeline.ordering import ordered
 from scan2sim.pipeline.planes import Planes
 from scan2sim.pipeline.steps.voxel import voxel_groups
-from scan2sim.pipeline.types import F32, F64, I32
-
-Bools = npt.NDArray[np.bool_]
+from scan2sim.pipeline.types import F32, F64, I32, I64, Bools
 
 LOOSE = 0.4
 """Voxels by which a single point may miss its plane, at least: several make a thinned one."""
@@ -405,7 +403,7 @@ def _fit(flat: F64, a: F64, b: F64, voxel: float) -> Line:
 
 
 @njit(cache=True)
-def _outermost(flat, start, along, length, bins, low, high):  # type: ignore[no-untyped-def]
+def _outermost(flat: F64, start: F64, along: F64, length: float, bins: int, low: float, high: float) -> tuple[I64, F64]:
     """Number (B,) and greatest distance (B,) to the right of a line, of points (N, 2) in each of its parts.
 
     Points count that are between `low` and `high` metres to its right.

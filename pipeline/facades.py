@@ -19,10 +19,7 @@ import numpy.typing as npt
 from numba import njit
 
 from scan2sim.pipeline.planes import Planes
-from scan2sim.pipeline.types import F32, F64, I32
-
-Bools = npt.NDArray[np.bool_]
-Numbers = npt.NDArray[np.int64]
+from scan2sim.pipeline.types import F32, F64, I32, I64, Bools
 
 UPRIGHT = float(np.sin(np.radians(10.0)))
 """|nz| of a wall's plane at most."""
@@ -160,7 +157,7 @@ class Rays:
             fits = off >= min(-LOOSE, float(np.sort(off)[-3]))
         return Rays(origin, end.astype(np.float64), limit)
 
-    def reach(self, which: Numbers) -> tuple[F64, F64]:
+    def reach(self, which: I64) -> tuple[F64, F64]:
         """Heights that the uppermost rays from the origins of some are at where those end, and how far away: (K,)."""
         ray = self.end[which] - self.origin[which]
         azimuth, _, level = _directions(ray)
@@ -174,7 +171,7 @@ def _directions(ray: F64) -> tuple[F64, F64, F64]:
     return np.arctan2(ray[:, 1], ray[:, 0]), np.arctan2(ray[:, 2], level), level
 
 
-def ceiling(wall: Wall, rays: Rays, own: Numbers) -> I32:
+def ceiling(wall: Wall, rays: Rays, own: I64) -> I32:
     """(C,) the highest row that each column may go on to.
 
     Any where its scan ends as the scanner's rays do, else up to the ray that would have passed above it.
@@ -215,7 +212,7 @@ def passed(wall: Wall, rays: Rays) -> Bools:
 
 
 @njit(cache=True)
-def _cross(out, origin, end, corner, normal, up, along, deep):  # type: ignore[no-untyped-def]
+def _cross(out: Bools, origin: F64, end: F64, corner: F64, normal: F64, up: F64, along: F64, deep: float) -> None:
     """Mark in `out` (R, C) the cells of a plane that rays cross from before it to `deep` metres behind it."""
     rows, columns = out.shape
     for i in range(len(end)):

@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
-from scan2sim.pipeline.types import F32, F64
+from scan2sim.pipeline.types import F32, F64, I32, I64, U8, Bools
 
 BLOCK = 32.0
 """Metres: space is worked on in square blocks of this side, one a thread, which bounds memory."""
@@ -44,14 +44,14 @@ HALO = 2
 def in_free_space(
     xyz: F32,
     origins: F32,
-    windows: npt.NDArray[np.int64],
+    windows: I64,
     *,
     voxel: float,
     reach: float,
     votes: int,
     low: float = -np.inf,
     high: float = np.inf,
-) -> tuple[npt.NDArray[np.bool_], float]:
+) -> tuple[Bools, float]:
     """(N,) which points lie where other rays have found nothing; and the share of points that rays can tell of.
 
     Args:
@@ -79,9 +79,7 @@ def in_free_space(
     return _with_outer_layer(xyz, windows, verdict, LAYER * voxel), float((verdict[candidates] > 0).mean())
 
 
-def _with_outer_layer(
-    xyz: F32, windows: npt.NDArray[np.int64], verdict: npt.NDArray[np.uint8], reach: float
-) -> npt.NDArray[np.bool_]:
+def _with_outer_layer(xyz: F32, windows: I64, verdict: U8, reach: float) -> Bools:
     """(N,) the points in free space, and those in the open that lie within `reach` of one of the same window."""
     from scipy.spatial import cKDTree
 
@@ -109,7 +107,17 @@ def _boxes(xyz: F32) -> F64:
 
 
 @njit(cache=True, parallel=True)
-def _in_free_space(xyz, origins, candidates, starts, again, boxes, voxel, reach, votes):  # type: ignore[no-untyped-def]
+def _in_free_space(
+    xyz: F32,
+    origins: F32,
+    candidates: Bools,
+    starts: I64,
+    again: Bools,
+    boxes: F64,
+    voxel: float,
+    reach: float,
+    votes: int,
+) -> U8:
     ends, spans = np.empty((len(starts) - 1, 6), np.float64), np.empty((len(starts) - 1, 6), np.float64)
     for w in prange(len(spans)):
         ends[w] = _span(xyz, starts[w], starts[w + 1], 0.0)
@@ -121,7 +129,7 @@ def _in_free_space(xyz, origins, candidates, starts, again, boxes, voxel, reach,
 
 
 @njit(cache=True)
-def _span(places, first, end, reach):  # type: ignore[no-untyped-def]
+def _span(places: F32, first: int, end: int, reach: float) -> F64:
     """Least and greatest corner of the box that holds all within `reach` of places."""
     span = np.array([np.inf, np.inf, np.inf, -np.inf, -np.inf, -np.inf])
     for i in range(first, end):
@@ -133,7 +141,20 @@ def _span(places, first, end, reach):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _carve(xyz, origins, candidates, starts, again, ends, spans, box, voxel, reach, votes, out):  # type: ignore[no-untyped-def]
+def _carve(
+    xyz: F32,
+    origins: F32,
+    candidates: Bools,
+    starts: I64,
+    again: Bools,
+    ends: F64,
+    spans: F64,
+    box: F64,
+    voxel: float,
+    reach: float,
+    votes: int,
+    out: U8,
+) -> None:
     """Mark in `out` which of the candidates that lie in the box are `FREE` or `OPEN`."""
     corner = box[:3] - HALO * voxel
     shape = np.empty(3, np.int64)
@@ -158,7 +179,20 @@ def _carve(xyz, origins, candidates, starts, again, ends, spans, box, voxel, rea
 
 
 @njit(cache=True)
-def _vote(xyz, candidates, box, corner, shape, voxel, votes, passes, hits, through, inside, out):  # type: ignore[no-untyped-def]
+def _vote(
+    xyz: F32,
+    candidates: Bools,
+    box: F64,
+    corner: F64,
+    shape: I64,
+    voxel: float,
+    votes: int,
+    passes: npt.NDArray[np.uint16],
+    hits: npt.NDArray[np.uint16],
+    through: npt.NDArray[np.uint16],
+    inside: npt.NDArray[np.uint16],
+    out: U8,
+) -> None:
     """What the counts say of each point in the box, kept in `out` if it is more than was said before."""
     for i in range(len(xyz)):
         if not candidates[i] or out[i] == FREE or xyz[i, 0] < box[0] or xyz[i, 1] < box[1] or xyz[i, 2] < box[2]:
@@ -176,7 +210,7 @@ def _vote(xyz, candidates, box, corner, shape, voxel, votes, passes, hits, throu
 
 
 @njit(cache=True)
-def _voxel(xyz, i, corner, voxel):  # type: ignore[no-untyped-def]
+def _voxel(xyz: F32, i: int, corner: F64, voxel: float) -> tuple[int, int, int]:
     """The voxel of point i: x, y and z."""
     return (
         int((xyz[i, 0] - corner[0]) / voxel),
@@ -186,7 +220,7 @@ def _voxel(xyz, i, corner, voxel):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _overlap(span, corner, far):  # type: ignore[no-untyped-def]
+def _overlap(span: F64, corner: F64, far: F64) -> bool:
     """Whether two boxes overlap."""
     apart = False
     for k in range(3):
@@ -195,7 +229,7 @@ def _overlap(span, corner, far):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _least(values, x, y, z, shape):  # type: ignore[no-untyped-def]
+def _least(values: npt.NDArray[np.uint16], x: int, y: int, z: int, shape: I64) -> int:
     """The least value of a voxel and its 26 neighbours."""
     least = values[(x * shape[1] + y) * shape[2] + z]
     for jx in range(x - 1, x + 2):
@@ -206,7 +240,19 @@ def _least(values, x, y, z, shape):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _hit(xyz, i, corner, far, shape, voxel, window, hit_in, hits, inside_in, inside):  # type: ignore[no-untyped-def]
+def _hit(
+    xyz: F32,
+    i: int,
+    corner: F64,
+    far: F64,
+    shape: I64,
+    voxel: float,
+    window: int,
+    hit_in: I32,
+    hits: npt.NDArray[np.uint16],
+    inside_in: I32,
+    inside: npt.NDArray[np.uint16],
+) -> None:
     """Mark the voxel of a return and its neighbours."""
     for k in range(3):
         if xyz[i, k] < corner[k] or xyz[i, k] >= far[k]:
@@ -227,7 +273,21 @@ def _hit(xyz, i, corner, far, shape, voxel, window, hit_in, hits, inside_in, ins
 
 
 @njit(cache=True)
-def _pass(xyz, origins, i, corner, far, shape, voxel, reach, window, hit_in, rays, passes, through):  # type: ignore[no-untyped-def]
+def _pass(
+    xyz: F32,
+    origins: F32,
+    i: int,
+    corner: F64,
+    far: F64,
+    shape: I64,
+    voxel: float,
+    reach: float,
+    window: int,
+    hit_in: I32,
+    rays: I32,
+    passes: npt.NDArray[np.uint16],
+    through: npt.NDArray[np.uint16],
+) -> None:
     """Walk along a ray from voxel to voxel (Amanatides and Woo, 1987), up to the last before its return."""
     for k in range(3):  # most rays are nowhere near a block
         if max(origins[i, k], xyz[i, k]) < corner[k] or min(origins[i, k], xyz[i, k]) >= far[k]:

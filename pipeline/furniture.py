@@ -18,10 +18,9 @@ from scan2sim.pipeline.lamps import Arm, arm
 from scan2sim.pipeline.plates import Plate, plates
 from scan2sim.pipeline.primitives import Triangles
 from scan2sim.pipeline.standing import SLAB, Columns, Stem, refined, stems
-from scan2sim.pipeline.types import F32, F64, PointCloud, Trajectory
+from scan2sim.pipeline.types import F32, F64, I64, Bools, PointCloud, Trajectory
 
 Kind = Literal["pole", "sign", "lamp", "trunk"]
-Bools = npt.NDArray[np.bool_]
 
 LEAST = 1.25
 """Metres that a pole or trunk stands free at least."""
@@ -212,7 +211,7 @@ def _lonely(cloud: PointCloud, columns: Columns, height: F32, path: Trajectory, 
     return found
 
 
-def _viewer(cloud: PointCloud, index: npt.NDArray[np.int64], path: Trajectory) -> F64:
+def _viewer(cloud: PointCloud, index: I64, path: Trajectory) -> F64:
     """(2,) from where the scanner saw points, on the ground plan: in the mean, or the path's nearest place."""
     if cloud.time is not None and len(path.times) > 1 and np.isfinite(path.times).all():
         return np.asarray(path.at(cloud.time[index])[:, :2].mean(axis=0))

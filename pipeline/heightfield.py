@@ -15,10 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from scan2sim.pipeline.errors import DataError
-from scan2sim.pipeline.types import F32, F64
+from scan2sim.pipeline.types import F32, F64, I64, Bools
 
-Bools = npt.NDArray[np.bool_]
-Ints = npt.NDArray[np.int64]
 SIZES = (0.1, 0.2, 0.25, 0.5, 1.0)
 """Metres that cells may measure: whole numbers of them make whole metres."""
 SAMPLE = 20_000
@@ -65,7 +63,7 @@ class Raster:
             )
         return cls(cell, (int(low[0]), int(low[1])), (rows, columns))
 
-    def at(self, xy: npt.NDArray[Any]) -> tuple[Ints, Ints]:
+    def at(self, xy: npt.NDArray[Any]) -> tuple[I64, I64]:
         """Rows and columns (N,) of places (N, 2 or 3); the outermost cell's for those beyond."""
         index = np.floor(np.asarray(xy)[:, :2].astype(np.float64) / self.cell + 1e-6).astype(np.int64) - self.low
         return index[:, 1].clip(0, self.shape[0] - 1), index[:, 0].clip(0, self.shape[1] - 1)

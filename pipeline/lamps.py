@@ -11,9 +11,7 @@ import numpy.typing as npt
 from scan2sim.pipeline import primitives
 from scan2sim.pipeline.primitives import Triangles
 from scan2sim.pipeline.standing import Stem
-from scan2sim.pipeline.types import F64
-
-Bools = npt.NDArray[np.bool_]
+from scan2sim.pipeline.types import F64, Bools
 
 TALL = 3.5
 """Metres of a pole that carries a lamp."""

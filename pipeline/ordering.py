@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-Numbers = npt.NDArray[np.int64]
+from scan2sim.pipeline.types import I64, Bools
 
 
-def ordered(codes: Numbers) -> tuple[Numbers, Numbers]:
+def ordered(codes: I64) -> tuple[I64, I64]:
     """The stable order (N,) of codes (N,), not below 0, and the codes (N,) in that order.
 
     Numbers are sorted several times as fast as their places: where both fit into 63 bits, they are sorted as one.
@@ -21,6 +20,6 @@ def ordered(codes: Numbers) -> tuple[Numbers, Numbers]:
     return packed & ((1 << bits) - 1), packed >> bits
 
 
-def first_of_each(codes: Numbers) -> npt.NDArray[np.bool_]:
+def first_of_each(codes: I64) -> Bools:
     """(N,) which of codes in order aren't like the one before."""
     return np.concatenate([np.ones(min(1, len(codes)), bool), codes[1:] != codes[:-1]])

@@ -11,8 +11,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from scan2sim.pipeline.heightfield import Bools, Ints, Raster, closed, signed_area
-from scan2sim.pipeline.types import F64
+from scan2sim.pipeline.heightfield import Raster, closed, signed_area
+from scan2sim.pipeline.types import F64, I64, Bools
 
 FINE = 4  # pixels of the outline's picture in a cell
 TURN = np.radians(12.0)  # by which a side may be turned to the building's main directions
@@ -33,7 +33,7 @@ class Places:
 
     xy: F64
     outward: F64
-    side: Ints
+    side: I64
 
     def __len__(self) -> int:
         return len(self.xy)
@@ -57,7 +57,7 @@ class Places:
         return Places(np.concatenate(xy), np.concatenate(outward), np.concatenate(side))
 
 
-def roofs(top: F64, cell: float, step: float, least: float) -> Ints:
+def roofs(top: F64, cell: float, step: float, least: float) -> I64:
     """Which roof each cell belongs to, 0: none.
 
     Cells are of one roof where one gets from one to the other without a step of more than `step` metres; what is

@@ -99,7 +99,7 @@ def detect(xyz: F32, normal: F32, voxel: float) -> tuple[Planes, I32, float]:
 
 
 @njit(cache=True, parallel=True)
-def _residuals(xyz, normal, near):  # type: ignore[no-untyped-def]
+def _residuals(xyz: F64, normal: F64, near: I32) -> F64:
     """(N,) root mean square distance of each point's neighbours to the plane through their middle."""
     n = len(xyz)
     out = np.empty(n)
@@ -116,13 +116,13 @@ def _residuals(xyz, normal, near):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, inline="always")
-def _along(places, i, axis):  # type: ignore[no-untyped-def]
+def _along(places: F64, i: int, axis: F64) -> float:
     """Place i (of (N, 3)) along an axis (3,)."""
     return places[i, 0] * axis[0] + places[i, 1] * axis[1] + places[i, 2] * axis[2]
 
 
 @njit(cache=True)
-def _grow(xyz, normal, near, seeds, tolerance, turn, least):  # type: ignore[no-untyped-def]
+def _grow(xyz: F64, normal: F64, near: I32, seeds: I32, tolerance: float, turn: float, least: int) -> I32:
     """(N,) regions from each seed in turn: neighbours are added that lie on the plane so far; small ones dissolve."""
     n, found = len(xyz), 0
     which = np.full(n, -1, np.int32)
@@ -166,7 +166,7 @@ def _grow(xyz, normal, near, seeds, tolerance, turn, least):  # type: ignore[no-
 
 
 @njit(cache=True, parallel=True)
-def _widened(xyz, near, which, normal, offset, tolerance):  # type: ignore[no-untyped-def]
+def _widened(xyz: F64, near: I32, which: I32, normal: F64, offset: F64, tolerance: float) -> I32:
     """Each point's plane: its own, else that of its neighbours' which it lies on best."""
     n = len(xyz)
     out = which.copy()

@@ -18,10 +18,8 @@ import numpy.typing as npt
 from scan2sim.pipeline.cameras import pixel_angle
 from scan2sim.pipeline.facades import Wall
 from scan2sim.pipeline.projection import pixels
-from scan2sim.pipeline.types import F32, I32, U8, View
+from scan2sim.pipeline.types import F32, I32, U8, Bools, View
 from scan2sim.pipeline.visibility import DepthMap, visible
-
-Bools = npt.NDArray[np.bool_]
 
 TEXELS = 2
 """Samples of the photos along a cell's side."""

@@ -14,9 +14,8 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from scan2sim.pipeline.types import F64
+from scan2sim.pipeline.types import F64, I64, Bools
 
-Bools = npt.NDArray[np.bool_]
 Shape = Literal["rectangle", "disc", "octagon", "triangle", "triangle_down", "diamond"]
 
 THIN = 0.04
@@ -169,7 +168,7 @@ def _line(xy: F64) -> tuple[F64, F64]:
     return middle, along
 
 
-def _largest(flat: F64) -> npt.NDArray[np.int64]:
+def _largest(flat: F64) -> I64:
     """Indices of the largest connected piece of points (N, 2)."""
     from scipy import ndimage
 

@@ -7,7 +7,7 @@ of them (how a picture is read at a pixel: `pipeline.sampling`). `pixels` does i
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +15,7 @@ from numba import njit, prange
 
 from scan2sim.pipeline.cameras import EQUIRECTANGULAR, MODEL_ID, ORTHOGRAPHIC, parameters, pixel_angle, project_point
 from scan2sim.pipeline.sampling import nearest
-from scan2sim.pipeline.types import F32, F64, Camera
+from scan2sim.pipeline.types import F32, F64, Bools, Camera
 
 SLOPE_SHARE = 0.4
 """Of a pixel's footprint times the slope, what is added to the bias; more leaks, less hides falsely."""
@@ -63,7 +63,7 @@ def eye(camera: Camera, T_world_cam: F64, axes: F64 | None = None) -> Eye:
     return Eye(MODEL_ID[camera.model], parameters(camera), T, pixel_angle(camera))
 
 
-def pixels(camera: Camera, T_world_cam: F64, places: npt.ArrayLike) -> tuple[F32, npt.NDArray[np.bool_]]:
+def pixels(camera: Camera, T_world_cam: F64, places: npt.ArrayLike) -> tuple[F32, Bools]:
     """Where a camera shows places, whether or not something hides them.
 
     Args:
@@ -77,7 +77,7 @@ def pixels(camera: Camera, T_world_cam: F64, places: npt.ArrayLike) -> tuple[F32
 
 
 @njit(cache=True, inline="always")
-def to_camera(T, x, y, z):  # type: ignore[no-untyped-def]
+def to_camera(T: F64, x: float, y: float, z: float) -> tuple[float, float, float]:
     """(x, y, z) of a place in the axes that T (4, 4) leads to."""
     return (
         T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3],
@@ -87,7 +87,7 @@ def to_camera(T, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, inline="always")
-def turned(T, x, y, z):  # type: ignore[no-untyped-def]
+def turned(T: F64, x: float, y: float, z: float) -> tuple[float, float, float]:
     """(x, y, z) of a direction in the axes that T (4, 4) leads to."""
     return (
         T[0, 0] * x + T[0, 1] * y + T[0, 2] * z,
@@ -97,7 +97,7 @@ def turned(T, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def pixel_of(eye, x, y, z):  # type: ignore[no-untyped-def]
+def pixel_of(eye: Eye, x: float, y: float, z: float) -> tuple[float, float, bool]:
     """(u, v, ok): the pixel of a place in camera axes; ok: it is within the image and its border of half a pixel."""
     u, v, ok = project_point(eye.model, eye.p, x, y, z)
     ok = ok and -0.5 <= v < eye.p[13] - 0.5
@@ -105,7 +105,7 @@ def pixel_of(eye, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, inline="always")
-def incidence(eye, x, y, z, nx, ny, nz):  # type: ignore[no-untyped-def]
+def incidence(eye: Eye, x: float, y: float, z: float, nx: float, ny: float, nz: float) -> tuple[float, float]:
     """(range, cos) of a place and its unit normal, camera axes: metres along the ray, and cosine of the incidence.
 
     The cosine is above 0 for what is seen from the side that the normal is on.
@@ -117,7 +117,7 @@ def incidence(eye, x, y, z, nx, ny, nz):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, inline="always")
-def range_pixel(eye, ranges, u, v, r, cos):  # type: ignore[no-untyped-def]
+def range_pixel(eye: Eye, ranges: Any, u: float, v: float, r: float, cos: float) -> tuple[int, int, float]:
     """(row, column, lean): the pixel of the range image that a place seen at (range, cos) is in.
 
     And the metres by which the range changes across it, on a surface that is so inclined.
@@ -129,7 +129,7 @@ def range_pixel(eye, ranges, u, v, r, cos):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, inline="always")
-def is_behind(r, first, lean, pixels, bias):  # type: ignore[no-untyped-def]
+def is_behind(r: float, first: float, lean: float, pixels: float, bias: float) -> bool:
     """Whether a place is hidden by the `first` hit; every test of visibility is this one.
 
     Args:
@@ -142,7 +142,7 @@ def is_behind(r, first, lean, pixels, bias):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def is_visible(eye, ranges, u, v, r, cos, bias):  # type: ignore[no-untyped-def]
+def is_visible(eye: Eye, ranges: Ranges, u: float, v: float, r: float, cos: float, bias: float) -> bool:
     """Whether nothing hides what is at a pixel within the image.
 
     Args:
@@ -156,7 +156,7 @@ def is_visible(eye, ranges, u, v, r, cos, bias):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, parallel=True)
-def visible_places(eye, ranges, places, normals, bias):  # type: ignore[no-untyped-def]
+def visible_places(eye: Eye, ranges: Ranges, places: F64, normals: F64, bias: float) -> Bools:
     """(N,) bool: `is_visible` for places (N, 3) and normals (N, 3), or (0, 3): all head-on."""
     seen = np.zeros(len(places), np.bool_)
     for i in prange(len(places)):
@@ -173,7 +173,7 @@ def visible_places(eye, ranges, places, normals, bias):  # type: ignore[no-untyp
 
 
 @njit(cache=True, parallel=True)
-def _pixels(eye, places):  # type: ignore[no-untyped-def]
+def _pixels(eye: Eye, places: F64) -> tuple[F32, Bools]:
     uv, ok = np.empty((len(places), 2), np.float32), np.empty(len(places), np.bool_)
     for i in prange(len(places)):
         x, y, z = to_camera(eye.T, places[i, 0], places[i, 1], places[i, 2])

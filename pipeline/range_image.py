@@ -13,7 +13,7 @@ from numba import njit, prange
 
 from scan2sim.pipeline.cameras import EQUIRECTANGULAR, FISHEYE, ORTHOGRAPHIC, project_point
 from scan2sim.pipeline.projection import Eye, to_camera, turned
-from scan2sim.pipeline.types import F32
+from scan2sim.pipeline.types import F32, I32, I64
 
 BAND = 32
 MAX_DISC = 40
@@ -29,7 +29,7 @@ def draw_discs(depth: F32, rays: F32, eye: Eye, centres: F32, normals: F32, radi
 
 
 @njit(cache=True, parallel=True)
-def _discs(eye, centres, normals, radii):  # type: ignore[no-untyped-def]
+def _discs(eye: Eye, centres: F32, normals: F32, radii: F32) -> F32:
     """(N, 3, 3) float32: centre and normal in camera axes, and radius, of every disc."""
     out = np.empty((len(centres), 3, 3), np.float32)
     for i in prange(len(centres)):
@@ -41,7 +41,7 @@ def _discs(eye, centres, normals, radii):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, parallel=True)
-def _disc_boxes(eye, discs):  # type: ignore[no-untyped-def]
+def _disc_boxes(eye: Eye, discs: F32) -> I32:
     """(N, 4) the footprints' pixels: u0, v0, u1, v1, inclusive; those of a panorama may go on over its side."""
     boxes = np.empty((len(discs), 4), np.int32)
     model, p = eye.model, eye.p
@@ -72,7 +72,7 @@ def _disc_boxes(eye, discs):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _bands(boxes, height):  # type: ignore[no-untyped-def]
+def _bands(boxes: I32, height: int) -> tuple[I64, I32]:
     """Footprints sorted into bands of rows: (start (B+1,), indices), in their own order within a band."""
     n = (height + BAND - 1) // BAND
     start = np.zeros(n + 1, np.int64)
@@ -93,7 +93,7 @@ def _bands(boxes, height):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, parallel=True)
-def _fill(depth, rays, eye, discs, boxes, start, index):  # type: ignore[no-untyped-def]
+def _fill(depth: F32, rays: F32, eye: Eye, discs: F32, boxes: I32, start: I64, index: I32) -> None:
     """Keep in every pixel the least range at which its ray meets a disc."""
     p = eye.p
     height, width = depth.shape
@@ -115,7 +115,7 @@ def _fill(depth, rays, eye, discs, boxes, start, index):  # type: ignore[no-unty
 
 
 @njit(cache=True, inline="always")
-def _intersect_disc(d, s, x0, y0):  # type: ignore[no-untyped-def]
+def _intersect_disc(d: F32, s: F32, x0: float, y0: float) -> float:
     """Range at which the unit ray d from (x0, y0, 0) meets the disc s: centre, normal, radius; -1 if it does not."""
     along = d[0] * s[1, 0] + d[1] * s[1, 1] + d[2] * s[1, 2]
     if abs(along) < 0.05:  # seen edge-on

@@ -10,15 +10,12 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit, prange
 
-from scan2sim.pipeline.projection import eye, incidence, is_visible, pixel_of, to_camera, turned
+from scan2sim.pipeline.projection import Eye, Ranges, eye, incidence, is_visible, pixel_of, to_camera, turned
 from scan2sim.pipeline.step import Report, silent
-from scan2sim.pipeline.types import F32, F64, PointCloud, View
+from scan2sim.pipeline.types import F32, F64, Bools, PointCloud, View
 from scan2sim.pipeline.visibility import depth_map, scene
-
-Bools = npt.NDArray[np.bool_]
 
 PIXELS = 300_000
 """Range images are at most this large: points of decimetres need no finer ones."""
@@ -48,7 +45,7 @@ def finest(cloud: PointCloud, views: Sequence[View], *, size: float, coarsest: f
 
 
 @njit(cache=True, parallel=True)
-def _refine(patch, xyz, normals, eye, ranges, bias, coarsest):  # type: ignore[no-untyped-def]
+def _refine(patch: F32, xyz: F32, normals: F32, eye: Eye, ranges: Ranges, bias: float, coarsest: float) -> None:
     """Lower `patch` in place to what one photo's pixels cover, where that photo sees the point."""
     for i in prange(len(patch)):
         x, y, z = to_camera(eye.T, xyz[i, 0], xyz[i, 1], xyz[i, 2])

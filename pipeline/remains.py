@@ -7,10 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from scan2sim.pipeline.steps.geometry import spread
-from scan2sim.pipeline.types import F64, Frame, Mesh
+from scan2sim.pipeline.types import F32, F64, Bools, Frame, Mesh
 
 SIDES = 0.1
 """Metres that a vehicle's box is taken smaller to each side: a wall that it touches is not its own."""
@@ -69,7 +68,7 @@ def _within(mesh: Mesh, corners: F64, height: float) -> float:
     return float(inside.mean()) * area
 
 
-def _along(places: npt.NDArray[np.float32], start: F64, side: F64) -> npt.NDArray[np.bool_]:
+def _along(places: F32, start: F64, side: F64) -> Bools:
     """(N,) whether places lie between the ends of a side, `SIDES` within them."""
     length = float(np.linalg.norm(side[:2]))
     along = (places[:, :2] - start[:2]) @ side[:2] / max(length, 1e-6)

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.types import F32, F64, I32, U8, Camera, Mesh
+from scan2sim.pipeline.types import F32, F64, I32, U8, Bools, Camera, Mesh
 
 CHUNK = 500_000
 """Rays at a time, to bound memory."""
@@ -57,7 +57,7 @@ class Image:
     """
 
     rgb: U8
-    hit: npt.NDArray[np.bool_]
+    hit: Bools
     seen: U8
     face: I32
     body: npt.NDArray[np.int16]
@@ -293,7 +293,7 @@ def _sub_pixels(samples: int) -> tuple[F64, F64]:
     return across.ravel(), down.ravel()
 
 
-def _mean(colours: U8, hit: npt.NDArray[np.bool_], centre: U8) -> U8:
+def _mean(colours: U8, hit: Bools, centre: U8) -> U8:
     """Mean (N, 3) of the S colours (N * S, 3) of every pixel that `hit` (N * S,); of none: the `centre`'s (N, 3)."""
     pixels, each = len(centre), len(hit) // max(1, len(centre))
     count = hit.reshape(pixels, each, 1).sum(axis=1)

@@ -8,18 +8,25 @@ do. Import late: it loads numba.
 from __future__ import annotations
 
 import math
+from typing import Any
 
+import numpy.typing as npt
 from numba import njit
+
+from scan2sim.pipeline.types import F64, U8
+
+Taps = tuple[int, int, int, int, float, float, float, float]
+"""Columns, rows, and weights of a bilinear lookup: see `taps`."""
 
 
 @njit(cache=True, inline="always")
-def rescaled(p, u, v, picture):  # type: ignore[no-untyped-def]
+def rescaled(p: F64, u: float, v: float, picture: npt.NDArray[Any]) -> tuple[float, float]:
     """(x, y): the pixel of a picture (H, W, ...) that shows what the photo's pixel (u, v) shows."""
     return (u + 0.5) * (picture.shape[1] / p[12]) - 0.5, (v + 0.5) * (picture.shape[0] / p[13]) - 0.5
 
 
 @njit(cache=True, inline="always")
-def halving(wide, count):  # type: ignore[no-untyped-def]
+def halving(wide: float, count: int) -> int:
     """Which of `count` halvings of a photo to read where what is painted is `wide` of its pixels wide: no finer one."""
     level = 0
     while level + 1 < count and wide >= 1.6:
@@ -29,14 +36,14 @@ def halving(wide, count):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, inline="always")
-def nearest(p, u, v, picture):  # type: ignore[no-untyped-def]
+def nearest(p: F64, u: float, v: float, picture: npt.NDArray[Any]) -> tuple[int, int]:
     """(row, column) of the pixel of a picture (H, W, ...) that a place (u, v) within the photo is in."""
     row, column = int((v + 0.5) * (picture.shape[0] / p[13])), int((u + 0.5) * (picture.shape[1] / p[12]))
     return min(max(row, 0), picture.shape[0] - 1), min(max(column, 0), picture.shape[1] - 1)
 
 
 @njit(cache=True, inline="always")
-def allows(mask, p, u, v):  # type: ignore[no-untyped-def]
+def allows(mask: U8, p: F64, u: float, v: float) -> bool:
     """Whether a mask (H, W), 0 where the photo must not be used, lets it be used at (u, v); (0, 0) always does."""
     if mask.shape[0] == 0:
         return True
@@ -45,7 +52,7 @@ def allows(mask, p, u, v):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, inline="always")
-def taps(picture, x, y, wrap):  # type: ignore[no-untyped-def]
+def taps(picture: npt.NDArray[Any], x: float, y: float, wrap: bool) -> Taps:
     """(a, b, c, d, w_ca, w_cb, w_da, w_db): columns, rows, weights of a bilinear lookup; outside, borders go on."""
     height, width = picture.shape[0], picture.shape[1]
     x0, y0 = math.floor(x), math.floor(y)
@@ -60,28 +67,28 @@ def taps(picture, x, y, wrap):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, inline="always")
-def mixed(picture, k, at):  # type: ignore[no-untyped-def]
+def mixed(picture: npt.NDArray[Any], k: int, at: Taps) -> float:
     """Channel k of a picture (H, W, C) at `taps`."""
     a, b, c, d, w_ca, w_cb, w_da, w_db = at
     return picture[c, a, k] * w_ca + picture[c, b, k] * w_cb + picture[d, a, k] * w_da + picture[d, b, k] * w_db
 
 
 @njit(cache=True, inline="always")
-def bilinear(picture, x, y, wrap):  # type: ignore[no-untyped-def]
+def bilinear(picture: npt.NDArray[Any], x: float, y: float, wrap: bool) -> tuple[float, float, float]:
     """(r, g, b) of a picture (H, W, 3) at its pixel (x, y)."""
     at = taps(picture, x, y, wrap)
     return mixed(picture, 0, at), mixed(picture, 1, at), mixed(picture, 2, at)
 
 
 @njit(cache=True, inline="always")
-def read(picture, p, u, v, wrap):  # type: ignore[no-untyped-def]
+def read(picture: npt.NDArray[Any], p: F64, u: float, v: float, wrap: bool) -> tuple[float, float, float]:
     """(r, g, b) of a picture (H, W, 3) of a photo, where the photo's pixel (u, v) is."""
     x, y = rescaled(p, u, v, picture)
     return bilinear(picture, x, y, wrap)
 
 
 @njit(cache=True)
-def bicubic(picture, x, y, wrap):  # type: ignore[no-untyped-def]
+def bicubic(picture: npt.NDArray[Any], x: float, y: float, wrap: bool) -> tuple[float, float, float]:
     """The same, bicubic: keeps what bilinear interpolation blurs (Catmull and Rom)."""
     height, width = picture.shape[0], picture.shape[1]
     x0, y0 = math.floor(x), math.floor(y)
@@ -100,7 +107,7 @@ def bicubic(picture, x, y, wrap):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, inline="always")
-def _cubic(f):  # type: ignore[no-untyped-def]
+def _cubic(f: float) -> tuple[float, float, float, float]:
     """Weights of four neighbours at fraction f between the middle ones."""
     f2, f3 = f * f, f * f * f
     return (

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from scan2sim.pipeline.ordering import first_of_each, ordered
 from scan2sim.pipeline.planes import Planes
-from scan2sim.pipeline.types import F32, F64, I32, Mesh
+from scan2sim.pipeline.types import F32, F64, I32, I64, Bools, Mesh
 
 NEAR = 16
 """Points around a vertex whose planes it may lie on."""
@@ -41,7 +41,7 @@ ROUNDS = 8
 """Times that vertices are given back, whose faces have turned over."""
 
 
-Edges = tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]
+Edges = tuple[I64, I64]
 """Of a mesh, as `edges_of` gives them."""
 
 
@@ -57,7 +57,7 @@ class Sharpened:
 
     mesh: Mesh
     which: I32
-    edge: npt.NDArray[np.bool_]
+    edge: Bools
 
 
 def sharpen(
@@ -65,7 +65,7 @@ def sharpen(
     edges: Edges,
     planes: Planes,
     own: I32,
-    beside: npt.NDArray[np.bool_],
+    beside: Bools,
     share: F64,
     ends: int,
     voxel: float,
@@ -119,9 +119,7 @@ def sharpen(
     return Sharpened(small, which_of[used], edge)
 
 
-def plane_of(
-    mesh: Mesh, planes: Planes, xyz: F32, which: I32, voxel: float, tolerance: float
-) -> tuple[I32, npt.NDArray[np.bool_]]:
+def plane_of(mesh: Mesh, planes: Planes, xyz: F32, which: I32, voxel: float, tolerance: float) -> tuple[I32, Bools]:
     """(V,) each vertex's plane, -1 for none; and whether it lies beside an edge.
 
     A vertex's is the nearest point's, where it lies on it and faces as it does; beside an edge, which Poisson has
@@ -168,9 +166,7 @@ def intersect(places: F64, planes: Planes, which: npt.NDArray[np.integer]) -> tu
     return places + shift, np.where(good, np.linalg.norm(shift, axis=1), np.inf)
 
 
-def upright(
-    first: F64, last: F64, faces: npt.NDArray[np.integer], was: F64, least: float
-) -> tuple[F64, npt.NDArray[np.bool_]]:
+def upright(first: F64, last: F64, faces: npt.NDArray[np.integer], was: F64, least: float) -> tuple[F64, Bools]:
     """Vertices at `last` (V, 3), but at `first` where a face would turn against its old normal; and which stayed.
 
     Old normals `was` (F, 3) are as long as twice the area; faces below `least` m2 may turn: they have no direction to
@@ -196,14 +192,16 @@ def upright(
     return last, stayed
 
 
-def border_of(edges: Edges) -> npt.NDArray[np.int64]:
+def border_of(edges: Edges) -> I64:
     """The vertices on a mesh's border."""
     pairs, of_face = edges
     return np.unique(pairs[np.bincount(of_face.ravel(), minlength=len(pairs)) == 1])
 
 
 @njit(cache=True, parallel=True)
-def _assign(xyz, normal, near, axis, offset, tolerance, rounded, own, beside):  # type: ignore[no-untyped-def]
+def _assign(
+    xyz: F64, normal: F64, near: I32, axis: F64, offset: F64, tolerance: float, rounded: float, own: I32, beside: Bools
+) -> None:
     for i in prange(len(xyz)):
         seen = np.empty(4, np.int32)
         count = 0
@@ -261,9 +259,7 @@ def edges_of(mesh: Mesh) -> Edges:
     return np.stack([code[first] // side, code[first] % side], axis=1), of_face.reshape(-1, 3)
 
 
-def _split(
-    faces: npt.NDArray[np.int64], new: npt.NDArray[np.int64], count: int
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+def _split(faces: I64, new: I64, count: int) -> tuple[I64, I64, I64]:
     """Faces (F, 3) split at the new vertices of their edges (F, 3), -1 for none.
 
     One that has three gets a vertex in its middle as well, numbered from `count` on.
@@ -274,11 +270,11 @@ def _split(
     cuts = (new >= 0).sum(axis=1)
     parts, parents = [faces[cuts == 0]], [np.flatnonzero(cuts == 0)]
 
-    def add(of: npt.NDArray[np.int64], *corners: npt.NDArray[np.int64]) -> None:
+    def add(of: I64, *corners: I64) -> None:
         parts.append(np.stack(corners, axis=1))
         parents.append(of)
 
-    def turned(of: npt.NDArray[np.int64], by: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.int64], ...]:
+    def turned(of: I64, by: I64) -> tuple[I64, ...]:
         """Corners and new vertices, from corner `by` on."""
         order = (by[:, None] + np.arange(3)) % 3
         v, e = np.take_along_axis(faces[of], order, 1), np.take_along_axis(new[of], order, 1)

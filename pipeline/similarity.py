@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from scan2sim.pipeline.errors import DataError
-from scan2sim.pipeline.types import F64
+from scan2sim.pipeline.types import F64, Bools
 
-Bools = npt.NDArray[np.bool_]
 TRIALS = 1000
 
 

@@ -17,10 +17,7 @@ import numpy.typing as npt
 from numba import njit
 
 from scan2sim.pipeline.ordering import ordered
-from scan2sim.pipeline.types import F32, F64
-
-Bools = npt.NDArray[np.bool_]
-Ints = npt.NDArray[np.int64]
+from scan2sim.pipeline.types import F32, F64, I64, Bools
 
 CELL = 0.1
 """Metres: discs have a gap around them at least so wide, which is a voxel of the mission's."""
@@ -273,7 +270,7 @@ def _rough(run: F64) -> float:
     return 1.48 / math.sqrt(1.5) * float(np.median(np.abs(bend)))
 
 
-def _around(columns: Columns, chain: Chain) -> Ints:
+def _around(columns: Columns, chain: Chain) -> I64:
     """The points of a chain's discs."""
     near = columns.near(chain.at(np.array([(chain.low + chain.high) / 2]))[0], WIDEST + 0.4)
     z = columns.xyz[near, 2]
@@ -298,7 +295,7 @@ class Columns:
         self._order, code = ordered(at[:, 0] * self._size[1] + at[:, 1])
         self._start = np.searchsorted(code, np.arange(int(self._size.prod()) + 1))
 
-    def near(self, place: F64, radius: float) -> Ints:
+    def near(self, place: F64, radius: float) -> I64:
         """Indices of the points in the square of twice the radius around a place (2,)."""
         first = np.clip(np.floor(place - radius).astype(int) - self._low, 0, self._size - 1)
         last = np.clip(np.floor(place + radius).astype(int) - self._low, 0, self._size - 1)
@@ -350,7 +347,7 @@ def circle(xy: F64, weight: F64) -> tuple[F64, float]:
 
 
 @njit(cache=True)
-def refined(xy, weight, middle, radius, steps, firm):  # type: ignore[no-untyped-def]
+def refined(xy: F64, weight: F64, middle: F64, radius: float, steps: int, firm: float) -> tuple[F64, float]:
     """A circle, middle (2,) and radius, moved to points by Gauss and Newton's method, outliers weighed down (Tukey).
 
     Args:
@@ -388,7 +385,7 @@ def refined(xy, weight, middle, radius, steps, firm):  # type: ignore[no-untyped
 
 
 @njit(cache=True)
-def _solved(A, g):  # type: ignore[no-untyped-def]
+def _solved(A: F64, g: F64) -> F64:
     """(3,) solution of a symmetric system of three, by Cramer's rule."""
     a, b, c, d, e, f = A[0, 0], A[0, 1], A[0, 2], A[1, 1], A[1, 2], A[2, 2]
     p, q, r = d * f - e * e, c * e - b * f, b * e - c * d

@@ -5,11 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from scan2sim.pipeline.types import F32, F64, Trajectory
-
-Bools = npt.NDArray[np.bool_]
+from scan2sim.pipeline.types import F32, F64, I64, Bools, Trajectory
 
 HALF_WIDTH, AHEAD, BEHIND, ROOF = 1.0, 2.8, 3.2, 0.3
 """Metres that a car's body reaches from a scanner on its roof: to each side, ahead, behind, above."""
@@ -109,7 +106,7 @@ def _lengthened(places: F64) -> F64:
     return np.concatenate(parts)
 
 
-def _near(xyz: F32, places: F64, reach: float) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+def _near(xyz: F32, places: F64, reach: float) -> tuple[I64, I64]:
     """Of the points that may be within `reach` of a place (in plan): the nearest place to their cell, and their index.
 
     Places are looked up by square cells of `STEP`, so that points far away cost next to nothing.

@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scan2sim.pipeline.classes import CODE
-from scan2sim.pipeline.types import F32, F64, Camera, Mesh, PointCloud
+from scan2sim.pipeline.types import F32, F64, Bools, Camera, Mesh, PointCloud
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.projection import Ranges
@@ -162,7 +162,7 @@ def _with(still: Scene, moving: PointCloud | None, radius: float) -> Scene:
     )
 
 
-def _of_class(cloud: PointCloud, codes: tuple[int, ...]) -> npt.NDArray[np.bool_]:
+def _of_class(cloud: PointCloud, codes: tuple[int, ...]) -> Bools:
     """(N,) which points are of these classes; none where the classes aren't known."""
     return np.zeros(len(cloud), bool) if cloud.classification is None else np.isin(cloud.classification, codes)
 
@@ -271,7 +271,7 @@ def load_depth_map(path: Path, camera: Camera, T_world_cam: F64) -> DepthMap:
 
 def visible(
     depth: DepthMap, points: npt.ArrayLike, normals: npt.ArrayLike | None = None, *, bias: float = BIAS
-) -> npt.NDArray[np.bool_]:
+) -> Bools:
     """(N,) which points the view sees: within the image, and not behind what its range image shows.
 
     Args:

@@ -9,20 +9,18 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 
 from scan2sim.pipeline.channels import FAR, FRACTION, NEAR, coded_height
-from scan2sim.pipeline.types import F32, U8
+from scan2sim.pipeline.types import F32, I64, U8
 from scan2sim.segmentation.labels import CLASSES
 
-Ints = npt.NDArray[np.int64]
 Rng = np.random.Generator
 
 WITHOUT = 0.25
 """Share of the crops without any channels: photos that come alone."""
 
 
-def augmented(rgb: U8, classes: U8, channels: U8, crop: tuple[int, int], rng: Rng) -> tuple[F32, Ints]:
+def augmented(rgb: U8, classes: U8, channels: U8, crop: tuple[int, int], rng: Rng) -> tuple[F32, I64]:
     """A part of a photo as another camera might have taken it on another day: (h, w, 7) in [0, 1], (h, w).
 
     Args:

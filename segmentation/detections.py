@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-import numpy.typing as npt
 
-from scan2sim.pipeline.types import F64, U8, View
+from scan2sim.pipeline.types import F32, F64, U8, View
 from scan2sim.segmentation.labels import CLASSES
 
 SURE = 127.5
@@ -71,7 +70,7 @@ def _along(ray: F64, own: int, views: Sequence[View], shown: Mapping[int, U8]) -
     return (float(share.max()), places[best[len(best) // 2]]) if share.max() > 0.5 else None
 
 
-def _sampled(view: View, sign: U8, places: F64) -> npt.NDArray[np.float32]:
+def _sampled(view: View, sign: U8, places: F64) -> F32:
     """(N,) how surely a photo shows a sign at places (N, 3), of 255; NaN where it doesn't show them."""
     from scan2sim.pipeline.projection import pixels
 

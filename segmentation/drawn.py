@@ -13,7 +13,7 @@ from numba import njit
 
 from scan2sim.pipeline.cameras import EQUIRECTANGULAR, project_point
 from scan2sim.pipeline.channels import FAR, FRACTION, coded, level
-from scan2sim.pipeline.projection import eye, to_camera
+from scan2sim.pipeline.projection import Eye, eye, to_camera
 from scan2sim.pipeline.types import F32, I32, U8, Camera, PointCloud, View
 
 NEIGHBOURS = 12
@@ -64,7 +64,7 @@ def resized(camera: Camera, size: tuple[int, int]) -> Camera:
 
 
 @njit(cache=True)
-def _draw(nearest, distance, xyz, eye, size):  # type: ignore[no-untyped-def]
+def _draw(nearest: I32, distance: F32, xyz: F32, eye: Eye, size: float) -> None:
     """Which point each pixel shows: the nearest of the squares over it, whose sides are `size` metres."""
     rows, columns = nearest.shape
     wide, half = eye.model == EQUIRECTANGULAR, 0.5 * size / eye.pixel
@@ -89,7 +89,7 @@ def _draw(nearest, distance, xyz, eye, size):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def filled(codes):  # type: ignore[no-untyped-def]
+def filled(codes: U8) -> U8:
     """(h, w, 4): pixels where nothing is, with some around them, take their nearest neighbour's codes."""
     out = codes.copy()
     rows, columns = codes.shape[0], codes.shape[1]

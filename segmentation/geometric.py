@@ -20,10 +20,7 @@ import numpy.typing as npt
 
 from scan2sim.pipeline.classes import CODE
 from scan2sim.pipeline.step import Report, silent
-from scan2sim.pipeline.types import F32, F64, I32, U8, PointCloud
-
-Bools = npt.NDArray[np.bool_]
-Ints = npt.NDArray[np.int64]
+from scan2sim.pipeline.types import F32, F64, I32, I64, U8, Bools, PointCloud
 
 NEIGHBOURS = 20
 FEW = 30  # points, fewer have no shape
@@ -153,7 +150,7 @@ def _fill(grid: F32, holes: Bools) -> F32:
     return grid[tuple(nearest)]
 
 
-def _voxels(xyz: F32, size: float) -> tuple[F32, Ints]:
+def _voxels(xyz: F32, size: float) -> tuple[F32, I64]:
     """Centroids (M, 3) of the occupied voxels, and each point's voxel (N,)."""
     cells = np.floor((xyz - xyz.min(axis=0)) / size).astype(np.int64)
     spans = cells.max(axis=0) + 1
@@ -226,10 +223,10 @@ class Parts:
         count: (P,) points.
     """
 
-    of: Ints
+    of: I64
     low: F64
     high: F64
-    count: Ints
+    count: I64
 
     @property
     def size(self) -> F64:
@@ -246,7 +243,7 @@ class Parts:
         return self.total(values) / np.maximum(self.count, 1)
 
 
-def _parts(xyz: F32, member: Bools, a: Ints, b: Ints) -> Parts:
+def _parts(xyz: F32, member: Bools, a: I64, b: I64) -> Parts:
     """Connected parts of the points that are `member`, over edges `a`-`b` between them."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -259,7 +256,7 @@ def _parts(xyz: F32, member: Bools, a: Ints, b: Ints) -> Parts:
     return _boxes(xyz, of)
 
 
-def _boxes(xyz: F32, of: Ints) -> Parts:
+def _boxes(xyz: F32, of: I64) -> Parts:
     """Parts numbered 0, 1, ... by `of` (-1 for none), with their bounding boxes."""
     count = np.bincount(of[of >= 0])
     if len(count) == 0:
@@ -271,7 +268,7 @@ def _boxes(xyz: F32, of: Ints) -> Parts:
     return Parts(of, low, high, count)
 
 
-def _edges(shape: Shape, member: Bools, k: int, reach: float) -> tuple[Ints, Ints]:
+def _edges(shape: Shape, member: Bools, k: int, reach: float) -> tuple[I64, I64]:
     """Pairs of neighbours (first `k`) that are members, nearer than `reach` or than three times the local spacing."""
     rows = np.flatnonzero(member)
     near, gap = shape.near[rows, :k], shape.gap[rows, :k]

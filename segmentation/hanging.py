@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -14,9 +13,7 @@ from scan2sim.pipeline import primitives
 from scan2sim.pipeline.classes import CODE
 from scan2sim.pipeline.furniture import SHEET, sheet
 from scan2sim.pipeline.plates import Plate, inside
-from scan2sim.pipeline.types import F64, Mesh
-
-Bools = npt.NDArray[np.bool_]
+from scan2sim.pipeline.types import F64, I64, Bools, Mesh
 
 BEFORE, BEHIND, BESIDE = 0.5, 0.05, 0.1
 """Metres before, behind and beside a plate within which surfaces are its own points' smear."""
@@ -36,7 +33,7 @@ def without(mesh: Mesh, plates: Sequence[Plate]) -> Mesh:
     return mesh.keep(~gone)
 
 
-def pieces(mesh: Mesh, code: int) -> list[npt.NDArray[np.int64]]:
+def pieces(mesh: Mesh, code: int) -> list[I64]:
     """Faces of a class in connected pieces."""
     if mesh.classification is None:
         return []
@@ -45,7 +42,7 @@ def pieces(mesh: Mesh, code: int) -> list[npt.NDArray[np.int64]]:
     return [faces[piece == k] for k in np.unique(piece)]
 
 
-def _connected(mesh: Mesh, faces: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+def _connected(mesh: Mesh, faces: I64) -> I64:
     """(F,) the connected piece that each of the faces belongs to."""
     a, b, c = mesh.faces[faces].T
     links = coo_array((np.ones(2 * len(a), np.int8), (np.r_[a, b], np.r_[b, c])), shape=(len(mesh.vertices),) * 2)

@@ -20,10 +20,8 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from scan2sim.pipeline.classes import CODE
-from scan2sim.pipeline.types import F32, F64, U8
+from scan2sim.pipeline.types import F32, F64, I64, U8, Bools
 
-Bools = npt.NDArray[np.bool_]
-Ints = npt.NDArray[np.int64]
 Span = tuple[float, float]
 
 
@@ -108,7 +106,7 @@ class Thing:
     height: float
     odds: float
     moved: bool
-    index: Ints
+    index: I64
 
     @property
     def box(self) -> Rectangle:
@@ -194,7 +192,7 @@ def vehicles(scan: Scan) -> list[Thing]:
     return found
 
 
-def no_vehicles(scan: Scan, found: Sequence[Thing]) -> Ints:
+def no_vehicles(scan: Scan, found: Sequence[Thing]) -> I64:
     """Indices of points that are classified as vehicles, but lie on the ground or in clusters of no vehicle's shape.
 
     What is classified so below the vehicles that were `found` is theirs: wheels and sills.
@@ -213,7 +211,7 @@ def no_vehicles(scan: Scan, found: Sequence[Thing]) -> Ints:
     return np.flatnonzero(wrong)
 
 
-def remains(scan: Scan) -> Ints:
+def remains(scan: Scan) -> I64:
     """Indices of points of what moved, and wasn't carved: where a trail begins and ends, nothing sees through it.
 
     These are clusters above the ground, no wider than a lane, that touch what was carved, and were there for a moment
@@ -234,7 +232,7 @@ def people(scan: Scan) -> list[Thing]:
     return [thing for thing in _of_a_persons_size(scan) if _is_person(scan, thing)]
 
 
-def no_people(scan: Scan) -> Ints:
+def no_people(scan: Scan) -> I64:
     """Indices of points that are classified as persons, in things of their size that most votes take for another."""
     classified = np.flatnonzero(scan.classification == CODE["person"])
     wrong = np.zeros(len(classified), bool)
@@ -265,7 +263,7 @@ def _of_a_persons_size(scan: Scan) -> list[Thing]:
     return found
 
 
-def _vehicle(scan: Scan, tree: cKDTree, above: Bools, cluster: Ints) -> Thing | None:
+def _vehicle(scan: Scan, tree: cKDTree, above: Bools, cluster: I64) -> Thing | None:
     """The vehicle that a cluster is of, if it is of one."""
     box = rectangle(scan.xyz[cluster, :2])
     if not (1.0 < box.length < 40 and 0.4 < box.width < 4.5):
@@ -313,7 +311,7 @@ def _within(value: float, span: Span, slack: float = 0.1) -> bool:
     return span[0] - slack <= value <= span[1] + slack
 
 
-def _stretched(box: Rectangle, scan: Scan, near: Ints, top: float) -> Rectangle:
+def _stretched(box: Rectangle, scan: Scan, near: I64, top: float) -> Rectangle:
     """A box with the ends that photos took for something else: what goes on at its height up to free space.
 
     What goes on for longer than a vehicle is, or rises above its roof, is no part of it.
@@ -348,7 +346,7 @@ def _whole(box: Rectangle, path: F64) -> Rectangle:
     return Rectangle(box.x + shift[0], box.y + shift[1], box.heading, box.length, 1.6)
 
 
-def _freedom(scan: Scan, near: Ints, box: Rectangle, top: float) -> float:
+def _freedom(scan: Scan, near: I64, box: Rectangle, top: float) -> float:
     """Logarithm of how much likelier its ends are so free for a vehicle than for a part of something larger.
 
     Its ends alone: cars park along walls and hedges.
@@ -379,12 +377,12 @@ def roof(xy: F32, height: F32) -> float:
     return float(np.percentile(tops, 90))
 
 
-def _floor(scan: Scan, index: Ints) -> float:
+def _floor(scan: Scan, index: I64) -> float:
     """Height of the ground below points, local metres."""
     return float(np.median(scan.xyz[index, 2] - scan.height[index])) if len(index) else 0.0
 
 
-def clusters(xyz: F32, member: Bools) -> Iterator[Ints]:
+def clusters(xyz: F32, member: Bools) -> Iterator[I64]:
     """Indices of members that are connected in plan, of `LEAST` or more."""
     index = np.flatnonzero(member)
     if not len(index):

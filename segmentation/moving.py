@@ -8,10 +8,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
 from scan2sim.pipeline.classes import CODE
-from scan2sim.pipeline.types import F32, PointCloud
+from scan2sim.pipeline.types import F32, Bools, PointCloud
 from scan2sim.pipeline.visibility import times_of_moving
 
 HEIGHTS = (0.15, 2.6)
@@ -22,7 +21,7 @@ AROUND, SHARE, NEIGHBOURS = 0.6, 0.7, 24
 """Of a point's neighbours within so many metres, this share must have moved, too."""
 
 
-def moving(cloud: PointCloud, height: F32, ground: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+def moving(cloud: PointCloud, height: F32, ground: Bools) -> Bools:
     """(N,) which points are of moving things; none where points have no time, or the survey is short.
 
     Args:

@@ -329,7 +329,9 @@ def _samples(shape: Shape) -> tuple[F64, F64]:
 
 
 @njit(cache=True, nogil=True)
-def _clear(pictures, project, focal, plates, flat, out, rim, off, noise):  # type: ignore[no-untyped-def]
+def _clear(
+    pictures: F32, project: F64, focal: F64, plates: F64, flat: F64, out: F64, rim: int, off: float, noise: float
+) -> F64:
     """`CloseUps.clear`; `flat` and `out` are of `_samples`."""
     rated = np.zeros((len(plates), 3))
     seen, mean, edge = np.empty((len(pictures), len(flat), 3)), np.empty((len(flat), 3)), np.empty(rim)
@@ -340,7 +342,9 @@ def _clear(pictures, project, focal, plates, flat, out, rim, off, noise):  # typ
 
 
 @njit(cache=True, nogil=True)
-def _sample_photos(pictures, project, focal, plates, n, flat, out, rim, off, seen):  # type: ignore[no-untyped-def]
+def _sample_photos(
+    pictures: F32, project: F64, focal: F64, plates: F64, n: int, flat: F64, out: F64, rim: int, off: float, seen: F64
+) -> bool:
     """Colours (J, S, 3) into `seen` at `_samples` of a plate (6,), its rim's `off` pixels in and out.
 
     False where a picture doesn't show them all.
@@ -379,7 +383,7 @@ def _sample_photos(pictures, project, focal, plates, n, flat, out, rim, off, see
 
 
 @njit(cache=True, nogil=True)
-def _rate(seen, mean, edge, noise):  # type: ignore[no-untyped-def]
+def _rate(seen: F64, mean: F64, edge: F64, noise: float) -> tuple[float, float, float]:
     """As `CloseUps.clear`, of colours (J, S, 3): just inside of the rim, just outside, and the face's.
 
     `mean` (S, 3) and `edge` (rim,) are room to work in.

@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from scan2sim.pipeline.classes import CLASSES, CODE, UNKNOWN
-from scan2sim.pipeline.types import U8
+from scan2sim.pipeline.types import I64, U8
 
 MEAN_OF = ("road", "terrain", "building", "low_vegetation", "high_vegetation")
 """Classes that the mean intersection over union is of."""
@@ -24,7 +23,7 @@ class Confusion:
     """
 
     codes: tuple[int, ...]
-    count: npt.NDArray[np.int64]
+    count: I64
 
     @property
     def iou(self) -> dict[str, float]:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import Field
 
 from scan2sim.pipeline.cells import Cell
@@ -18,12 +17,12 @@ from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.ranges import Place
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.steps.furniture import BORDER, listed, of_plate
-from scan2sim.pipeline.types import F32, F64, U8, Frame, Mesh, View
+from scan2sim.pipeline.types import F32, F64, U8, Bools, Frame, Mesh, View
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.plates import Plate
 
-    Bools = npt.NDArray[np.bool_]
+    Bools = Bools
 
 REACH = 0.4
 """Metres by which points or a network's classes may misplace a plate."""

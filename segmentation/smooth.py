@@ -10,16 +10,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit, prange
 
 from scan2sim.pipeline.classes import CODE
-from scan2sim.pipeline.types import F32, I32, U8, PointCloud
+from scan2sim.pipeline.types import F32, I32, U8, Bools, PointCloud
 from scan2sim.segmentation.labels import CLASSES, GROUND, SKY
 from scan2sim.segmentation.tidy import by_height, with_feet, without_specks
 from scan2sim.segmentation.votes import Votes
-
-Bools = npt.NDArray[np.bool_]
 
 NEIGHBOURS = 24
 ROUNDS = 10
@@ -146,7 +143,7 @@ def _borrow(unary: F32, weight: F32, shape: U8, xyz: F32) -> None:
 
 
 @njit(cache=True, parallel=True)
-def _alike(near, normals, rgb, pull):  # type: ignore[no-untyped-def]
+def _alike(near: I32, normals: F32, rgb: U8, pull: float) -> F32:
     """(N, K) float32 weights of neighbours that sum to 1 or less."""
     n, k = near.shape
     out = np.empty((n, k), np.float32)
@@ -179,7 +176,7 @@ def mean_field(unary: F32, near: I32, alike: F32) -> F32:
 
 
 @njit(cache=True, parallel=True)
-def _settle(unary, q, near, alike, out, pull):  # type: ignore[no-untyped-def]
+def _settle(unary: F32, q: F32, near: I32, alike: F32, out: F32, pull: np.float32) -> None:
     n, classes = unary.shape
     for i in prange(n):
         most = -1e30

@@ -14,11 +14,11 @@ from scan2sim.pipeline.io.files import pass_on
 from scan2sim.pipeline.ranges import Voxel
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.steps.voxel import voxel_groups
-from scan2sim.pipeline.types import F32, F64, U8, Frame, PointCloud, Trajectory
+from scan2sim.pipeline.types import F32, F64, I64, U8, Frame, PointCloud, Trajectory
 from scan2sim.segmentation.segment import OWN, SHAPE
 
 if TYPE_CHECKING:
-    from scan2sim.segmentation.instances import Ints, Scan, Thing
+    from scan2sim.segmentation.instances import Scan, Thing
 
 PASSING, AROUND, NEIGHBOURS = 1.0, 0.5, 16
 """Seconds within which of what passes all is scanned that is within so many metres, of so many neighbours."""
@@ -161,7 +161,7 @@ def scan_of(thin: PointCloud, sure: U8, source: U8, moving: F32, moments: tuple[
     return Scan(thin.xyz, height, ground, thin.classification, odds.astype(np.float32), weight, moved, brief, path)
 
 
-def other_class(scan: Scan, index: Ints) -> U8:
+def other_class(scan: Scan, index: I64) -> U8:
     """The classes (K,) of points that are of no thing: of the nearest on the ground, or above it, that is of none."""
     from scipy.spatial import cKDTree
 

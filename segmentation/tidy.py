@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-from scan2sim.pipeline.types import F32, I32, U8
+from scan2sim.pipeline.types import F32, I32, U8, Bools
 from scan2sim.segmentation.labels import CLASSES, GROUND
-
-Bools = npt.NDArray[np.bool_]
 
 FLOATING, LINK = 0.35, 0.35
 """What has its lowest so many metres above ground floats; its points are linked within so many."""

@@ -13,19 +13,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import torch
 import torch.nn.functional as F
 
 from scan2sim.pipeline.channels import COUNT
 from scan2sim.pipeline.step import Report, silent
-from scan2sim.pipeline.types import F32
+from scan2sim.pipeline.types import F32, I64
 from scan2sim.segmentation.augment import augmented
 from scan2sim.segmentation.labelled import pairs, read, read_channels, split
 from scan2sim.segmentation.labels import CLASSES, IGNORED, index_of_code
 from scan2sim.segmentation.network import StreetNet
-
-Ints = npt.NDArray[np.int64]
 
 MEMORY = 0.002
 """Share of a step's weights in their running mean."""
@@ -104,7 +101,7 @@ def train(folder: Path, recipe: Recipe, report: Report = silent) -> Trained:
     return Trained(best, evaluate(best, check) if check else {})
 
 
-def _seen(pair: tuple[Path, Path], crop: tuple[int, int], rng: np.random.Generator) -> tuple[F32, Ints]:
+def _seen(pair: tuple[Path, Path], crop: tuple[int, int], rng: np.random.Generator) -> tuple[F32, I64]:
     rgb, classes = read(*pair)
     return augmented(rgb, classes, read_channels(pair[0], classes.shape), crop, rng)
 

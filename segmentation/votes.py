@@ -15,10 +15,10 @@ from numba import njit, prange
 
 from scan2sim.pipeline.cameras import EQUIRECTANGULAR
 from scan2sim.pipeline.io import image
-from scan2sim.pipeline.projection import eye, incidence, is_visible, pixel_of, to_camera, turned
+from scan2sim.pipeline.projection import Eye, Ranges, eye, incidence, is_visible, pixel_of, to_camera, turned
 from scan2sim.pipeline.sampling import allows, mixed, rescaled, taps
 from scan2sim.pipeline.step import Report, silent
-from scan2sim.pipeline.types import F32, PointCloud, View
+from scan2sim.pipeline.types import F32, U8, PointCloud, View
 from scan2sim.pipeline.visibility import depth_map, scene
 from scan2sim.segmentation.labels import CLASSES, SKY
 
@@ -87,7 +87,9 @@ def _mask(view: View) -> np.ndarray:
 
 
 @njit(cache=True, parallel=True)
-def _vote(score, weight, xyz, normals, eye, ranges, probabilities, mask):  # type: ignore[no-untyped-def]
+def _vote(
+    score: F32, weight: F32, xyz: F32, normals: F32, eye: Eye, ranges: Ranges, probabilities: U8, mask: U8
+) -> tuple[int, int]:
     """Add a photo's votes in place; returns (points seen, those that it takes for sky)."""
     n, classes = score.shape
     kind = np.zeros(n, np.uint8)

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from scan2sim.pipeline.errors import DataError
 from scan2sim.pipeline.extras import need
@@ -22,11 +21,10 @@ from scan2sim.pipeline.io import gps as gps_io
 from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.io.trajectory import replacing
 from scan2sim.pipeline.similarity import umeyama
-from scan2sim.pipeline.types import F64, GpsTrack, Trajectory
+from scan2sim.pipeline.types import F64, I64, GpsTrack, Trajectory
 from scan2sim.slam.gps import noise, smooth
 
 AlignmentKind = Literal["similarity2d", "rigid2d", "similarity3d"]
-Index = npt.NDArray[np.int64]
 
 SEGMENT = 400.0  # m, D3.2
 STEP = 5.0  # m between the starts of segments
@@ -278,7 +276,7 @@ def _named(name: str, unit: str, error: Relative | None) -> dict[str, float | No
     }
 
 
-def _associate(estimate: Trajectory, truth: Trajectory | GpsTrack, by: str) -> tuple[F64, Index, F64]:
+def _associate(estimate: Trajectory, truth: Trajectory | GpsTrack, by: str) -> tuple[F64, I64, F64]:
     """Times of the poses that both have, their indices in the estimate, and the truth's (N, 3) positions there."""
     if by == "index":
         if len(estimate) != len(truth):
@@ -312,7 +310,7 @@ def _course(truth: Trajectory | GpsTrack, ground: F64, times: F64) -> tuple[floa
 
 
 def _poses(
-    estimate: Trajectory, truth: Trajectory | GpsTrack, times: F64, index: Index, by: str
+    estimate: Trajectory, truth: Trajectory | GpsTrack, times: F64, index: I64, by: str
 ) -> tuple[F64, F64] | None:
     """(N, 3, 3) rotations of the estimate and of the truth; None where one has none."""
     if isinstance(truth, GpsTrack) or truth.rotations is None or estimate.rotations is None:
@@ -324,14 +322,14 @@ def _rms(vectors: F64) -> float:
     return float(np.sqrt((vectors**2).sum(axis=1).mean()))
 
 
-def _pairs(distance: F64, starts: Index, length: float) -> tuple[Index, Index]:
+def _pairs(distance: F64, starts: I64, length: float) -> tuple[I64, I64]:
     """Starts and ends of the motions that are the first to be longer than `length`."""
     ends = np.searchsorted(distance, distance[starts] + length, side="right")
     there = ends < len(distance)
     return starts[there], ends[there]
 
 
-def _motions(chords: tuple[F64, F64], poses: tuple[F64, F64] | None, a: Index, b: Index) -> tuple[F64, F64 | None]:
+def _motions(chords: tuple[F64, F64], poses: tuple[F64, F64] | None, a: I64, b: I64) -> tuple[F64, F64 | None]:
     """(P,) errors in metres and in degrees of the motions from poses `a` to poses `b`.
 
     With rotations: of the motion in the first pose's axes. Without: of the length of the chord.
@@ -349,9 +347,7 @@ def _motions(chords: tuple[F64, F64], poses: tuple[F64, F64] | None, a: Index, b
     return np.linalg.norm(translation, axis=1), np.degrees(np.arctan2(sine, cosine))
 
 
-def _relative(
-    chords: tuple[F64, F64], poses: tuple[F64, F64] | None, distance: F64, a: Index, b: Index
-) -> Relative | None:
+def _relative(chords: tuple[F64, F64], poses: tuple[F64, F64] | None, distance: F64, a: I64, b: I64) -> Relative | None:
     if not len(a):
         return None
     metres, degrees = _motions(chords, poses, a, b)

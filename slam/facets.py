@@ -15,9 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scan2sim.pipeline.cameras import pixel_rays, project, unproject
-from scan2sim.pipeline.types import F32, F64, I32, U8, Camera
-
-Bools = npt.NDArray[np.bool_]
+from scan2sim.pipeline.types import F32, F64, I32, I64, U8, Camera
 
 BAND = math.radians(46)
 """Elevation up to which features are followed in the band."""
@@ -95,7 +93,7 @@ class Facets:
             return unproject(self.camera, uv + [-self._pad, self._rows[0]])
         return unproject(self._cap, uv) @ _CAPS[facet - 1].T
 
-    def cell(self, bearing: F64, across: int) -> npt.NDArray[np.int64]:
+    def cell(self, bearing: F64, across: int) -> I64:
         """(N,) number of the cell of the sphere, or of the frame, that holds a bearing: `across` cells a full width."""
         if self.whole:
             uv, _ = project(self.camera, bearing)

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from scan2sim.pipeline.types import F64, Frame, GpsTrack, Trajectory
+from scan2sim.pipeline.types import F64, I64, Bools, Frame, GpsTrack, Trajectory
 from scan2sim.slam import scale
 from scan2sim.slam.geometry import exp_so3
 from scan2sim.slam.mapped import Mapped
@@ -34,7 +33,7 @@ class Placing:
     factor: F64
     frame: Frame
 
-    def points(self, xyz: F64, at: npt.NDArray[np.int64], before: F64, after: Trajectory) -> F64:
+    def points(self, xyz: F64, at: I64, before: F64, after: Trajectory) -> F64:
         """Points (P, 3) of the camera's world, carried along with the poses `at` (P,) which they were seen from.
 
         `before` (T, 3) are the positions in the camera's world, `after` the finished trajectory.
@@ -96,7 +95,7 @@ def place(positions: F64, there: F64) -> tuple[F64, F64]:
     return turn, shift
 
 
-def uncertainty(times: F64, positions: F64, unsure: npt.NDArray[np.bool_]) -> F64:
+def uncertainty(times: F64, positions: F64, unsure: Bools) -> F64:
     """(T, 6, 6) covariance against the start: little for what was tracked, much for what was bridged."""
     way = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     seconds = np.diff(times)

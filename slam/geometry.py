@@ -11,9 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from scan2sim.pipeline.types import F64, I32
-
-Bools = npt.NDArray[np.bool_]
+from scan2sim.pipeline.types import F64, I32, I64, Bools
 
 
 def exp_so3(w: npt.ArrayLike) -> F64:
@@ -47,7 +45,7 @@ def inverse(T: F64) -> F64:
 
 
 @njit(cache=True, nogil=True)
-def triangulate(poses, starts, camera_of, bearing):  # type: ignore[no-untyped-def]
+def triangulate(poses: F64, starts: I64, camera_of: I32, bearing: F64) -> tuple[F64, F64]:
     """Where rays meet, by least squares of the distances to them, and the widest angle between two.
 
     Args:

@@ -7,11 +7,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from scan2sim.pipeline.types import F64, I32
-
-Bools = npt.NDArray[np.bool_]
+from scan2sim.pipeline.types import F64, I32, Bools
 
 
 @dataclass(frozen=True)

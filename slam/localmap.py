@@ -7,18 +7,14 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import Field
 
 from scan2sim.pipeline.ranges import Reach
 from scan2sim.pipeline.step import Params
-from scan2sim.pipeline.types import F64, I32, Camera, GpsTrack
+from scan2sim.pipeline.types import F64, I32, I64, Bools, Camera, GpsTrack
 from scan2sim.slam import shared, solvers
 from scan2sim.slam.geometry import triangulate
 from scan2sim.slam.graph import Chord, Graph, errors
-
-I64 = npt.NDArray[np.int64]
-Bools = npt.NDArray[np.bool_]
 
 
 class MapParams(Params):

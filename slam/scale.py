@@ -7,9 +7,8 @@ the camera's own: where GPS is, nobody asks (D3.2, section 4.1, uses distances a
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-from scan2sim.pipeline.types import F64, GpsTrack
+from scan2sim.pipeline.types import F64, I64, Bools, GpsTrack
 
 KNOT = 50.0
 """Metres between the places where the factor may change."""
@@ -19,7 +18,7 @@ CHORDS = (50.0, 100.0, 200.0)
 """Metres, of the chords compared."""
 
 
-def factors(times: F64, positions: F64, unsure: npt.NDArray[np.bool_], gps: GpsTrack, *, sigma: float = 1.5) -> F64:
+def factors(times: F64, positions: F64, unsure: Bools, gps: GpsTrack, *, sigma: float = 1.5) -> F64:
     """(T - 1,) what the steps between (T, 3) positions at (T,) times are to be multiplied by.
 
     Args:
@@ -60,7 +59,7 @@ def factors(times: F64, positions: F64, unsure: npt.NDArray[np.bool_], gps: GpsT
     return np.exp((1 - weight) * solved.x[lower] + weight * solved.x[np.minimum(lower + 1, knots - 1)])
 
 
-def _chords(travelled: F64, there: F64, unsure: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:
+def _chords(travelled: F64, there: F64, unsure: Bools) -> I64:
     """(K, 2) pairs of poses that GPS and camera both know, some way apart."""
     known = np.isfinite(there[:, 0])
     doubtful = np.concatenate([[0], np.cumsum(unsure)])

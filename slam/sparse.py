@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from scan2sim.pipeline.cameras import project
 from scan2sim.pipeline.io.colmap_writer import SparseMap
-from scan2sim.pipeline.types import F64, I32, Trajectory
+from scan2sim.pipeline.types import F64, I32, I64, Trajectory
 from scan2sim.slam.finish import Placing
 from scan2sim.slam.localmap import Landmarks
 from scan2sim.slam.mapped import Mapped
@@ -26,7 +25,7 @@ class Kept:
         bearing: (O, 3) in which direction.
     """
 
-    ids: npt.NDArray[np.int64]
+    ids: I64
     xyz: F64
     point: I32
     keyframe: I32
@@ -69,7 +68,7 @@ def sparse_map(mapped: Mapped, placing: Placing, trajectory: Trajectory) -> Spar
     frame_of = np.searchsorted(trajectory.times, [k.time for k in mapped.map.keyframes])
     uv, inside = project(mapped.map.camera, known.bearing)
     frame = frame_of[known.keyframe]
-    at: npt.NDArray[np.int64] = np.zeros(len(known.xyz), np.int64)
+    at: I64 = np.zeros(len(known.xyz), np.int64)
     at[known.point[::-1]] = frame[::-1]
     before = np.stack([mapped.pose_of(p)[:3, 3] for p in mapped.placed])
     points = placing.points(known.xyz, at, before, trajectory)

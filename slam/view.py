@@ -8,16 +8,13 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-import numpy.typing as npt
 
 from scan2sim.pipeline.cameras import project
 from scan2sim.pipeline.errors import from_os_error
 from scan2sim.pipeline.io.video import Encoder
-from scan2sim.pipeline.types import F64, U8
+from scan2sim.pipeline.types import F64, U8, Bools
 from scan2sim.slam.geometry import angles
 from scan2sim.slam.odometry import Odometry
-
-Bools = npt.NDArray[np.bool_]
 
 WIDTH, LEAST = 1280, 960
 """Pixels: the picture is so wide at most; smaller frames are enlarged to the lesser."""

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import Field
 
 from scan2sim.pipeline.errors import InputError
@@ -24,7 +23,7 @@ from scan2sim.pipeline.io import image
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.ranges import Cosine, Depth, Reach
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.types import F32, U8, View
+from scan2sim.pipeline.types import F32, U8, Bools, View
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.visibility import DepthMap
@@ -210,7 +209,7 @@ class Compared:
     """A photo beside its prediction: figures, where it shows a ghost (h, w), its warp (`warp_of`); None: unknown."""
 
     figures: dict[str, Any]
-    ghosts: npt.NDArray[np.bool_] | None = None
+    ghosts: Bools | None = None
     warp: F32 | None = None
 
 
@@ -256,9 +255,7 @@ def compare(
     return Compared(figures | displacement, ghosts, warp)
 
 
-def _shift(
-    mine: F32, predicted: Prediction, sure: npt.NDArray[np.bool_], scale: float
-) -> tuple[dict[str, float], F32 | None]:
+def _shift(mine: F32, predicted: Prediction, sure: Bools, scale: float) -> tuple[dict[str, float], F32 | None]:
     """How a photo is displaced against its prediction by optical flow: figures (pixels of the photo), and its warp."""
     import cv2
 
@@ -302,7 +299,7 @@ def warp_of(flow: F32, slope: F32, scale: float) -> F32:
     return np.asarray(cv2.resize(smooth, size, interpolation=cv2.INTER_AREA) * scale, np.float32)
 
 
-def ghost_mask(mine: F32, predicted: Prediction, white: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+def ghost_mask(mine: F32, predicted: Prediction, white: Bools) -> Bools:
     """Where a photo shows what the others agree is not there: (h, w).
 
     Args:
@@ -341,7 +338,7 @@ def without_sky(view: View, rgb: U8, mask: U8, depth: DepthMap) -> tuple[U8, flo
     return (np.minimum(allowed, mask) if mask.size else allowed), round(float(found.mean()), 5)
 
 
-def combined(ghosts: npt.NDArray[np.bool_] | None, mask: U8) -> U8 | None:
+def combined(ghosts: Bools | None, mask: U8) -> U8 | None:
     """The photo's own mask and its ghosts as one, 0 where it must not be used; None where that is nowhere."""
     import cv2
 

@@ -9,14 +9,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 import scipy.sparse as sp
 
 from scan2sim.pipeline.classes import CODE
 from scan2sim.pipeline.extras import missing
 from scan2sim.pipeline.projection import eye
 from scan2sim.pipeline.step import Report
-from scan2sim.pipeline.types import F32, I32, Mesh, View
+from scan2sim.pipeline.types import F32, I32, I64, Mesh, View
 from scan2sim.pipeline.visibility import load_depth_map
 from scan2sim.texturing import texels
 from scan2sim.texturing.agreement import Agreement
@@ -24,8 +23,6 @@ from scan2sim.texturing.blend import Laid, NumbaRows, Occlusion, Picture, Rows, 
 from scan2sim.texturing.choose import Choice
 from scan2sim.texturing.fill import Page
 from scan2sim.texturing.photos import Exposures, Photos
-
-Index = npt.NDArray[np.int64]
 
 BAND = 6_000_000
 """Texels of a page that are baked at a time, in whole rows."""
@@ -78,7 +75,7 @@ class Baker:
         self.photos = Photos(views, max(1, weighing.band))
         self.used: dict[int, int] = {}
 
-    def bake(self, faces: Index, width: int, height: int, report: Report) -> Page:
+    def bake(self, faces: I64, width: int, height: int, report: Report) -> Page:
         """A page baked from photos alone; texels that none saw stay black and unmarked.
 
         Args:
@@ -103,7 +100,7 @@ class Baker:
                 self._bake_rows(page, rows, here, faces)
         return page
 
-    def _bake_rows(self, page: Page, rows: slice, here: Index, faces: Index) -> None:
+    def _bake_rows(self, page: Page, rows: slice, here: I64, faces: I64) -> None:
         """Bake the rows of a page; `here` are its faces (indices into `faces`) that reach into them."""
         flat = page.flat - np.array([0, rows.start], np.float32)
         band = self._rows(Laid(page.owner[rows], flat, page.corners, self._normals[faces]))
@@ -125,7 +122,7 @@ class Baker:
 
         return TorchRows(laid, self._device)
 
-    def _add_photo(self, i: int, rows: Rows, mine: Index, faces: Index) -> int:
+    def _add_photo(self, i: int, rows: Rows, mine: I64, faces: I64) -> int:
         """Add what photo `i` says of the page's faces `mine`, the mesh's `faces`; returns the texels it sees."""
         photo = self.photos.get(i)
         if photo is None:
@@ -142,7 +139,7 @@ class Baker:
         """Of view `i`."""
         return self._views[i].name
 
-    def _alone(self, i: int, faces: Index) -> F32:
+    def _alone(self, i: int, faces: I64) -> F32:
         return np.repeat((self._choice.detail_view[faces] == i).astype(np.float32)[:, None], 3, axis=1)
 
     def _read_occlusion(self, i: int) -> Occlusion:

@@ -6,7 +6,6 @@ import math
 from typing import NamedTuple, Protocol
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit, prange
 
 from scan2sim.pipeline.cameras import ALIKE, EQUIRECTANGULAR, ORTHOGRAPHIC
@@ -21,7 +20,7 @@ from scan2sim.pipeline.projection import (
     turned,
 )
 from scan2sim.pipeline.sampling import allows, bicubic, halving, mixed, read, rescaled, taps
-from scan2sim.pipeline.types import F32, F64, I32, U8
+from scan2sim.pipeline.types import F32, F64, I32, I64, U8
 from scan2sim.texturing.photos import OFFSET
 from scan2sim.texturing.texels import box, frame
 
@@ -122,7 +121,7 @@ class Sums(NamedTuple):
 class Rows(Protocol):
     """Rows of a page that photos are added to, one after another."""
 
-    def add(self, faces: npt.NDArray[np.int64], share: F32, source: Source, weighing: Weighing) -> int:
+    def add(self, faces: I64, share: F32, source: Source, weighing: Weighing) -> int:
         """Add what one photo says of `faces` (N,); returns the texels that it sees.
 
         Args:
@@ -143,7 +142,7 @@ class NumbaRows:
         self._laid = laid
         self._sums = Sums(*(np.zeros((*laid.owner.shape, 4), np.float32) for _ in range(2)))
 
-    def add(self, faces: npt.NDArray[np.int64], share: F32, source: Source, weighing: Weighing) -> int:
+    def add(self, faces: I64, share: F32, source: Source, weighing: Weighing) -> int:
         """See `Rows`."""
         return int(accumulate(self._sums, self._laid, faces, share, *source, weighing))
 
@@ -153,7 +152,7 @@ class NumbaRows:
 
 
 @njit(cache=True, inline="always")
-def vignette(exposure, p, u, v):  # type: ignore[no-untyped-def]
+def vignette(exposure: F64, p: F64, u: float, v: float) -> float:
     """Factor that undoes the darkening towards a photo's corners; `exposure` as of `photos.Exposures.of`."""
     if exposure[3] == 0.0 and exposure[4] == 0.0:
         return 1.0
@@ -163,13 +162,15 @@ def vignette(exposure, p, u, v):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, inline="always")
-def corrected(value, factor):  # type: ignore[no-untyped-def]
+def corrected(value: float, factor: float) -> float:
     """An encoded grey level whose light is multiplied: `factor` is of the power law's base."""
     return (value + OFFSET) * factor - OFFSET
 
 
 @njit(cache=True, parallel=True)
-def accumulate(sums, laid, faces, share, picture, eye, occlusion, weighing):  # type: ignore[no-untyped-def]
+def accumulate(
+    sums: Sums, laid: Laid, faces: I64, share: F32, picture: Picture, eye: Eye, occlusion: Occlusion, weighing: Weighing
+) -> int:
     """`Rows.add` to `sums`, in place; `tests/texturing/plain_blend.py` says the same without haste."""
     used = np.zeros(len(faces), np.int64)
     for i in prange(len(faces)):
@@ -178,7 +179,9 @@ def accumulate(sums, laid, faces, share, picture, eye, occlusion, weighing):  # 
 
 
 @njit(cache=True)
-def _add_face(sums, laid, f, share, picture, eye, occlusion, weighing):  # type: ignore[no-untyped-def]
+def _add_face(
+    sums: Sums, laid: Laid, f: int, share: F32, picture: Picture, eye: Eye, occlusion: Occlusion, weighing: Weighing
+) -> int:
     """Add what a photo says of face f, whose corners want `share` (3,) of their detail from it; the texels seen."""
     origin, per_x, per_y, ok = frame(laid.flat, laid.corners, f)
     if not ok:
@@ -237,14 +240,14 @@ def _add_face(sums, laid, f, share, picture, eye, occlusion, weighing):  # type:
 
 
 @njit(cache=True, inline="always")
-def _border(eye, u, v):  # type: ignore[no-untyped-def]
+def _border(eye: Eye, u: float, v: float) -> float:
     """Pixels to the nearest border of the photo; a panorama's sides are none."""
     border = min(v + 0.5, eye.p[13] - 0.5 - v)
     return border if eye.model == EQUIRECTANGULAR else min(border, min(u + 0.5, eye.p[12] - 0.5 - u))
 
 
 @njit(cache=True, inline="always")
-def _displaced(warp, p, u, v, wrap):  # type: ignore[no-untyped-def]
+def _displaced(warp: F32, p: F64, u: float, v: float, wrap: bool) -> tuple[float, float]:
     """Where a photo shows what belongs at a pixel."""
     if warp.shape[0] == 0:
         return u, v
@@ -254,7 +257,9 @@ def _displaced(warp, p, u, v, wrap):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, inline="always")
-def _colour(whole, half, quarter, p, u, v, wrap, wide, sharp):  # type: ignore[no-untyped-def]
+def _colour(
+    whole: U8, half: U8, quarter: U8, p: F64, u: float, v: float, wrap: bool, wide: float, sharp: bool
+) -> tuple[float, float, float]:
     """(r, g, b) of a photo at a pixel, for a texel that is `wide` pixels wide; sampled sharply where asked."""
     level = halving(wide, 3)
     if level == 0 and sharp:
@@ -267,7 +272,7 @@ def _colour(whole, half, quarter, p, u, v, wrap, wide, sharp):  # type: ignore[n
 
 
 @njit(cache=True, inline="always")
-def _share_at(flat, f, share, x, y):  # type: ignore[no-untyped-def]
+def _share_at(flat: F32, f: int, share: F32, x: float, y: float) -> float:
     """The corners' shares (3,), interpolated at a texel of face f."""
     ax, ay = flat[f, 0, 0], flat[f, 0, 1]
     bx, by = flat[f, 1, 0] - ax, flat[f, 1, 1] - ay
@@ -278,7 +283,7 @@ def _share_at(flat, f, share, x, y):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, parallel=True)
-def resolve(sums, rgb, seen):  # type: ignore[no-untyped-def]
+def resolve(sums: Sums, rgb: U8, seen: U8) -> None:
     """Weighted means of both sums, added, into `rgb` (H, W, 3) uint8; `seen` is 255 where there is one."""
     height, width = seen.shape
     for y in prange(height):

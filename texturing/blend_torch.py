@@ -16,7 +16,7 @@ from torch import Tensor
 from scan2sim.pipeline.cameras import ALIKE, EQUIRECTANGULAR, FISHEYE, OPENCV, ORTHOGRAPHIC
 from scan2sim.pipeline.errors import SettingError
 from scan2sim.pipeline.projection import MAX_SLOPE, SLOPE_SHARE
-from scan2sim.pipeline.types import F32, F64, U8
+from scan2sim.pipeline.types import F32, F64, I64, U8
 from scan2sim.texturing.blend import EDGE, WHITE, Laid, Source, Weighing
 from scan2sim.texturing.photos import OFFSET
 
@@ -51,7 +51,7 @@ class TorchRows:
         self._origin, self._per_x, self._per_y, self._flat_enough = _frames(self._flat, self._to(laid.corners).double())
         self._low, self._detail = (torch.zeros((laid.owner.size, 4), device=self._device) for _ in range(2))
 
-    def add(self, faces: npt.NDArray[np.int64], share: F32, source: Source, weighing: Weighing) -> int:
+    def add(self, faces: I64, share: F32, source: Source, weighing: Weighing) -> int:
         """Add what one photo says of `faces` (N,), its share of their detail (N, 3); returns the texels it sees."""
         which = torch.full((len(self._flat),), -1, dtype=torch.int64, device=self._device)
         which[self._to(faces)] = torch.arange(len(faces), device=self._device)

@@ -15,11 +15,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 
 from scan2sim.pipeline.cameras import project, project_exactly, unproject
-from scan2sim.pipeline.types import F64, Camera
+from scan2sim.pipeline.types import F64, I32, I64, Camera
 from scan2sim.texturing.matches import Matches
 
 OUTLIER = 1.0
@@ -62,7 +61,7 @@ class Corrections:
     photo: F64
     camera: F64
 
-    def apply(self, poses: F64, camera: npt.NDArray[np.int64]) -> F64:
+    def apply(self, poses: F64, camera: I64) -> F64:
         """(V, 4, 4) the poses corrected; `camera` (V,) names each photo's."""
         from scipy.spatial.transform import Rotation
 
@@ -74,7 +73,7 @@ class Corrections:
         return out
 
 
-def chain(centres: F64, times: Sequence[float | None]) -> npt.NDArray[np.int64]:
+def chain(centres: F64, times: Sequence[float | None]) -> I64:
     """(V,) views in the order in which they were taken; as they are listed where that isn't known."""
     known = [t for t in times if t is not None]
     if len(known) < len(times):
@@ -87,8 +86,8 @@ def solve(
     cameras: Sequence[Camera],
     poses: F64,
     start: Corrections,
-    camera: npt.NDArray[np.int64],
-    order: npt.NDArray[np.int64],
+    camera: I64,
+    order: I64,
     priors: Priors,
 ) -> Corrections:
     """The corrections that bring matches together.
@@ -201,7 +200,7 @@ def _linearised(found: Matches, place: F64, cameras: Sequence[Camera], poses: F6
     return residual, by_place, by_pose
 
 
-def _pairs(found: Matches, count: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int32]]:
+def _pairs(found: Matches, count: int) -> tuple[I64, I32]:
     """(B, 2) pairs of views that share a place, and (V, V) the index of each pair; -1 for none."""
     order = np.argsort(found.of, kind="stable")
     start = np.searchsorted(found.of[order], np.arange(len(found.place) + 1))
@@ -213,7 +212,7 @@ def _pairs(found: Matches, count: int) -> tuple[npt.NDArray[np.int64], npt.NDArr
 
 
 @njit(cache=True)
-def _mark(block, view, start):  # type: ignore[no-untyped-def]
+def _mark(block: I32, view: I64, start: I64) -> None:
     for p in range(len(start) - 1):
         for i in range(start[p], start[p + 1]):
             for j in range(start[p], start[p + 1]):
@@ -221,8 +220,8 @@ def _mark(block, view, start):  # type: ignore[no-untyped-def]
 
 
 def _reduced(
-    residual: F64, by_place: F64, by_pose: F64, weight: F64, of: npt.NDArray[np.int64], view: npt.NDArray[np.int64],
-    stiff: F64, left: F64, pairs: npt.NDArray[np.int64], block: npt.NDArray[np.int32], count: int,
+    residual: F64, by_place: F64, by_pose: F64, weight: F64, of: I64, view: I64,
+    stiff: F64, left: F64, pairs: I64, block: I32, count: int,
 ) -> tuple[F64, F64, F64, F64, F64]:  # fmt: skip
     """Normal equations of the poses with the places eliminated (Schur).
 
@@ -246,7 +245,7 @@ def _reduced(
 
 
 @njit(cache=True)
-def _eliminate(S, g, Hinv, e, cross, order, view, start, block):  # type: ignore[no-untyped-def]
+def _eliminate(S: F64, g: F64, Hinv: F64, e: F64, cross: F64, order: I64, view: I64, start: I64, block: I32) -> None:
     for p in range(len(start) - 1):
         for a in range(start[p], start[p + 1]):
             i = order[a]
@@ -257,16 +256,14 @@ def _eliminate(S, g, Hinv, e, cross, order, view, start, block):  # type: ignore
                 S[block[view[i], view[j]]] -= back @ cross[j]
 
 
-def _places_moved(
-    moved: F64, Hinv: F64, e: F64, cross: F64, of: npt.NDArray[np.int64], view: npt.NDArray[np.int64]
-) -> F64:
+def _places_moved(moved: F64, Hinv: F64, e: F64, cross: F64, of: I64, view: I64) -> F64:
     """(P, 3) what places move by, once the poses' steps (V, 6) are known."""
     right = e.copy()
     np.add.at(right, of, -np.einsum("nij,nj->ni", cross, moved[view]))
     return np.einsum("pij,pj->pi", Hinv, right)
 
 
-def _shares(poses: F64, camera: npt.NDArray[np.int64], lenses: int) -> Any:
+def _shares(poses: F64, camera: I64, lenses: int) -> Any:
     """Sparse (6 V, 6 V + 6 C): the step of each pose from photos' and cameras' corrections."""
     import scipy.sparse as sp
 
@@ -281,7 +278,7 @@ def _shares(poses: F64, camera: npt.NDArray[np.int64], lenses: int) -> Any:
     return sp.csc_array((values, (rows, columns)), (6 * n, 6 * (n + lenses)))
 
 
-def _prior(centres: F64, order: npt.NDArray[np.int64], lenses: int, priors: Priors) -> Any:
+def _prior(centres: F64, order: I64, lenses: int, priors: Priors) -> Any:
     """Sparse (6 V + 6 C) squared: precision of the corrections, about none."""
     import scipy.sparse as sp
 

@@ -6,8 +6,8 @@ import numpy as np
 from numba import njit, prange
 
 from scan2sim.pipeline.cameras import ALIKE, ORTHOGRAPHIC
-from scan2sim.pipeline.projection import eye, incidence, is_visible, pixel_of, to_camera, turned
-from scan2sim.pipeline.types import F32, U8
+from scan2sim.pipeline.projection import Eye, Ranges, eye, incidence, is_visible, pixel_of, to_camera, turned
+from scan2sim.pipeline.types import F32, F64, I32, U8
 from scan2sim.pipeline.visibility import DepthMap
 
 DRAPED = 0.25
@@ -66,7 +66,9 @@ class Candidates:
 
 
 @njit(cache=True, parallel=True)
-def _rate(corners, normals, eye, ranges, bias, max_distance, min_cos, samples):  # type: ignore[no-untyped-def]
+def _rate(
+    corners: F32, normals: F32, eye: Eye, ranges: Ranges, bias: float, max_distance: float, min_cos: float, samples: F64
+) -> F32:
     """(F,) float32: cos / distance^2 (1/m2), meaned over the face's samples, 0 for those not seen."""
     quality = np.zeros(len(corners), np.float32)
     for f in prange(len(corners)):
@@ -96,7 +98,7 @@ def _rate(corners, normals, eye, ranges, bias, max_distance, min_cos, samples): 
 
 
 @njit(cache=True, parallel=True)
-def _insert(rated, index, view, quality):  # type: ignore[no-untyped-def]
+def _insert(rated: F32, index: int, view: I32, quality: F32) -> None:
     """Insert a view into every face's list, kept in descending quality; ties stay with the earlier view."""
     count = view.shape[1]
     for f in prange(len(rated)):

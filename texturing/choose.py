@@ -12,14 +12,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import Field
 
 from scan2sim.pipeline.classes import CODE
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.ranges import Cosine, Depth, Reach
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.types import F32, I32, U8, Mesh, View
+from scan2sim.pipeline.types import F32, I32, I64, U8, Mesh, View
 from scan2sim.texturing.agreement import Agreement
 
 if TYPE_CHECKING:
@@ -157,7 +156,7 @@ def with_whole_signs(choice: Choice, mesh: Mesh, pixel: Sequence[float]) -> Choi
     return Choice(view, quality, detail_view)
 
 
-def _sides(mesh: Mesh, faces: npt.NDArray[np.int64], pairs: I32) -> list[npt.NDArray[np.int64]]:
+def _sides(mesh: Mesh, faces: I64, pairs: I32) -> list[I64]:
     """Faces (N,) in connected pieces that look one way; `pairs` (E, 2) of neighbours, indices into them."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components

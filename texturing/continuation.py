@@ -15,9 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from scan2sim.pipeline.types import F32, F64, I32
-
-Bools = npt.NDArray[np.bool_]
+from scan2sim.pipeline.types import F32, F64, I32, Bools
 
 FACTOR = 4
 """Cells each way that make one of the coarse picture."""
@@ -174,7 +172,7 @@ def _shown(coarse: F32, whole: Bools, hole: Bools, kind: I32, shifts: I32) -> tu
 
 
 @njit(cache=True, fastmath=True)
-def _pass_messages(number, cells, shown, cost, sweeps):  # type: ignore[no-untyped-def]
+def _pass_messages(number: I32, cells: I32, shown: F32, cost: F32, sweeps: int) -> I32:
     """The shift of each cell after so many sweeps (min-sum, in raster order and back); -1 where all are impossible."""
     height, width = number.shape
     n, count = cost.shape

@@ -13,12 +13,11 @@ import numpy.typing as npt
 
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.io import image
-from scan2sim.pipeline.types import F32, F64, U8, View
+from scan2sim.pipeline.types import F32, F64, U8, Bools, View
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.render import Image, Renderer
 
-Mask = npt.NDArray[np.bool_]
 
 SAMPLES = 3
 """Rays a pixel each way: a rendering is as soft with distance as a simulator's, which filters with mip-maps."""
@@ -67,7 +66,7 @@ class HeldOut:
     view: View
     photo: U8
     render: Image
-    mask: Mask
+    mask: Bools
     errors: Errors
     coverage: float
     psnr_db: float
@@ -76,7 +75,7 @@ class HeldOut:
     sharpness: float
 
 
-def score(photo: U8, render: U8, mask: Mask) -> dict[str, float]:
+def score(photo: U8, render: U8, mask: Bools) -> dict[str, float]:
     """Likeness of a rendering to a photo (H, W, 3) where `mask` (H, W) holds.
 
     Returns:
@@ -87,14 +86,14 @@ def score(photo: U8, render: U8, mask: Mask) -> dict[str, float]:
     return _score(errors(photo, render, mask), photo, render, mask)
 
 
-def _score(of: Errors, photo: U8, render: U8, mask: Mask) -> dict[str, float]:
+def _score(of: Errors, photo: U8, render: U8, mask: Bools) -> dict[str, float]:
     whole = figures(tally(of, np.zeros(mask.shape, np.int64), 1)[0])
     return {name: whole[name] for name in ("psnr_db", "psnr_gain_db", "ssim")} | {
         "sharpness": sharpness(photo, matched(photo, render, mask), mask)
     }
 
 
-def errors(photo: U8, render: U8, mask: Mask) -> Errors:
+def errors(photo: U8, render: U8, mask: Bools) -> Errors:
     """The errors of a rendering (H, W, 3) against a photo, where `mask` (H, W) holds."""
     like = matched(photo, render, mask)
     squared, squared_gain = (np.full(mask.shape, np.nan, np.float32) for _ in range(2))
@@ -103,14 +102,14 @@ def errors(photo: U8, render: U8, mask: Mask) -> Errors:
     return Errors(squared, squared_gain, _ssim(photo, like, mask))
 
 
-def matched(photo: U8, render: U8, mask: Mask) -> U8:
+def matched(photo: U8, render: U8, mask: Bools) -> U8:
     """The rendering (H, W, 3) with the least-squares gain of each channel that makes it most like the photo."""
     a, b = photo[mask].astype(np.float64), render[mask].astype(np.float64)
     gain = (a * b).sum(axis=0) / np.maximum((b * b).sum(axis=0), 1.0)
     return np.clip(np.round(render * gain), 0, 255).astype(np.uint8)
 
 
-def sharpness(photo: U8, render: U8, mask: Mask) -> float:
+def sharpness(photo: U8, render: U8, mask: Bools) -> float:
     """Mean absolute Laplacian of the grey rendering over that of the photo: 1 is as sharp as it, less is softer.
 
     Pixels count whose eight neighbours are in the mask; NaN where there are none, or the photo has no detail there.
@@ -167,7 +166,7 @@ def psnr(squared: float) -> float:
     return 10 * math.log10(255**2 / max(squared, 1e-3))
 
 
-def _ssim(photo: U8, render: U8, mask: Mask) -> F32:
+def _ssim(photo: U8, render: U8, mask: Bools) -> F32:
     """(H, W) by Gaussian windows of sigma 1.5; pixels outside the mask have no say in them."""
     import cv2
 

@@ -15,13 +15,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import Field
 
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.ranges import FileName, Reach, Stops
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.types import F64, View
+from scan2sim.pipeline.types import F64, I64, U8, View
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.visibility import DepthMap
@@ -102,8 +101,8 @@ def exposure(inputs: Inputs, params: ExposureParams, out: Path, report: Report) 
 class Observed:
     """Places seen in several photos: index of photo (N,), of place (N,), log values (N, 3), q (N,) of `Exposures`."""
 
-    photo: npt.NDArray[np.int64]
-    place: npt.NDArray[np.int64]
+    photo: I64
+    place: I64
     value: F64
     q: F64
 
@@ -148,14 +147,14 @@ def observe(
 
 
 def _observe(
-    low: npt.NDArray[np.uint8],
-    mask: npt.NDArray[np.uint8],
+    low: U8,
+    mask: U8,
     view: View,
     depth: DepthMap,
     place: F64,
     normal: F64,
     max_distance: float,
-) -> tuple[npt.NDArray[np.int64], F64, F64]:
+) -> tuple[I64, F64, F64]:
     """Indices of the places (P, 3) that a photo sees well, their log values (N, 3), and q (N,)."""
     import cv2
 
@@ -263,7 +262,7 @@ def _least_squares(
 
 def _prior(
     views: Sequence[View],
-    photos: npt.NDArray[np.int64],
+    photos: I64,
     lenses: Sequence[str],
     prior: Exposures,
     params: ExposureParams,

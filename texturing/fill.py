@@ -14,7 +14,7 @@ from numba import njit, prange
 
 from scan2sim.pipeline.classes import colour_of
 from scan2sim.pipeline.heightfield import spacing
-from scan2sim.pipeline.types import F32, I32, U8
+from scan2sim.pipeline.types import F32, I32, I64, U8, Bools
 from scan2sim.texturing.texels import box, frame
 
 LATTICE = 0.08
@@ -127,7 +127,7 @@ def pad(rgb: U8, seen: U8, reach: int) -> None:
 
 
 @njit(cache=True, parallel=True)
-def _carry(rgb, coloured, distance, nearest, reach, beyond):  # type: ignore[no-untyped-def]
+def _carry(rgb: U8, coloured: Bools, distance: F32, nearest: I32, reach: int, beyond: U8) -> None:
     height, width = coloured.shape
     row, column = np.zeros(nearest.max() + 1, np.int32), np.zeros(nearest.max() + 1, np.int32)
     for y in prange(height):
@@ -145,7 +145,7 @@ def _carry(rgb, coloured, distance, nearest, reach, beyond):  # type: ignore[no-
 
 
 @njit(cache=True, parallel=True)
-def _lattice(owner, seen, flat, step):  # type: ignore[no-untyped-def]
+def _lattice(owner: I32, seen: U8, flat: F32, step: int) -> I32:
     """(F, 2) int32 lattice nodes in x and y over every face that has an unseen texel; zero for the others."""
     height, width = owner.shape
     shape = np.zeros((len(flat), 2), np.int32)
@@ -165,7 +165,7 @@ def _lattice(owner, seen, flat, step):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, parallel=True)
-def _places(flat, corners, shape, start, step, size):  # type: ignore[no-untyped-def]
+def _places(flat: F32, corners: F32, shape: I32, start: I64, step: int, size: tuple[int, int]) -> F32:
     out = np.empty((start[-1], 3), np.float32)
     for f in prange(len(flat)):
         if shape[f, 0] == 0:
@@ -181,7 +181,9 @@ def _places(flat, corners, shape, start, step, size):  # type: ignore[no-untyped
 
 
 @njit(cache=True, parallel=True)
-def _interpolate(rgb, seen, owner, flat, shape, start, step, colour, mark):  # type: ignore[no-untyped-def]
+def _interpolate(
+    rgb: U8, seen: U8, owner: I32, flat: F32, shape: I32, start: I64, step: int, colour: F32, mark: U8
+) -> None:
     height, width = owner.shape
     for f in prange(len(flat)):
         if shape[f, 0] == 0:
@@ -203,7 +205,7 @@ def _interpolate(rgb, seen, owner, flat, shape, start, step, colour, mark):  # t
 
 
 @njit(cache=True, parallel=True)
-def texel_places(owner, flat, corners, rows, columns):  # type: ignore[no-untyped-def]
+def texel_places(owner: I32, flat: F32, corners: F32, rows: I64, columns: I64) -> F32:
     """(N, 3) local metres of texels at rows and columns (N,) of a page, on the faces that own them."""
     out = np.empty((len(rows), 3), np.float32)
     for i in prange(len(rows)):

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -22,12 +23,11 @@ from scan2sim.pipeline.cameras import (
     unproject,
     unproject_pixel,
 )
-from scan2sim.pipeline.projection import eye, to_camera
+from scan2sim.pipeline.projection import Eye, eye, to_camera
 from scan2sim.pipeline.sampling import mixed, taps
-from scan2sim.pipeline.types import F64, U8, Camera, View
+from scan2sim.pipeline.types import F32, F64, I64, U8, Bools, Camera, View
 from scan2sim.pipeline.visibility import DepthMap, visible
 
-Bools = npt.NDArray[np.bool_]
 HALF = 5
 """Patches reach so many pixels to each side of their corner, on every level."""
 WINDOW = 3
@@ -79,10 +79,10 @@ class Matches:
 
     place: F64
     normal: F64
-    first: npt.NDArray[np.int64]
+    first: I64
     corner: F64
-    of: npt.NDArray[np.int64]
-    view: npt.NDArray[np.int64]
+    of: I64
+    view: I64
     uv: F64
 
 
@@ -144,7 +144,7 @@ def matches(
     def joined(parts: list[F64], width: int) -> F64:
         return np.concatenate(parts) if parts else np.zeros((0, width))
 
-    def numbers(parts: list[npt.NDArray[np.int64]]) -> npt.NDArray[np.int64]:
+    def numbers(parts: list[I64]) -> I64:
         return np.concatenate(parts).astype(np.int64) if parts else np.zeros(0, np.int64)
 
     return Matches(
@@ -187,7 +187,7 @@ def _corners(picture: Picture, depth: DepthMap, count: int, max_distance: float)
 
 
 @njit(cache=True, parallel=True)
-def _planes(points):  # type: ignore[no-untyped-def]
+def _planes(points: F32) -> F32:
     """(H, W, 3) unit normals towards the camera of the plane through a patch; NaN where the surface is not flat."""
     height, width = points.shape[:2]
     out = np.full((height, width, 3), np.nan, np.float32)
@@ -223,7 +223,9 @@ def _planes(points):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, parallel=True)
-def _find(a, b, usable, corner, place, normal, eye_a, eye_b):  # type: ignore[no-untyped-def]
+def _find(
+    a: Sequence[U8], b: Sequence[U8], usable: Bools, corner: F64, place: F64, normal: F64, eye_a: Eye, eye_b: Eye
+) -> tuple[F64, Bools]:
     """Pixels (N, 2) at which the second photo shows corners of the first, and whether it was found (N,).
 
     Args:
@@ -260,7 +262,7 @@ def _find(a, b, usable, corner, place, normal, eye_a, eye_b):  # type: ignore[no
 
 
 @njit(cache=True)
-def _through_plane(eye_a, u, v, place, normal, eye_b):  # type: ignore[no-untyped-def]
+def _through_plane(eye_a: Eye, u: float, v: float, place: F64, normal: F64, eye_b: Eye) -> tuple[float, float, bool]:
     """(u, v, ok): where the second camera has what the first one's pixel shows of a plane (in the first's axes)."""
     x, y, z = unproject_pixel(eye_a.model, eye_a.p, u, v)
     along = x * normal[0] + y * normal[1] + z * normal[2]
@@ -272,7 +274,7 @@ def _through_plane(eye_a, u, v, place, normal, eye_b):  # type: ignore[no-untype
 
 
 @njit(cache=True)
-def _align(a, b, size, u, v, x0, y0, A, shift):  # type: ignore[no-untyped-def]
+def _align(a: U8, b: U8, size: float, u: float, v: float, x0: float, y0: float, A: F64, shift: F64) -> float:
     """Correlation of two patches after `shift` (2,), in place, was bettered on one level; -1: not to be had.
 
     Args:
@@ -351,6 +353,6 @@ def _align(a, b, size, u, v, x0, y0, A, shift):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, inline="always")
-def _at(image, x, y):  # type: ignore[no-untyped-def]
+def _at(image: npt.NDArray[Any], x: float, y: float) -> float:
     """Grey of a picture (H, W, 1) at a pixel."""
     return mixed(image, 0, taps(image, x, y, False))

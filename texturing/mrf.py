@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from scan2sim.pipeline.types import F32, I32
+from scan2sim.pipeline.types import F32, I32, I64
 
 SWEEPS = 100
 CLOSE = 2e-3
@@ -103,7 +103,7 @@ def solve(view: I32, cost: F32, pairs: I32, price: F32) -> Solution:
 
 
 @njit(cache=True)
-def _energy(view, cost, count, start, other, edge, price, pick):  # type: ignore[no-untyped-def]
+def _energy(view: I32, cost: F32, count: I64, start: I64, other: I32, edge: I64, price: F32, pick: I64) -> float:
     """What a picked candidate a face costs, prices included."""
     energy = 0.0
     for f in range(len(count)):
@@ -116,7 +116,18 @@ def _energy(view, cost, count, start, other, edge, price, pick):  # type: ignore
 
 
 @njit(cache=True)
-def _sweep(view, cost, count, start, other, edge, price, message, pick, forward):  # type: ignore[no-untyped-def]
+def _sweep(
+    view: I32,
+    cost: F32,
+    count: I64,
+    start: I64,
+    other: I32,
+    edge: I64,
+    price: F32,
+    message: F32,
+    pick: I64,
+    forward: bool,
+) -> float:
     """Let each face in turn pick its candidate and pass messages to the faces that come later; returns a bound.
 
     Args:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from scan2sim.pipeline.types import F32, F64, I32, Mesh
+from scan2sim.pipeline.types import F32, F64, I32, I64, Bools, Mesh
 
 TILT = 0.2
 """How far a chart's plane is turned from its faces' mean normal towards the camera."""
@@ -23,8 +23,6 @@ COVERED = 0.6
 
 CELLS = 8
 """Charts are cut at a grid of this many cells along their largest side."""
-
-Index = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -38,10 +36,10 @@ class Charts:
         size: (C, 2) width and height of every chart, texels.
     """
 
-    face: Index
-    chart: Index
+    face: I64
+    chart: I64
     flat: F32
-    size: npt.NDArray[np.int64]
+    size: I64
 
 
 def cut(mesh: Mesh, view: I32, centres: F64, texel: float, largest: int) -> Charts:
@@ -102,7 +100,7 @@ def cut(mesh: Mesh, view: I32, centres: F64, texel: float, largest: int) -> Char
     return Charts(face[keep], renamed[chart[keep]], flat[keep], size[small])
 
 
-def pack(size: npt.NDArray[np.int64], side: int, gutter: int) -> tuple[Index, Index, list[tuple[int, int]]]:
+def pack(size: I64, side: int, gutter: int) -> tuple[I64, I64, list[tuple[int, int]]]:
     """Rectangles onto pages, on shelves of falling height.
 
     Args:
@@ -133,7 +131,7 @@ def pack(size: npt.NDArray[np.int64], side: int, gutter: int) -> tuple[Index, In
     return place, page, pages
 
 
-def overlapping(flat: F32, page: Index, pages: list[tuple[int, int]]) -> npt.NDArray[np.bool_]:
+def overlapping(flat: F32, page: I64, pages: list[tuple[int, int]]) -> Bools:
     """(N,) faces of which others cover too much; `flat` (N, 3, 2) texels of their page."""
     from scan2sim.texturing.texels import owners
 
@@ -147,7 +145,7 @@ def overlapping(flat: F32, page: Index, pages: list[tuple[int, int]]) -> npt.NDA
     return covered
 
 
-def _components(mesh: Mesh, view: I32, cell: float) -> Index:
+def _components(mesh: Mesh, view: I32, cell: float) -> I64:
     """(F,) connected faces of one view within one cell of a grid (metres); -1 without a view."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -183,7 +181,7 @@ def _axes(normal: F64) -> tuple[F64, F64]:
     return across, np.cross(normal, across)
 
 
-def _upright(flat: F64, chart: Index, count: int) -> F64:
+def _upright(flat: F64, chart: I64, count: int) -> F64:
     """Charts turned so that their longest extent lies along x."""
     points = np.nan_to_num(flat.mean(axis=1))
     n = np.maximum(np.bincount(chart, minlength=count), 1)

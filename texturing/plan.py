@@ -9,11 +9,10 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 
 from scan2sim.pipeline.heightfield import MOST, drawn, grown
-from scan2sim.pipeline.types import F32, F64, U8, Mesh
+from scan2sim.pipeline.types import F32, F64, I32, I64, U8, Bools, Mesh
 from scan2sim.texturing.continuation import FACTOR, continued
 from scan2sim.texturing.fill import FILLED, FROM_POINTS, SEEN, Page, texel_places
 from scan2sim.texturing.texels import frame
@@ -26,8 +25,6 @@ reach to what photos saw, and have its tone."""
 
 BESIDE = 2.5
 """Metres around what was taken out within which points, where no photo shows the ground, may have its colours."""
-
-Bools = npt.NDArray[np.bool_]
 
 
 class Plan:
@@ -77,7 +74,7 @@ class Plan:
         picture, filled = continued(rgb, known, _whole(self._wanted | rim, known), self._kind())
         return Continued(self, picture.astype(np.uint8), filled)
 
-    def _kind(self) -> npt.NDArray[np.int32]:
+    def _kind(self) -> I32:
         """Class of the nearest point for every coarse cell; -1 far from all."""
         from scipy import ndimage
 
@@ -90,7 +87,7 @@ class Plan:
         nearest = ndimage.distance_transform_edt(kind < 0, return_distances=False, return_indices=True)
         return kind[tuple(nearest)]
 
-    def at(self, places: F32) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    def at(self, places: F32) -> tuple[I64, I64]:
         """Rows and columns (N,) of places (N, 3)."""
         index = np.floor((places[:, :2] - self.low) / self.cell).astype(np.int64)
         rows, columns = self._count.shape
@@ -115,7 +112,9 @@ class Continued:
 
 
 @njit(cache=True, inline="always")
-def _cell_of(origin, per_x, per_y, x, y, low, cell, shape):  # type: ignore[no-untyped-def]
+def _cell_of(
+    origin: F64, per_x: F64, per_y: F64, x: float, y: float, low: F64, cell: float, shape: tuple[int, ...]
+) -> tuple[int, int]:
     """Row and column of a texel in the picture; `origin`, `per_x`, `per_y` are its face's (`texels.frame`)."""
     row = math.floor((origin[1] + x * per_x[1] + y * per_y[1] - low[1]) / cell)
     column = math.floor((origin[0] + x * per_x[0] + y * per_y[0] - low[0]) / cell)
@@ -123,7 +122,7 @@ def _cell_of(origin, per_x, per_y, x, y, low, cell, shape):  # type: ignore[no-u
 
 
 @njit(cache=True)
-def _clear(seen, owner, flat, corners, low, cell, stood):  # type: ignore[no-untyped-def]
+def _clear(seen: U8, owner: I32, flat: F32, corners: F32, low: F64, cell: float, stood: Bools) -> None:
     last = -1
     for y in range(seen.shape[0]):
         for x in range(seen.shape[1]):
@@ -137,7 +136,19 @@ def _clear(seen, owner, flat, corners, low, cell, stood):  # type: ignore[no-unt
 
 
 @njit(cache=True)
-def _add(rgb, seen, owner, flat, corners, low, cell, total, count, wanted, from_points):  # type: ignore[no-untyped-def]
+def _add(
+    rgb: U8,
+    seen: U8,
+    owner: I32,
+    flat: F32,
+    corners: F32,
+    low: F64,
+    cell: float,
+    total: F32,
+    count: F32,
+    wanted: Bools,
+    from_points: Bools,
+) -> None:
     last = -1
     for y in range(seen.shape[0]):
         for x in range(seen.shape[1]):

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
 from scan2sim.pipeline.cameras import EQUIRECTANGULAR, pixel_angle, pixel_rays
-from scan2sim.pipeline.projection import eye, incidence, is_visible, pixel_of, to_camera, turned
+from scan2sim.pipeline.projection import Eye, Ranges, eye, incidence, is_visible, pixel_of, to_camera, turned
 from scan2sim.pipeline.sampling import allows, halving, read
 from scan2sim.pipeline.types import F32, F64, U8, Camera
 from scan2sim.pipeline.visibility import DepthMap
@@ -112,7 +113,7 @@ class Predictor:
 
 
 @njit(cache=True, parallel=True)
-def _normals(points):  # type: ignore[no-untyped-def]
+def _normals(points: F32) -> F32:
     """(H, W, 3) unit normals towards the camera, from each pixel's nearer neighbours; along the ray at borders."""
     height, width = points.shape[:2]
     out = np.zeros((height, width, 3), np.float32)
@@ -152,9 +153,21 @@ def _normals(points):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, parallel=True)
-def _sample(  # type: ignore[no-untyped-def]
-    rgb, weight, points, normals, own_pixel, levels, mask, eye, ranges, exposure, max_distance, min_cos, bias
-):  # fmt: skip
+def _sample(
+    rgb: U8,
+    weight: F32,
+    points: F32,
+    normals: F32,
+    own_pixel: float,
+    levels: tuple[U8, U8, U8],
+    mask: U8,
+    eye: Eye,
+    ranges: Ranges,
+    exposure: F64,
+    max_distance: float,
+    min_cos: float,
+    bias: float,
+) -> None:
     height, width = weight.shape
     wide = eye.model == EQUIRECTANGULAR
     factors = (math.exp(exposure[0]), math.exp(exposure[1]), math.exp(exposure[2]))
@@ -189,7 +202,7 @@ def _sample(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, parallel=True)
-def _agree(rgb, weight, out, support, others, alike):  # type: ignore[no-untyped-def]
+def _agree(rgb: U8, weight: F32, out: F32, support: U8, others: U8, alike: float) -> None:
     """The mean of those that are alike the sample which most are alike to."""
     count, height, width = weight.shape
     for row in prange(height):
@@ -223,7 +236,7 @@ def _agree(rgb, weight, out, support, others, alike):  # type: ignore[no-untyped
 
 
 @njit(cache=True, inline="always")
-def _apart(a, b):  # type: ignore[no-untyped-def]
+def _apart(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> np.float32:
     """How far two colours are apart: the mean over channels, grey levels."""
     return (
         abs(np.float32(a[0]) - np.float32(b[0]))
@@ -232,7 +245,7 @@ def _apart(a, b):  # type: ignore[no-untyped-def]
     ) / 3.0
 
 
-def corrected_photo(photo: npt.NDArray[np.uint8], camera: Camera, exposure: F64) -> F32:
+def corrected_photo(photo: U8, camera: Camera, exposure: F64) -> F32:
     """The photo (H, W, 3), of a camera scaled to it, with its exposure corrected; (H, W, 3) float32, unclipped."""
     v, u = np.mgrid[: camera.height, : camera.width].astype(np.float32)
     cx, cy = (camera.width - 1) / 2, (camera.height - 1) / 2

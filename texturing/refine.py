@@ -14,14 +14,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import Field
 
 from scan2sim.pipeline.io import image
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.ranges import Reach
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.types import F64, Camera, Mesh, PointCloud, View
+from scan2sim.pipeline.types import F64, I64, Bools, Camera, Mesh, PointCloud, View
 from scan2sim.texturing.agreement import AgreementParams, neighbours
 
 if TYPE_CHECKING:
@@ -29,7 +28,7 @@ if TYPE_CHECKING:
     from scan2sim.texturing.bundle import Corrections, Priors
     from scan2sim.texturing.matches import Matches, Picture
 
-    Numbers = npt.NDArray[np.int64]
+    Numbers = I64
 
 PIXELS = 500_000
 """Photos are compared at this size at most."""
@@ -225,7 +224,7 @@ def _believed(
     """The corrections without those that are larger than poses can be wrong by, and sentences about these."""
     from scan2sim.texturing.bundle import Corrections
 
-    def beyond(rows: F64, turn: float, shift: float) -> npt.NDArray[np.bool_]:
+    def beyond(rows: F64, turn: float, shift: float) -> Bools:
         turned, shifted = np.linalg.norm(rows[:, :3], axis=1), np.linalg.norm(rows[:, 3:], axis=1)
         return np.asarray((turned > BOUND * turn) | (shifted > BOUND * shift))
 

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import Field
 
 from scan2sim.pipeline.classes import SURFACES
@@ -16,7 +15,7 @@ from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.ranges import Reach
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.steps.pictures import Album
-from scan2sim.pipeline.types import F32, View
+from scan2sim.pipeline.types import F32, I64, Bools, View
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.render import Renderer
@@ -122,7 +121,7 @@ def _caption(figures: dict[str, float | None]) -> str:
     return ", ".join(parts) + "."
 
 
-def _band(distance: F32) -> npt.NDArray[np.int64]:
+def _band(distance: F32) -> I64:
     """(H, W) which band a pixel is in, -1 where there is no surface."""
     from scan2sim.texturing.evaluate import BANDS
 
@@ -156,13 +155,13 @@ def _truth(inputs: Inputs, world: Renderer, params: ScoreParams) -> dict[str, fl
     near = counts.copy()
     near[counts] = _seen_from_near(inputs, *world.nearest_places(truth.xyz[counts]), params.near)
 
-    def over(chosen: npt.NDArray[np.bool_]) -> float | None:
+    def over(chosen: Bools) -> float | None:
         return round(psnr(float(squared[chosen].mean())), 2) if chosen.any() else None
 
     return {"truth_psnr_db": over(counts), "truth_psnr_near_db": over(near)}
 
 
-def _seen_from_near(inputs: Inputs, places: F32, normals: F32, near: float) -> npt.NDArray[np.bool_]:
+def _seen_from_near(inputs: Inputs, places: F32, normals: F32, near: float) -> Bools:
     """(N,) which places (N, 3) on the meshes a photo that was not held out sees from `near` metres or nearer."""
     from scan2sim.pipeline.visibility import load_depth_map, visible
 

@@ -9,11 +9,8 @@ No network is needed: clouds that come with classes have none.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-from scan2sim.pipeline.types import F32, U8
-
-Bools = npt.NDArray[np.bool_]
+from scan2sim.pipeline.types import F32, U8, Bools
 
 SMOOTH = 4.0
 """Grey levels, standard deviation within 5 x 5 pixels: sky varies by no more ..."""

@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from scan2sim.pipeline.types import F32, I32
+from scan2sim.pipeline.types import F32, F64, I32, I64, U8
 
 BAND = 32
 """Rows of a page that one thread finds the owners of."""
@@ -29,7 +29,7 @@ def owners(flat: F32, width: int, height: int) -> I32:
 
 
 @njit(cache=True)
-def box(flat, f, width, height):  # type: ignore[no-untyped-def]
+def box(flat: F32, f: int, width: int, height: int) -> tuple[int, int, int, int]:
     """Texels whose centres may be in face f: x0, y0, x1, y1, inclusive."""
     x0 = min(flat[f, 0, 0], flat[f, 1, 0], flat[f, 2, 0])
     x1 = max(flat[f, 0, 0], flat[f, 1, 0], flat[f, 2, 0])
@@ -44,7 +44,7 @@ def box(flat, f, width, height):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, parallel=True)
-def _own(flat, owner):  # type: ignore[no-untyped-def]
+def _own(flat: F32, owner: I32) -> None:
     height, width = owner.shape
     bands = (height + BAND - 1) // BAND
     rows = np.empty((len(flat), 2), np.int32)
@@ -71,7 +71,7 @@ def _own(flat, owner):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def frame(flat, corners, f):  # type: ignore[no-untyped-def]
+def frame(flat: F32, corners: F32, f: int) -> tuple[F64, F64, F64, bool]:
     """The affine map of a face from texels to space: (origin, per x, per y), each (3,); and whether it has one."""
     ax, ay = np.float64(flat[f, 0, 0]), np.float64(flat[f, 0, 1])
     bx, by = flat[f, 1, 0] - ax, flat[f, 1, 1] - ay
@@ -90,7 +90,7 @@ def frame(flat, corners, f):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, parallel=True)
-def count(owner, seen, flat):  # type: ignore[no-untyped-def]
+def count(owner: I32, seen: U8, flat: F32) -> I64:
     """(F, 4) texels of every face: all, seen by a photo (255), coloured from points (128), filled (64)."""
     height, width = owner.shape
     out = np.zeros((len(flat), 4), np.int64)

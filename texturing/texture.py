@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import Field
 
 from scan2sim.pipeline.extras import need
@@ -24,7 +23,7 @@ from scan2sim.pipeline.io import image
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.ranges import Cosine, Depth, Device
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.types import F32, U8, Mesh, PointCloud
+from scan2sim.pipeline.types import F32, I64, U8, Bools, Mesh, PointCloud
 from scan2sim.texturing.agreement import Agreement
 from scan2sim.texturing.choose import Choice
 
@@ -157,7 +156,7 @@ def _texel(mesh: Mesh, sizes: Sequence[dict[str, int]]) -> float:
     return float(np.percentile(np.sqrt(mesh.face_area / np.maximum(texels, 1e-9)), 25))
 
 
-def _go_on(plan: Plan, folder: Path, mesh: Mesh, wanting: npt.NDArray[np.bool_], params: TextureParams) -> None:
+def _go_on(plan: Plan, folder: Path, mesh: Mesh, wanting: Bools, params: TextureParams) -> None:
     """Paint the pages of the faces that are `wanting` (F,), where the ground goes on, and pad their charts."""
     from scan2sim.texturing import fill, texels
     from scan2sim.texturing.writer import Writer
@@ -182,11 +181,11 @@ def _go_on(plan: Plan, folder: Path, mesh: Mesh, wanting: npt.NDArray[np.bool_],
 
 def _filled(
     page: Page,
-    faces: npt.NDArray[np.int64],
+    faces: I64,
     mesh: Mesh,
     colours: Colours | None,
     made: tuple[F32, U8] | None,
-) -> npt.NDArray[np.int64]:
+) -> I64:
     """Fill what no photo saw; returns (N, 4) texels of the faces, as `texels.count`.
 
     Where points have no colours of their own, texels that photos saw stand in, but for what was made up (`made`).
@@ -208,7 +207,7 @@ def _filled(
     return np.asarray(texels.count(page.owner, page.seen, page.flat))
 
 
-def _facts(mesh: Mesh, texels: npt.NDArray[np.int64], sizes: Sequence[dict[str, int]], baker: Baker) -> dict[str, Any]:
+def _facts(mesh: Mesh, texels: I64, sizes: Sequence[dict[str, int]], baker: Baker) -> dict[str, Any]:
     """Figures of a texture: areas (m2) by where their colour came from, photos and what each gave."""
     area = mesh.face_area.astype(np.float64)
     share = texels[:, 1:] / np.maximum(texels[:, :1], 1)

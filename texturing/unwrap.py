@@ -23,13 +23,13 @@ from scan2sim.pipeline.errors import SettingError, StepError
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.ranges import Seconds, Texel
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.types import Mesh, View
+from scan2sim.pipeline.types import F32, F64, I32, I64, Mesh, View
 from scan2sim.texturing.choose import Choice
 
 if TYPE_CHECKING:
     from scan2sim.texturing.atlas import Backend, Unwrapped
 
-    Index = npt.NDArray[np.int64]
+    Index = I64
 
 FAR = 1e5
 """Metres to where an orthographic camera's rays are taken to meet."""
@@ -138,14 +138,14 @@ class Laid:
         charts, fallbacks: number of charts, and of blocks that went to the other backend.
     """
 
-    uv: npt.NDArray[np.float32]
+    uv: F32
     page: npt.NDArray[np.int16]
     pages: list[dict[str, int]]
     charts: int
     fallbacks: int
 
 
-def _photos(inputs: Inputs) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+def _photos(inputs: Inputs) -> tuple[I32, F64, F64]:
     """The view (F,) of every face's detail, the cameras' centres (V, 3), and metres a pixel (V,), 0 if by distance."""
     views = views_io.load(inputs["views"])
     pixel = [1 / min(v.camera.fx, v.camera.fy) if v.camera.model == "orthographic" else 0.0 for v in views]
@@ -153,7 +153,7 @@ def _photos(inputs: Inputs) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float
     return Choice.load(inputs["choice"]).detail_view, centres, np.array(pixel, np.float64)
 
 
-def _eye(view: View) -> npt.NDArray[np.float64]:
+def _eye(view: View) -> F64:
     """(3,) where a view's rays meet: its centre; those of an orthographic camera nearly do so far above its middle."""
     from scan2sim.pipeline.cameras import ray_origins
 
@@ -163,9 +163,7 @@ def _eye(view: View) -> npt.NDArray[np.float64]:
     return view.centre + view.T_world_cam[:3, :3] @ (middle - (0.0, 0.0, FAR))
 
 
-def lay_by_photo(
-    mesh: Mesh, laid: Laid, detail_view: npt.NDArray[np.int32], centres: npt.NDArray[np.float64], params: UnwrapParams
-) -> Laid:
+def lay_by_photo(mesh: Mesh, laid: Laid, detail_view: I32, centres: F64, params: UnwrapParams) -> Laid:
     """Charts as the chosen photos see them, on pages after those that are there; faces that can't be laid so get none.
 
     Args:

@@ -21,8 +21,8 @@ from scan2sim.flows.reports import gazebo
 from scan2sim.flows.reports.tile import write_whole
 from scan2sim.pipeline.classes import SURFACES
 from scan2sim.pipeline.errors import from_os_error
+from scan2sim.pipeline.types import F64
 
-F64 = npt.NDArray[np.float64]
 State = Literal["done", "kept", "failed", "waiting"]
 STATES: tuple[State, ...] = ("failed", "waiting", "done", "kept")
 TEMPLATE = "survey.html.j2"

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from scan2sim.pipeline.borders.faces import Bools, Ints, directed_edges, normals, welded
+from scan2sim.pipeline.borders.faces import directed_edges, normals, welded
 from scan2sim.pipeline.borders.grid import local, on_grid, world
 from scan2sim.pipeline.cells import Cell
-from scan2sim.pipeline.types import F64, Mesh
+from scan2sim.pipeline.types import F64, I64, Bools, Mesh
 
 ON = 1e-4
 """Metres from a border within which a vertex counts as lying on it."""
@@ -82,7 +82,7 @@ def clip(mesh: Mesh, cell: Cell) -> Clipped:
     return Clipped(local(mesh.frame, xyz, faces), {name: on[:, k] for k, name in enumerate(names)})
 
 
-def _cut(xyz: F64, faces: Ints, on: Bools, distance: F64, k: int) -> tuple[F64, Ints, Bools]:
+def _cut(xyz: F64, faces: I64, on: Bools, distance: F64, k: int) -> tuple[F64, I64, Bools]:
     """Cut at border `k`, which vertices lie `distance` (V,) beyond."""
     side = np.sign(np.where(np.abs(distance) <= ON, 0, distance)).astype(np.int8)
     xyz, side = _slid(xyz, faces, on, distance, side)
@@ -103,7 +103,7 @@ def _cut(xyz: F64, faces: Ints, on: Bools, distance: F64, k: int) -> tuple[F64, 
     return xyz, np.concatenate([faces[~crosses], _fans(xyz, ring)]), on
 
 
-def _crossings(faces: Ints, side: npt.NDArray[np.int8]) -> tuple[Ints, Ints, Ints]:
+def _crossings(faces: I64, side: npt.NDArray[np.int8]) -> tuple[I64, I64, I64]:
     """Edges that cross: both ends, and (F, 3) each face's (first corner to second, ...) index into them, or -1."""
     edges = np.sort(directed_edges(faces), axis=1)
     across = side[edges[:, 0]] * side[edges[:, 1]] < 0
@@ -113,7 +113,7 @@ def _crossings(faces: Ints, side: npt.NDArray[np.int8]) -> tuple[Ints, Ints, Int
     return ends[:, 0], ends[:, 1], index.reshape(3, -1).T
 
 
-def _fans(xyz: F64, ring: Ints) -> Ints:
+def _fans(xyz: F64, ring: I64) -> I64:
     """Triangles of polygons (F, 4), the fourth corner -1 where there are but three; quads by their shorter diagonal."""
     quad = ring[ring[:, 3] >= 0]
     corners = xyz[quad]
@@ -124,7 +124,7 @@ def _fans(xyz: F64, ring: Ints) -> Ints:
 
 
 def _slid(
-    xyz: F64, faces: Ints, on: Bools, distance: F64, side: npt.NDArray[np.int8]
+    xyz: F64, faces: I64, on: Bools, distance: F64, side: npt.NDArray[np.int8]
 ) -> tuple[F64, npt.NDArray[np.int8]]:
     """Vertices close to a border slid onto it along one of their edges that cross it; new places and sides.
 

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from scan2sim.pipeline.borders.faces import Bools, Ints, directed_edges
-from scan2sim.pipeline.types import F64
+from scan2sim.pipeline.borders.faces import directed_edges
+from scan2sim.pipeline.types import F64, I64, Bools
 
 AGAINST = 4.0
 """What a metre along the other's border costs in the wrong direction."""
@@ -27,8 +27,8 @@ class Curve(NamedTuple):
         face: (E,) the face of each.
     """
 
-    edges: Ints
-    face: Ints
+    edges: I64
+    face: I64
 
 
 def curve(faces: npt.NDArray[Any], on: Bools) -> Curve:
@@ -42,7 +42,7 @@ def curve(faces: npt.NDArray[Any], on: Bools) -> Curve:
     return Curve(edges[alone], face[alone])
 
 
-def chains(edges: Ints, ends: Iterable[int] = ()) -> list[list[int]]:
+def chains(edges: I64, ends: Iterable[int] = ()) -> list[list[int]]:
     """Edges in a row, as lists of vertices; closed ones name their first vertex again at the end.
 
     Args:
@@ -73,7 +73,7 @@ class Graph:
         xyz: (V, 3) metres.
     """
 
-    def __init__(self, edges: Ints, xyz: F64) -> None:
+    def __init__(self, edges: I64, xyz: F64) -> None:
         self.xyz = xyz
         self.next: dict[int, dict[int, float]] = defaultdict(dict)
         length = np.linalg.norm(xyz[edges[:, 0]] - xyz[edges[:, 1]], axis=1)

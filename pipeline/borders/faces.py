@@ -7,10 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from scan2sim.pipeline.types import F64
-
-Bools = npt.NDArray[np.bool_]
-Ints = npt.NDArray[np.int64]
+from scan2sim.pipeline.types import F64, I64, Bools
 
 
 def normals(corners: F64) -> F64:
@@ -18,12 +15,12 @@ def normals(corners: F64) -> F64:
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
-def directed_edges(faces: npt.NDArray[Any]) -> Ints:
+def directed_edges(faces: npt.NDArray[Any]) -> I64:
     """(3 F, 2) directed edges: those from every face's first corner, then those from its second, then its third."""
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
 
 
-def welded(faces: Ints, pairs: Ints, n: int) -> tuple[Ints, Bools, Ints]:
+def welded(faces: I64, pairs: I64, n: int) -> tuple[I64, Bools, I64]:
     """Make vertices one that `pairs` (P, 2) say are; of `n` in all.
 
     Returns:

@@ -10,9 +10,9 @@ import numpy as np
 
 from scan2sim.pipeline.borders.clip import Clipped
 from scan2sim.pipeline.borders.curve import Graph, chains, curve
-from scan2sim.pipeline.borders.faces import Ints, normals
+from scan2sim.pipeline.borders.faces import normals
 from scan2sim.pipeline.borders.grid import world
-from scan2sim.pipeline.types import F64, Mesh
+from scan2sim.pipeline.types import F64, I64, Mesh
 
 FACING = 0.1
 """Metres that a normal's turn by 60 degrees counts for where the counterpart of a vertex is looked for."""
@@ -29,9 +29,9 @@ class Follow(NamedTuple):
         facts: see `join.join`.
     """
 
-    vertices: Ints
+    vertices: I64
     places: F64
-    welds: Ints
+    welds: I64
     inserts: list[tuple[int, int, int, F64]]
     facts: dict[str, float]
 
@@ -83,7 +83,7 @@ def follow(name: str, own: Clipped, settled: F64, other: str, theirs: Clipped, t
 
 
 def _partners(
-    mesh: Mesh, vertices: Ints, other: Mesh, others: Ints, there: F64, tolerance: float
+    mesh: Mesh, vertices: I64, other: Mesh, others: I64, there: F64, tolerance: float
 ) -> tuple[dict[int, int], dict[int, float]]:
     """The nearest of a neighbour's vertices for each, and how far it is; none where that is beyond `tolerance`.
 
@@ -159,7 +159,7 @@ def _to_the_end(run: Run, ends: set[int], graph: Graph, limit: float) -> Run:
     return Run(vertices, walk, at)
 
 
-def _vertex_normals(mesh: Mesh, vertices: Ints) -> F64:
+def _vertex_normals(mesh: Mesh, vertices: I64) -> F64:
     """(N, 3) unit normals of some of a mesh's vertices."""
     chosen = np.zeros(len(mesh.vertices), bool)
     chosen[vertices] = True

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 
 from scan2sim.pipeline.borders.curve import curve
-from scan2sim.pipeline.borders.faces import Ints
 from scan2sim.pipeline.borders.grid import world
 from scan2sim.pipeline.cells import Cell
-from scan2sim.pipeline.types import F64, Mesh
+from scan2sim.pipeline.types import F64, I64, Mesh
 
 COUNTERPART = 0.3
 """Metres within which two borders are parts of one, for the measure."""
@@ -104,7 +103,7 @@ def _apart(side: F64, other: F64, known: set[frozenset[Any]]) -> F64:
     return np.stack([distance, length])
 
 
-def _along(edges: F64) -> tuple[F64, F64, Ints]:
+def _along(edges: F64) -> tuple[F64, F64, I64]:
     """Places every centimetre along edges (E, 2, 3), the length that each stands for, and its edge."""
     length = np.linalg.norm(edges[:, 0] - edges[:, 1], axis=1)
     count = np.maximum(1, np.rint(length / STEP)).astype(np.int64)

@@ -11,10 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from scan2sim.pipeline.borders.clip import Clipped, stacked
-from scan2sim.pipeline.borders.faces import Bools, Ints, directed_edges, normals, welded
+from scan2sim.pipeline.borders.faces import directed_edges, normals, welded
 from scan2sim.pipeline.borders.follow import follow
 from scan2sim.pipeline.borders.grid import local, world
-from scan2sim.pipeline.types import F64, Mesh
+from scan2sim.pipeline.types import F64, I64, Bools, Mesh
 
 ROUNDS = 30
 """Tries at turning back the faces that moving the border has turned over."""
@@ -118,7 +118,7 @@ def _ramp(xyz: F64, moved: F64, shift: F64, reach: float) -> F64:
     return out
 
 
-def _split(faces: npt.NDArray[Any], inserts: list[tuple[int, int, int, F64]], n: int) -> tuple[Ints, Ints, F64]:
+def _split(faces: npt.NDArray[Any], inserts: list[tuple[int, int, int, F64]], n: int) -> tuple[I64, I64, F64]:
     """Faces with vertices inserted into their edges, as fans; the face each comes from; the new vertices' places.
 
     Args:
@@ -142,14 +142,14 @@ def _split(faces: npt.NDArray[Any], inserts: list[tuple[int, int, int, F64]], n:
     return np.concatenate([faces[whole].astype(np.int64), split]), np.concatenate([whole, parent]), added
 
 
-def _turned_back(xyz: F64, faces: Ints, before: F64, free: Bools) -> tuple[F64, int]:
+def _turned_back(xyz: F64, faces: I64, before: F64, free: Bools) -> tuple[F64, int]:
     """Turn back faces that don't look as `before` (F, 3): their free vertices go to the middle of their neighbours.
 
     Returns:
         Places (V, 3), and how many faces stayed turned.
     """
 
-    def turned(near: Ints) -> Ints:
+    def turned(near: I64) -> I64:
         return near[np.einsum("ij,ij->i", normals(xyz[faces[near]]), before[near]) < 0]
 
     xyz = xyz.copy()

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from scan2sim.pipeline.borders.curve import curve
 from scan2sim.pipeline.errors import UnavailableError
-from scan2sim.pipeline.types import F64, I32
+from scan2sim.pipeline.types import F64, I32, Bools
 
 NEEDS = ("pymeshlab",)
 KEEPS_BORDER = True
@@ -43,7 +42,7 @@ def simplify(vertices: F64, faces: I32, target: int, keep_border: bool) -> tuple
     return mesh.vertex_matrix(), mesh.face_matrix()
 
 
-def _at_border(faces: I32, n: int) -> npt.NDArray[np.bool_]:
+def _at_border(faces: I32, n: int) -> Bools:
     """(F,) faces that have a vertex, of `n`, on an edge of one face alone."""
     on = np.zeros(n, bool)
     on[curve(faces, np.ones(n, bool)).edges] = True

@@ -13,6 +13,8 @@ from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.types import Frame
 
 if TYPE_CHECKING:
+    from pyproj import CRS
+
     from scan2sim.pipeline.io.clouds import Header
 
 UNITS = {"m": 1.0, "ft": 0.3048, "us-ft": 1200 / 3937}
@@ -104,7 +106,7 @@ def has_heights(crs: str) -> bool:
     return crs != LOCAL and bool(_parsed(crs).is_compound)
 
 
-def _parsed(crs: str):  # type: ignore[no-untyped-def]  # pyproj is imported late
+def _parsed(crs: str) -> CRS:
     from pyproj import CRS
     from pyproj.exceptions import CRSError
 
@@ -116,7 +118,7 @@ def _parsed(crs: str):  # type: ignore[no-untyped-def]  # pyproj is imported lat
         ) from None
 
 
-def _horizontal(crs: str):  # type: ignore[no-untyped-def]
+def _horizontal(crs: str) -> CRS:
     parsed = _parsed(crs)
     return parsed.sub_crs_list[0] if parsed.is_compound else parsed
 

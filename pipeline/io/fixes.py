@@ -8,11 +8,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.io.crs import utm
-from scan2sim.pipeline.types import F64, Frame, GpsTrack
+from scan2sim.pipeline.types import F64, I64, Frame, GpsTrack
 
 MAX_SPEED = 70.0
 """Metres a second (252 km/h) that no car drives: a fix that would need more is a jump."""
@@ -57,7 +56,7 @@ def tidy(path: Path, times: F64, positions: F64, sigma: F64, frame: Frame) -> Gp
     return GpsTrack(times, positions, np.where(known, sigma, RANGE_ERROR) if known.any() else None, frame)
 
 
-def without_jumps(times: F64, xy: F64, max_speed: float = MAX_SPEED, reach: int = 1000) -> npt.NDArray[np.int64]:
+def without_jumps(times: F64, xy: F64, max_speed: float = MAX_SPEED, reach: int = 1000) -> I64:
     """Indices of the most fixes of (N,) `times` and (N, 2) `xy` that one can pass through at `max_speed` (m/s).
 
     The longest chain rather than the first: a wrong start doesn't take the rest with it. `reach` is the number of

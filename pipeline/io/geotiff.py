@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from scan2sim.pipeline.errors import from_os_error
 from scan2sim.pipeline.io.crs import LOCAL, _parsed
-from scan2sim.pipeline.types import Frame
+from scan2sim.pipeline.types import F64, U8, Frame
 
 NODATA = -9999.0
 """Of heights: what GIS tools know as "nothing here"."""
@@ -59,7 +59,7 @@ class Grid:
         east, north = np.ceil(frame.to_crs(high)[:2] / pixel).astype(int).tolist()
         return cls(frame, west, north, max(1, east - west), max(1, north - south), pixel)
 
-    def band(self, first: int, rows: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    def band(self, first: int, rows: int) -> tuple[F64, F64]:
         """South-west and north-east corner (2,) of some rows, local metres."""
         south, north = self.row - first - rows, self.row - first
         corners = np.array([[self.column, south, 0], [self.column + self.width, north, 0]], float)
@@ -67,7 +67,7 @@ class Grid:
         return low[:2], high[:2]
 
 
-def write_colours(path: Path, grid: Grid, bands: Iterable[npt.NDArray[np.uint8]]) -> None:
+def write_colours(path: Path, grid: Grid, bands: Iterable[U8]) -> None:
     """Write a picture; `bands` gives it from north to south, (rows, W, 4) RGB and alpha (0: nothing here).
 
     JPEG with a mask.
@@ -83,7 +83,7 @@ def write_colours(path: Path, grid: Grid, bands: Iterable[npt.NDArray[np.uint8]]
         _fill(raster, bands)
 
 
-def write_heights(path: Path, grid: Grid, bands: Iterable[npt.NDArray[np.float64]]) -> None:
+def write_heights(path: Path, grid: Grid, bands: Iterable[F64]) -> None:
     """Write heights; `bands` gives them from north to south, (rows, W) in CRS units, NaN where there is nothing.
 
     Float32, lossless, `NODATA` where there is nothing.

@@ -9,9 +9,7 @@ import numpy.typing as npt
 
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.io.image import read_rgb
-from scan2sim.pipeline.types import F32, F64, U8, UNCOLOURED, Camera
-
-Bools = npt.NDArray[np.bool_]
+from scan2sim.pipeline.types import F32, F64, U8, UNCOLOURED, Bools, Camera
 
 COLOUR_REACH = 0.2  # metres over which a point that its own photo doesn't show borrows a colour
 COLOUR_VOXEL = 0.1

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from scan2sim.pipeline.types import F64, UNCOLOURED, Frame, PointCloud
+from scan2sim.pipeline.types import F64, I32, UNCOLOURED, Frame, PointCloud
 
 QUANTUM = 0.001
 """CRS units, of coordinates; a whole number of them makes a unit, so that tiles with whole offsets agree on them."""
@@ -26,8 +26,6 @@ POINT = np.dtype(
     ]
 )
 CHUNK = 500_000
-
-I32 = npt.NDArray[np.int32]
 
 
 @dataclass

@@ -34,9 +34,7 @@ from scan2sim.pipeline.io.tile import DISTORTION_LENGTHS, CameraEntry, read_tile
 from scan2sim.pipeline.poses import interpolate, nearest_rotation
 from scan2sim.pipeline.ranges import Metres, Range, Shift, Voxel
 from scan2sim.pipeline.step import Params, Report, silent
-from scan2sim.pipeline.types import F32, F64, U8, Camera, Frame, PointCloud, Trajectory
-
-Bools = npt.NDArray[np.bool_]
+from scan2sim.pipeline.types import F32, F64, U8, Bools, Camera, Frame, PointCloud, Trajectory
 
 VERSION = 1
 """Raised whenever the same sweeps come to another tile with the same options."""

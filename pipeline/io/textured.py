@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.types import F32, I32, Mesh
+from scan2sim.pipeline.types import F32, I32, Bools, Mesh
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Textured:
         assert self.mesh.page is not None
         return self.keep(self.mesh.page == page)
 
-    def keep(self, mask: npt.NDArray[np.bool_]) -> Textured:
+    def keep(self, mask: Bools) -> Textured:
         """The faces that `mask` (F,) selects; normals stay those of the whole, so no seam shows between parts."""
         used = np.unique(self.mesh.faces[mask])
         return Textured(self.mesh.keep(mask), self.normal[used], self.pages)

@@ -6,16 +6,13 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import Field
 
 from scan2sim.pipeline.classes import CODE
 from scan2sim.pipeline.io.files import pass_on
 from scan2sim.pipeline.ranges import Coordinate
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.types import F64, Frame, PointCloud, Trajectory
-
-Bools = npt.NDArray[np.bool_]
+from scan2sim.pipeline.types import F64, Bools, Frame, PointCloud, Trajectory
 
 WINDOW = 0.1
 """Seconds: a turn of most spinning scanners."""

@@ -17,10 +17,10 @@ from scan2sim.pipeline.io import image
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.ranges import Place, Voxel
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.types import F64, UNCOLOURED, PointCloud, Trajectory
+from scan2sim.pipeline.types import F64, I64, UNCOLOURED, Bools, PointCloud, Trajectory
 
 if TYPE_CHECKING:
-    from scan2sim.pipeline.facades import Bools, Numbers, Rays, Wall
+    from scan2sim.pipeline.facades import Rays, Wall
     from scan2sim.pipeline.planesweep import Photo
 
 MOST = 1_000_000  # pixels at which a photo is sampled: all of a tile are kept in memory
@@ -130,7 +130,7 @@ def photos_of(inputs: Inputs, whole: PointCloud) -> list[Photo]:
     return photos
 
 
-def raised(wall: Wall, rays: Rays, own: Numbers, through: Bools, photos: Callable[[], list[Photo]]) -> Bools:
+def raised(wall: Wall, rays: Rays, own: I64, through: Bools, photos: Callable[[], list[Photo]]) -> Bools:
     """(R, C) cells of a wall above its scan; its points are `own` of the rays' ends, which went `through` its cells.
 
     Photos are compared for walls that somewhere end where the scanner's rays do.

@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import Field
 
 from scan2sim.pipeline.cells import Cell
 from scan2sim.pipeline.classes import CODE, NOISE, group_of
 from scan2sim.pipeline.ranges import Place
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.types import F32, Frame, Mesh, PointCloud, Trajectory
+from scan2sim.pipeline.types import F32, I64, Frame, Mesh, PointCloud, Trajectory
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.furniture import Thing
@@ -122,7 +121,7 @@ def heights(ground: F32, xyz: F32) -> F32:
     return (xyz[:, 2] - smooth[raster.at(xyz)]).astype(np.float32)
 
 
-def _held(columns: Columns, things: list[Thing]) -> npt.NDArray[np.int64]:
+def _held(columns: Columns, things: list[Thing]) -> I64:
     """Indices of the points that are one of the things' own."""
     xyz = columns.xyz
     near = [columns.near(thing.stem.middle, 4.0) for thing in things]

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import Field
 
 from scan2sim.pipeline.cells import Cell
@@ -15,12 +14,12 @@ from scan2sim.pipeline.classes import CODE
 from scan2sim.pipeline.ranges import Place
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.steps.overlap import nearest
-from scan2sim.pipeline.types import UNCOLOURED, Frame, PointCloud
+from scan2sim.pipeline.types import UNCOLOURED, Bools, Frame, PointCloud
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.heightfield import Raster
 
-    Bools = npt.NDArray[np.bool_]
+    Bools = Bools
 
 FLAT = 0.5  # |nz| from which on a surface is a roof's
 COVER = 3  # cells of the points' spacing: gaps between points of one roof or crown

@@ -6,13 +6,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import Field
 
 from scan2sim.pipeline.cells import Seed
 from scan2sim.pipeline.step import Done, Inputs, Report, Step
 from scan2sim.pipeline.steps.clip import CellParams
-from scan2sim.pipeline.types import F64, PointCloud
+from scan2sim.pipeline.types import F64, I64, PointCloud
 
 
 class OverlapParams(CellParams):
@@ -60,7 +59,7 @@ def overlap(inputs: Inputs, params: OverlapParams, out: Path, report: Report) ->
     return Done({"cloud": out / "cloud.npz"}, {"points_in": len(own), "points": points, "missing": missing})
 
 
-def nearest(xy: F64, seeds: list[Seed]) -> npt.NDArray[np.int64]:
+def nearest(xy: F64, seeds: list[Seed]) -> I64:
     """(N,) index of the nearest seed to each world place (N, 2), the first of several as near."""
     index, least = np.zeros(len(xy), np.int64), np.full(len(xy), np.inf)
     for i, seed in enumerate(seeds):

@@ -5,13 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import Field
 
 from scan2sim.pipeline.cells import Cell
 from scan2sim.pipeline.ranges import Place
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.types import F32, PointCloud
+from scan2sim.pipeline.types import F32, F64, PointCloud
 
 CELL = 0.25  # metres, of the canopy raster
 
@@ -61,7 +60,7 @@ def plants(inputs: Inputs, params: PlantsParams, out: Path, report: Report) -> D
     )
 
 
-def crowns(xyz: F32, ground: F32, params: PlantsParams) -> npt.NDArray[np.float64]:
+def crowns(xyz: F32, ground: F32, params: PlantsParams) -> F64:
     """(P, 5) x, y, z of the base, height, crown radius: metres, local."""
     from scipy import ndimage
     from scipy.spatial import cKDTree

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import Field
 
 from scan2sim.pipeline.classes import SURFACES
 from scan2sim.pipeline.errors import DataError, SettingError
 from scan2sim.pipeline.ranges import Name, Texel
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.types import F64, U8
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.render import Image, Renderer
@@ -76,12 +76,12 @@ def rasters(inputs: Inputs, params: RastersParams, out: Path, report: Report) ->
             corners = np.append(south_west, low[2]), np.append(north_east, high[2])
             yield renderer.above(*corners, width=grid.width, samples=samples)
 
-    def heights(renderer: Renderer) -> Iterator[npt.NDArray[np.float64]]:
+    def heights(renderer: Renderer) -> Iterator[F64]:
         for image in rendered(renderer):
             z = high[2] + 1.0 - image.range.astype(float) + frame.origin[2]
             yield np.where(image.hit, z / frame.unit, np.nan)
 
-    def colours() -> Iterator[npt.NDArray[np.uint8]]:
+    def colours() -> Iterator[U8]:
         for image in rendered(
             render.Renderer(list(bodies.values())), min(SAMPLES, round(params.pixel / params.texel)) or 1
         ):

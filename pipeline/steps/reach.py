@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import Field
 
 from scan2sim.pipeline.classes import GROUPS, group_of
@@ -17,9 +16,7 @@ from scan2sim.pipeline.io.files import pass_on
 from scan2sim.pipeline.ranges import Voxel
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.steps.voxel import sample, voxel_groups
-from scan2sim.pipeline.types import F64, PointCloud, Trajectory, View
-
-Bools = npt.NDArray[np.bool_]
+from scan2sim.pipeline.types import F64, Bools, PointCloud, Trajectory, View
 
 PATCH = 2.0
 """Voxels: a photo is asked for a pixel on every square of this side. Coarser, all that a voxel can show is a blur."""

@@ -7,12 +7,11 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from scan2sim.pipeline.classes import CODE, GROUPS, NOISE, UNKNOWN, group_of, known, name_of
 from scan2sim.pipeline.errors import DataError
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.types import PointCloud
+from scan2sim.pipeline.types import Bools, PointCloud
 
 FURNITURE, VEHICLE = len(GROUPS) + 1, len(GROUPS) + 2
 """Of a point, beside the groups' numbers: it is street furniture's."""
@@ -91,7 +90,7 @@ def split(inputs: Inputs, params: SplitParams, out: Path, report: Report) -> Don
     return Done(files, {"points_in": len(cloud), "points": counts, "classes": classes}, warnings)
 
 
-def parked(cloud: PointCloud, things: Path) -> npt.NDArray[np.bool_]:
+def parked(cloud: PointCloud, things: Path) -> Bools:
     """(N,) which points of the class vehicle are in a box of `things` (GeoJSON of the step) that didn't move."""
     inside = np.zeros(len(cloud), bool)
     vehicle = np.flatnonzero(cloud.classification == CODE["vehicle"])

@@ -6,14 +6,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import Field
 
 from scan2sim.pipeline.ranges import Voxel
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.types import F32, PointCloud, Trajectory
+from scan2sim.pipeline.types import F32, I64, PointCloud, Trajectory
 
-Groups = tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]
+Groups = tuple[I64, I64]
 
 
 class VoxelParams(Params):

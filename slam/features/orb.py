@@ -5,9 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
-from scan2sim.pipeline.types import F64, U8
+from scan2sim.pipeline.types import F64, I64, U8
 from scan2sim.slam.features import Found, enlarged, no_weights, reduced, unmasked
 
 THRESHOLD = 7
@@ -51,7 +50,7 @@ class Orb:
         return f"ORB on pictures enlarged {self.upsample} times, by OpenCV"
 
 
-def _spread(uv: F64, scores: F64, cell: float, count: int) -> npt.NDArray[np.int64]:
+def _spread(uv: F64, scores: F64, cell: float, count: int) -> I64:
     """(M,) rows of places (N, 2), `count` at most: the best of every cell, then the second best of every cell ..."""
     column, line = (uv // cell).astype(np.int64).T
     number = line * (column.max(initial=0) + 1) + column

@@ -7,14 +7,13 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-import numpy.typing as npt
 
 from scan2sim.pipeline import backends
 from scan2sim.pipeline.errors import SettingError
+from scan2sim.pipeline.types import I64
 from scan2sim.slam.features import Features, Found
 from scan2sim.slam.weights import Weights
 
-I64 = npt.NDArray[np.int64]
 Sizes = tuple[tuple[int, int], tuple[int, int]]
 
 

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from scan2sim.pipeline.types import I64, Bools
 from scan2sim.slam.features import Found, no_weights
-from scan2sim.slam.matchers import I64, Sizes
+from scan2sim.slam.matchers import Sizes
 
 RATIO = 0.9
 """Of the distance to the nearest to that of the second nearest. Looser than Lowe's 0.8: what stands in neighbouring
@@ -47,7 +48,7 @@ class Nearest:
         return f"nearest descriptors, ratio {self.ratio}"
 
 
-def _nearest(a: npt.NDArray[Any], b: npt.NDArray[Any], ratio: float) -> tuple[I64, npt.NDArray[np.bool_]]:
+def _nearest(a: npt.NDArray[Any], b: npt.NDArray[Any], ratio: float) -> tuple[I64, Bools]:
     """(N,) the row of b nearest to each of a, and whether the second nearest is clearly farther."""
     if a.dtype == np.uint8:
         import cv2

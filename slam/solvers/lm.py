@@ -10,14 +10,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 
-from scan2sim.pipeline.types import F64, I32
+from scan2sim.pipeline.types import F64, I32, I64, Bools
 from scan2sim.slam.geometry import exp_so3
 from scan2sim.slam.graph import Factor, Graph, Solution
-
-I64 = npt.NDArray[np.int64]
 
 ITERATIONS = 8
 ENOUGH = 1e-4
@@ -70,7 +67,7 @@ def _covariance(graph: Graph, poses: F64, xyz: F64, shared: F64, free: I64, star
     return out
 
 
-def _moved(poses: F64, shared: F64, step: F64, fixed) -> tuple[F64, F64]:  # type: ignore[no-untyped-def]
+def _moved(poses: F64, shared: F64, step: F64, fixed: Bools) -> tuple[F64, F64]:
     out = poses.copy()
     n = int((~fixed).sum())
     by = step[: 6 * n].reshape(n, 6)
@@ -182,7 +179,7 @@ def _reduce(
 
 
 @njit(cache=True, inline="always")
-def _transformed(T, X, bend, shared, R):  # type: ignore[no-untyped-def]
+def _transformed(T: F64, X: F64, bend: F64, shared: F64, R: F64) -> tuple[float, float, float, float, float, float]:
     """Point in the camera's axes; `R` (3, 3) receives the camera's rotation, bent by the shared parameters."""
     tx, ty, tz = T[0, 3], T[1, 3], T[2, 3]
     for r in range(3):
@@ -214,7 +211,9 @@ def _transformed(T, X, bend, shared, R):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _robust_cost(poses, xyz, point_of, camera_of, bearing, bend, shared, sigma):  # type: ignore[no-untyped-def]
+def _robust_cost(
+    poses: F64, xyz: F64, point_of: I32, camera_of: I32, bearing: F64, bend: F64, shared: F64, sigma: float
+) -> F64:
     """(O,) Cauchy's cost of every observation; of those behind the camera, that of a right angle."""
     out = np.empty(len(point_of))
     none = np.zeros((0, 6))
@@ -233,7 +232,18 @@ def _robust_cost(poses, xyz, point_of, camera_of, bearing, bend, shared, sigma):
 
 
 @njit(cache=True, nogil=True)
-def _accumulate(poses, xyz, starts, camera_of, bearing, bend, shared, free, size, sigma):  # type: ignore[no-untyped-def]
+def _accumulate(
+    poses: F64,
+    xyz: F64,
+    starts: I64,
+    camera_of: I32,
+    bearing: F64,
+    bend: F64,
+    shared: F64,
+    free: I64,
+    size: int,
+    sigma: float,
+) -> tuple[F64, F64, F64, F64, F64]:
     S = shared.shape[0]
     D = 6 + S
     n = len(starts) - 1
@@ -305,7 +315,7 @@ def _accumulate(poses, xyz, starts, camera_of, bearing, bend, shared, free, size
 
 
 @njit(cache=True, inline="always")
-def _inverse3(A, damping, out):  # type: ignore[no-untyped-def]
+def _inverse3(A: F64, damping: float, out: F64) -> None:
     """Inverse of a damped symmetric (3, 3)."""
     a, b, c = A[0, 0] * (1 + damping) + 1e-9, A[0, 1], A[0, 2]
     d, e, f = A[1, 1] * (1 + damping) + 1e-9, A[1, 2], A[2, 2] * (1 + damping) + 1e-9
@@ -319,7 +329,9 @@ def _inverse3(A, damping, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _schur(V, gp, W, starts, camera_of, free, S, size, damping):  # type: ignore[no-untyped-def]
+def _schur(
+    V: F64, gp: F64, W: F64, starts: I64, camera_of: I32, free: I64, S: int, size: int, damping: float
+) -> tuple[F64, F64]:
     """What eliminating the points takes from H and g."""
     n = len(starts) - 1
     D = 6 + S
@@ -353,7 +365,7 @@ def _schur(V, gp, W, starts, camera_of, free, S, size, damping):  # type: ignore
 
 
 @njit(cache=True, nogil=True)
-def _back(step, V, gp, W, starts, camera_of, free, S, damping):  # type: ignore[no-untyped-def]
+def _back(step: F64, V: F64, gp: F64, W: F64, starts: I64, camera_of: I32, free: I64, S: int, damping: float) -> F64:
     """(P, 3) change of the points that follows from that of the cameras."""
     n = len(starts) - 1
     size = len(step)

@@ -6,15 +6,12 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 
 from scan2sim.pipeline import backends
-from scan2sim.pipeline.types import F64, U8
+from scan2sim.pipeline.types import F64, I64, U8, Bools
 from scan2sim.slam.facets import Facets
 from scan2sim.slam.features import Features
 from scan2sim.slam.matchers import Matcher
-
-I64 = npt.NDArray[np.int64]
 
 
 @dataclass
@@ -32,7 +29,7 @@ class Tracks:
     def __len__(self) -> int:
         return len(self.ids)
 
-    def keep(self, mask: npt.NDArray[np.bool_]) -> Tracks:
+    def keep(self, mask: Bools) -> Tracks:
         """Those that `mask` (N,) selects."""
         return Tracks(self.ids[mask], self.bearing[mask])
 

@@ -8,13 +8,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from scan2sim.pipeline.types import F32, F64, U8
+from scan2sim.pipeline.types import F32, F64, I64, U8
 from scan2sim.slam.facets import Facets
 from scan2sim.slam.trackers import Tracks
-
-I64 = npt.NDArray[np.int64]
 
 WINDOW, FINE = 17, 9
 """Pixels, of Lucas-Kanade's square: a large one finds a corner again, a small one says where it is: the larger
@@ -123,7 +120,7 @@ class CornerTracker:
         )
         return len(chosen)
 
-    def _corners(self, facet: int) -> tuple[F64, npt.NDArray[np.float32]]:
+    def _corners(self, facet: int) -> tuple[F64, F32]:
         """(N, 3) bearings of corners away from all tracks, and how pronounced they are."""
         import cv2
 

@@ -14,15 +14,12 @@ import numpy as np
 import numpy.typing as npt
 
 from scan2sim.pipeline.errors import SettingError
-from scan2sim.pipeline.types import F32, F64, U8
+from scan2sim.pipeline.types import F32, F64, I64, U8, Bools
 from scan2sim.slam.facets import Facets
 from scan2sim.slam.features import Features, Found
 from scan2sim.slam.matchers import Matcher, check
 from scan2sim.slam.trackers import Tracker, Tracks
 from scan2sim.slam.trackers.corners import FINE, RETURN, SPACING, WINDOW, CornerTracker, flow
-
-Bools = npt.NDArray[np.bool_]
-I64 = npt.NDArray[np.int64]
 
 STRAY = 4.0
 """Pixels between where a feature was matched and where Lucas-Kanade finds it."""
@@ -215,7 +212,7 @@ class DescriptorTracker(CornerTracker):
                 rest = rows[~taken]
                 seen.add(uv[~taken], np.stack([descriptors[row] for row in rest]), self.tracks.ids[rest])
 
-    def _corners(self, facet: int) -> tuple[F64, npt.NDArray[np.float32]]:
+    def _corners(self, facet: int) -> tuple[F64, F32]:
         """See `CornerTracker._corners`: features instead, the strongest of those that are near each other."""
         from scipy.spatial import cKDTree
 

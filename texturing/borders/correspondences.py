@@ -9,9 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scan2sim.pipeline.borders.grid import GRID, world
-from scan2sim.pipeline.types import F32, F64, Mesh
-
-Index = npt.NDArray[np.int64]
+from scan2sim.pipeline.types import F32, F64, I64, Mesh
 
 SPACING = 0.015
 """Metres between the places of an edge where colours are compared: texels span a centimetre or more."""
@@ -29,7 +27,7 @@ class Rim:
         page: (E,) the face's page.
     """
 
-    ends: Index
+    ends: I64
     uv: F32
     page: npt.NDArray[np.int16]
 
@@ -44,7 +42,7 @@ class Samples:
         uv: (L, 2) texture coordinates.
     """
 
-    place: Index
+    place: I64
     page: npt.NDArray[np.int16]
     uv: F32
 
@@ -106,19 +104,19 @@ def shared_border(rims: Sequence[Rim], spacing: float = SPACING) -> Border:
     return Border(xyz, np.concatenate([np.maximum(at_ends, SPACING / 2), along]), samples, length)
 
 
-def _shared(names: Sequence[Index]) -> Index:
+def _shared(names: Sequence[I64]) -> I64:
     """What at least two of the arrays contain, ascending."""
     name, count = np.unique(np.concatenate([np.unique(array) for array in names]), return_counts=True)
     return name[count > 1]
 
 
-def _along(parts: Index) -> tuple[Index, Index]:
+def _along(parts: I64) -> tuple[I64, I64]:
     """The parts of all edges one after another, `parts` (N,) of each: which edge, which part of it."""
     which = np.repeat(np.arange(len(parts)), parts)
     return which, np.arange(len(which)) - np.repeat(np.cumsum(parts) - parts, parts)
 
 
-def _samples(rim: Rim, number: Index, code: Index, corners: Index, edges: Index, parts: Index) -> Samples:
+def _samples(rim: Rim, number: I64, code: I64, corners: I64, edges: I64, parts: I64) -> Samples:
     """Where a mesh shows the places of `shared_border`: `corners` come first, then each of `edges` in `parts` (N,)."""
     at = np.flatnonzero(np.isin(number, corners))
     rows = np.flatnonzero(np.isin(code, edges))

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit, prange
 
-from scan2sim.pipeline.types import F32, F64, I32, U8
-from scan2sim.texturing.borders.correspondences import SOFT, Index
+from scan2sim.pipeline.types import F32, F64, I32, I64, U8, Bools
+from scan2sim.texturing.borders.correspondences import SOFT
 from scan2sim.texturing.borders.sampling import taps
 from scan2sim.texturing.texels import box, frame
 
@@ -41,9 +41,9 @@ class Changes(NamedTuple):
         xyz, metres, change: (P, 3) metres, (P,) metres of border, and (P, 3) grey levels of the places.
     """
 
-    first: Index
-    last: Index
-    child: Index
+    first: I64
+    last: I64
+    child: I64
     centre: F64
     radius: F64
     length: F64
@@ -79,12 +79,12 @@ def changes(xyz: F64, metres: F64, change: F32) -> Changes:
 
 
 @njit(cache=True, inline="always")
-def _distance2(a, x, y, z):  # type: ignore[no-untyped-def]
+def _distance2(a: F64, x: float, y: float, z: float) -> float:
     return (a[0] - x) ** 2 + (a[1] - y) ** 2 + (a[2] - z) ** 2
 
 
 @njit(cache=True)
-def _nearest(tree, x, y, z, limit, stack):  # type: ignore[no-untyped-def]
+def _nearest(tree: Changes, x: float, y: float, z: float, limit: float, stack: I64) -> float:
     """Metres to the nearest place; `limit` where none is nearer."""
     best = limit * limit
     stack[0] = 0
@@ -107,7 +107,7 @@ def _nearest(tree, x, y, z, limit, stack):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _change(tree, x, y, z, nearest, stack):  # type: ignore[no-untyped-def]
+def _change(tree: Changes, x: float, y: float, z: float, nearest: float, stack: I64) -> tuple[float, float, float]:
     """The mean change of all places, weighted by metres / distance^4, less where the border is short as seen from here.
 
     A straight border weighs pi / 2 / nearest^3; what has at least half of that counts in full.
@@ -145,7 +145,7 @@ def _change(tree, x, y, z, nearest, stack):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, parallel=True)
-def within(tree, corners, reach):  # type: ignore[no-untyped-def]
+def within(tree: Changes, corners: F32, reach: float) -> Bools:
     """(F,) whether a face, `corners` (F, 3, 3), may have a part within `reach` metres of a place."""
     out = np.zeros(len(corners), np.bool_)
     for f in prange(len(corners)):
@@ -160,7 +160,7 @@ def within(tree, corners, reach):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, parallel=True)
-def fade(rgb, owner, flat, corners, near, tree, reach):  # type: ignore[no-untyped-def]
+def fade(rgb: U8, owner: I32, flat: F32, corners: F32, near: Bools, tree: Changes, reach: float) -> None:
     """Add to every texel of the faces that are `near` the change of the places around, faded out over `reach`.
 
     Args:
@@ -236,7 +236,7 @@ def settle(page: U8, source: I32, uv: F32, wanted: F32) -> None:
 
 
 @njit(cache=True, parallel=True)
-def follow(before, after, owner, source):  # type: ignore[no-untyped-def]
+def follow(before: U8, after: U8, owner: I32, source: I32) -> None:
     """Let texels around charts that showed the colour of the nearest one in a chart (`fill.pad`) do so again.
 
     Args:

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from scan2sim.pipeline.io import image
-from scan2sim.pipeline.types import F32, F64, U8
-from scan2sim.texturing.borders.correspondences import SOFT, Index, Samples
+from scan2sim.pipeline.types import F32, F64, I64, U8
+from scan2sim.texturing.borders.correspondences import SOFT, Samples
 
 BLUR = 0.1
 """Share of `reach` by which colours are averaged where more than two tiles meet (a Gaussian's sigma)."""
@@ -33,7 +33,7 @@ def colours(samples: Samples, pages: Sequence[Path], places: int) -> F32:
     return by_place(samples.place, shown, places)
 
 
-def by_place(place: Index, shown: F32, places: int) -> F32:
+def by_place(place: I64, shown: F32, places: int) -> F32:
     """(P, 3) means of the samples (L, 3) at a place; NaN where there is none."""
     total = np.stack([np.bincount(place, shown[:, k], places) for k in range(3)], axis=1)
     count = np.bincount(place, minlength=places)[:, None]
@@ -46,7 +46,7 @@ def sampled(page: U8, uv: F32) -> F32:
     return np.einsum("lt,ltc->lc", weight, page.reshape(-1, 3)[texel].astype(np.float32))
 
 
-def taps(uv: F32, width: int, height: int) -> tuple[Index, F32]:
+def taps(uv: F32, width: int, height: int) -> tuple[I64, F32]:
     """(L, 4) texels of a bilinear sample, counted along the rows of a page, and (L, 4) their weights."""
     x, y = uv[:, 0] * width - 0.5, (1 - uv[:, 1]) * height - 0.5
     x0, y0 = np.floor(x), np.floor(y)

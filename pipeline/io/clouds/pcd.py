@@ -22,7 +22,7 @@ from numba import njit
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.io import points, text
 from scan2sim.pipeline.io.points import PART, Points
-from scan2sim.pipeline.types import F64, Frame, PointCloud
+from scan2sim.pipeline.types import F64, U8, Frame, PointCloud
 
 SUFFIXES = (".pcd",)
 REMEDY = "Copy it again, or write it as binary PCD or LAZ"
@@ -167,7 +167,7 @@ def _compressed(path: Path, file: BinaryIO, header: _Header, left: int) -> npt.N
 
 
 @njit(cache=True)
-def _unpack(packed, plain):  # type: ignore[no-untyped-def]
+def _unpack(packed: U8, plain: U8) -> int:
     """LZF (Lehmann's liblzf): a byte below 32 says how many follow as they are, others point back; -1: damaged."""
     i, o, n, size = 0, 0, len(packed), len(plain)
     while i < n:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -65,7 +66,7 @@ def write(path: Path, surface: Textured, names: PageNames) -> None:
     document.write(str(path))
 
 
-def _material(document, name: str, texture: str):  # type: ignore[no-untyped-def]  # pycollada is imported late
+def _material(document: Any, name: str, texture: str) -> Any:
     from collada import material
 
     image = material.CImage(f"{name}-image", texture)
