@@ -39,15 +39,15 @@ class Incoming:
         flow: what was received.
         sent: messages that their publishers numbered meanwhile; None: they number none.
         lost: of these, what didn't come; None likewise.
-        latencies: nanoseconds, of the last ones (as many as the window holds).
-        publishers: GIDs.
+        latencies: nanoseconds, of the last ones (as many as the window holds), with clocks' offsets taken away.
+        clock: nanoseconds by which the last sender's clock is ahead, and how far that may be off; None: unknown.
     """
 
     flow: Flow
     sent: int | None
     lost: int | None
     latencies: tuple[int, ...]
-    publishers: frozenset[bytes]
+    clock: tuple[int, int] | None
 
 
 @dataclass(frozen=True)
@@ -88,6 +88,7 @@ class _Topic:
     messages: int = 0
     size: int = 0
     unnumbered: bool = False
+    clock: tuple[int, int] | None = None
     numbers: dict[bytes, _Numbers] = field(default_factory=dict)
 
 
@@ -108,16 +109,19 @@ class Meter:
             flow[0] += 1
             flow[1] += size
 
-    def received(self, arrival: Arrival) -> None:
-        """Count a message that came."""
+    def received(self, arrival: Arrival, clock: tuple[int, int] | None = None) -> None:
+        """Count a message that came; `clock` as `Incoming`'s."""
         with self._lock:
             topic = self._incoming.get(arrival.topic)
             if topic is None:
                 topic = self._incoming[arrival.topic] = _Topic(deque(maxlen=self._window))
             topic.messages += 1
             topic.size += arrival.size
-            if arrival.sent is not None and arrival.received - arrival.sent > -LATE:
-                topic.latencies.append(arrival.received - arrival.sent)
+            topic.clock = clock
+            if arrival.sent is not None:
+                latency = arrival.received - arrival.sent + (clock[0] if clock else 0)
+                if latency > -LATE:
+                    topic.latencies.append(latency)
             if arrival.publisher is None or arrival.number is None:
                 topic.unnumbered = True
                 return
@@ -144,7 +148,7 @@ def _period(topic: _Topic) -> Incoming:
         sent=sum(sent for sent, _ in told) if numbered else None,
         lost=sum(lost for _, lost in told) if numbered else None,
         latencies=tuple(topic.latencies),
-        publishers=frozenset(topic.numbers),
+        clock=topic.clock,
     )
     topic.messages = topic.size = 0
     topic.latencies.clear()

@@ -11,20 +11,22 @@ a file, on the console and to Prometheus, each as it was asked for. It runs on w
 
 from __future__ import annotations
 
+import contextlib
+import json
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from scan2sim.services import transport
-from scan2sim.services.monitoring import compatibility, sinks
+from scan2sim.services.monitoring import clock, compatibility, sinks
 from scan2sim.services.monitoring.machine import Machine
 from scan2sim.services.monitoring.meter import Meter
 from scan2sim.services.monitoring.record import Record, TopicEndpoints, endpoint_info, flows_of, sums
 from scan2sim.services.monitoring.watched import Watched
 from scan2sim.services.records import new_ids
-from scan2sim.services.transport import Arrival, QoS
+from scan2sim.services.transport import Arrival, Endpoint, QoS
 
 log = logging.getLogger(__name__)
 
@@ -35,6 +37,8 @@ STRING = "std_msgs/msg/String"
 OF_ROS = ("/rosout", "/parameter_events")
 """Topics that every node has of its own, and that aren't told."""
 RECORDS = QoS(depth=100)
+CLOCK = QoS(reliability="BEST_EFFORT", depth=100)
+"""What comes late is of no use."""
 
 
 class Monitor(ros.Node):  # type: ignore[misc]
@@ -56,7 +60,12 @@ class Monitor(ros.Node):  # type: ignore[misc]
         self._types: dict[str, str] = {}
         self._next_id, self._ended = new_ids(), threading.Event()
         super().__init__(node_name, namespace=namespace, **named)
-        self._told_on = super().create_publisher(ros.message_type(STRING), watched.publisher_topic, RECORDS)
+        string = ros.message_type(STRING)
+        self._told_on = super().create_publisher(string, watched.publisher_topic, RECORDS)
+        self._clocks = clock.Clock()
+        self._clock_arrival: Arrival | None = None
+        self._clock_topic = super().create_publisher(string, clock.TOPIC, CLOCK)
+        super().create_subscription(string, clock.TOPIC, self._take_time, CLOCK)
         self._sinks = sinks.opened(watched, node_name)
         self._telling = threading.Thread(
             target=self._tell_periodically, args=(watched.period,), name=f"{node_name} monitor", daemon=True
@@ -84,8 +93,14 @@ class Monitor(ros.Node):  # type: ignore[misc]
             self._meter.published(topic, size)
 
     def received(self, arrival: Arrival) -> None:
-        """Count a message."""
-        self._meter.received(arrival)
+        """Count a message; its sender is asked for the time, if its clock isn't known."""
+        if arrival.topic == self._clock_topic.topic_name:
+            self._clock_arrival = arrival
+        elif arrival.publisher is None:
+            self._meter.received(arrival)
+        else:
+            self._meter.received(arrival, self._clocks.offset(arrival.publisher))
+            self._exchange(self._clocks.ping(arrival.publisher))
 
     def destroy_node(self) -> Any:
         """Tell the last record, and end."""
@@ -95,6 +110,16 @@ class Monitor(ros.Node):  # type: ignore[misc]
             for sink in self._sinks:
                 sink.close()
         return super().destroy_node()
+
+    def _take_time(self, message: Any) -> None:
+        arrival = self._clock_arrival
+        if arrival and arrival.publisher:
+            with contextlib.suppress(ValueError, TypeError):  # somebody else's message
+                self._exchange(self._clocks.heard(json.loads(message.data), arrival.publisher, arrival.received))
+
+    def _exchange(self, told: dict[str, Any] | None) -> None:
+        if told:
+            self._clock_topic.publish(ros.message(STRING, data=json.dumps(told)))
 
     def _tell_periodically(self, period: float) -> None:
         began = due = time.monotonic()
@@ -109,6 +134,7 @@ class Monitor(ros.Node):  # type: ignore[misc]
             began, due = now, max(due, now - period)
 
     def _tell(self, seconds: float) -> None:
+        self._exchange(self._clocks.hello())
         record = self.record(seconds)
         self._told_on.publish(ros.message(STRING, data=record.json_line()))
         for sink in self._sinks:
@@ -140,7 +166,15 @@ class Monitor(ros.Node):  # type: ignore[misc]
                 )
                 for topic, found in endpoints.items()
             ],
-            remarks=[text for topic, found in endpoints.items() for text in compatibility.remarks(topic, found)],
+            remarks=self._remarks(endpoints),
+            clock_synchronised=clock.synchronised(),
             dropped=sum(sink.dropped for sink in self._sinks),
             **Record.machine(self._machine.read()),
         )
+
+    def _remarks(self, endpoints: Mapping[str, tuple[Endpoint, ...]]) -> list[str]:
+        jumped = self._clocks.jump()
+        told = (
+            [f"this machine's clock was set by {jumped:+.3f} s; latencies of this period are wrong"] if jumped else []
+        )
+        return told + [text for topic, found in endpoints.items() for text in compatibility.remarks(topic, found)]

@@ -58,7 +58,9 @@ class TopicFlow(_Told):
     Attributes:
         bandwidth: bytes a second.
         sent: messages that publishers sent meanwhile, by their numbers: more than came, where a subscriber is slow.
-        latency: nanoseconds, mean of the window; `latency_p95` of it, too.
+        latency: nanoseconds, mean of the window, with the clocks' offset taken away; `latency_p95` likewise.
+        clock_offset: by which the sender's clock is ahead, nanoseconds; None: unknown, as it isn't watched.
+        clock_uncertainty: how far that may be off.
     """
 
     topic: str
@@ -71,6 +73,8 @@ class TopicFlow(_Told):
     lost: int | None = Field(None, alias="lost messages")
     latency: int | None = Field(None, alias="latency (nanoseconds)")
     latency_p95: int | None = Field(None, alias="latency p95 (nanoseconds)")
+    clock_offset: int | None = Field(None, alias="clock offset (nanoseconds)")
+    clock_uncertainty: int | None = Field(None, alias="clock uncertainty (nanoseconds)")
 
 
 class Record(_Told):
@@ -84,7 +88,7 @@ class Record(_Told):
         bandwidth: bytes a second, in and out; likewise `messages`, `size` (bytes).
         lost: None where no publisher numbers its messages.
         latency: mean of all that came (of the window); None where no message tells when it was sent.
-        clock_offset: nanoseconds by which other clocks seem to be ahead, with `clock_uncertainty`; None: unknown.
+        clock_synchronised: whether NTP keeps this machine's clock, as its kernel says; None: it says nothing.
         remarks: what is wrong with the topics, in words: profiles that don't fit, nodes of one name.
         dropped: records that were given up before this one, as the disk's share for them was full.
     """
@@ -107,8 +111,7 @@ class Record(_Told):
     in_size: float = Field(alias="incoming message size mean")
     latency: int | None = Field(alias="latency (nanoseconds)")
     latency_p95: int | None = Field(alias="latency p95 (nanoseconds)")
-    clock_offset: int | None = Field(None, alias="clock offset (nanoseconds)")
-    clock_uncertainty: int | None = Field(None, alias="clock uncertainty (nanoseconds)")
+    clock_synchronised: bool | None = Field(None, alias="clock synchronised")
     lost: int | None = Field(alias="lost messages")
     publishers: int
     subscribers: int
@@ -160,6 +163,8 @@ def flows_of(reading: Reading, types: Mapping[str, str], period: float) -> list[
             lost=found.lost,
             latency=mean(found.latencies),
             latency_p95=p95(found.latencies),
+            clock_offset=found.clock[0] if found.clock else None,
+            clock_uncertainty=found.clock[1] if found.clock else None,
         )
         for topic, found in reading.incoming.items()
     ]
