@@ -322,18 +322,15 @@ def _read(path: Path) -> tuple[U8, U8 | None]:
 
 def _sample(page: U8, mask: U8 | None, uv: F32) -> tuple[U8, U8]:
     """Bilinear colours (N, 3) of a page, and the nearest value (N,) of its mask, at uv (N, 2), origin lower left."""
-    height, width = page.shape[:2]
-    x = np.clip(uv[:, 0] * width - 0.5, 0, width - 1)
-    y = np.clip((1 - uv[:, 1]) * height - 0.5, 0, height - 1)
-    x0, y0 = np.minimum(x.astype(np.int32), max(0, width - 2)), np.minimum(y.astype(np.int32), max(0, height - 2))
-    x1, y1 = np.minimum(x0 + 1, width - 1), np.minimum(y0 + 1, height - 1)
-    fx, fy = (x - x0)[:, None].astype(np.float32), (y - y0)[:, None].astype(np.float32)
-    upper = page[y0, x0] * (1 - fx) + page[y0, x1] * fx
-    lower = page[y1, x0] * (1 - fx) + page[y1, x1] * fx
-    rgb = np.round(upper * (1 - fy) + lower * fy).astype(np.uint8)
+    from scan2sim.pipeline.sampling import page_colours
+
+    rgb = np.round(page_colours(page, uv)).astype(np.uint8)
     if mask is None:
         return rgb, np.zeros(len(uv), np.uint8)
-    return rgb, mask[np.round(y).astype(np.int32), np.round(x).astype(np.int32)]
+    height, width = mask.shape
+    column = np.clip(np.round(uv[:, 0] * width - 0.5), 0, width - 1).astype(np.int32)
+    row = np.clip(np.round((1 - uv[:, 1]) * height - 0.5), 0, height - 1).astype(np.int32)
+    return rgb, mask[row, column]
 
 
 def _shade(mesh: Mesh, face: I32, direction: F64, rgb: U8) -> U8:

@@ -10,10 +10,11 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import numpy.typing as npt
-from numba import njit
+from numba import njit, prange
 
-from scan2sim.pipeline.types import F64, U8
+from scan2sim.pipeline.types import F32, F64, I64, U8
 
 Taps = tuple[int, int, int, int, float, float, float, float]
 """Columns, rows, and weights of a bilinear lookup: see `taps`."""
@@ -78,6 +79,36 @@ def bilinear(picture: npt.NDArray[Any], x: float, y: float, wrap: bool) -> tuple
     """(r, g, b) of a picture (H, W, 3) at its pixel (x, y)."""
     at = taps(picture, x, y, wrap)
     return mixed(picture, 0, at), mixed(picture, 1, at), mixed(picture, 2, at)
+
+
+@njit(cache=True, inline="always")
+def of_uv(page: npt.NDArray[Any], u: Any, v: Any) -> tuple[Any, Any]:
+    """(x, y): the pixel of a page (H, W, ...) at texture coordinates (float32), (0, 0) its lower left corner."""
+    half = np.float32(0.5)
+    return u * np.float32(page.shape[1]) - half, (np.float32(1) - v) * np.float32(page.shape[0]) - half
+
+
+@njit(cache=True, parallel=True)
+def page_colours(page: U8, uv: F32) -> F32:
+    """(N, 3) float32 bilinear colours of a page (H, W, 3) at texture coordinates (N, 2) float32."""
+    rgb = np.empty((len(uv), 3), np.float32)
+    for i in prange(len(uv)):
+        x, y = of_uv(page, uv[i, 0], uv[i, 1])
+        rgb[i, 0], rgb[i, 1], rgb[i, 2] = bilinear(page, x, y, False)
+    return rgb
+
+
+@njit(cache=True, parallel=True)
+def page_taps(page: U8, uv: F32) -> tuple[I64, F32]:
+    """What `page_colours` reads: (N, 4) int64 texels, counted along the rows, and (N, 4) float32 weights."""
+    texel, weight = np.empty((len(uv), 4), np.int64), np.empty((len(uv), 4), np.float32)
+    for i in prange(len(uv)):
+        x, y = of_uv(page, uv[i, 0], uv[i, 1])
+        a, b, c, d, w_ca, w_cb, w_da, w_db = taps(page, x, y, False)
+        upper, lower = c * page.shape[1], d * page.shape[1]
+        texel[i, 0], texel[i, 1], texel[i, 2], texel[i, 3] = upper + a, upper + b, lower + a, lower + b
+        weight[i, 0], weight[i, 1], weight[i, 2], weight[i, 3] = w_ca, w_cb, w_da, w_db
+    return texel, weight
 
 
 @njit(cache=True, inline="always")

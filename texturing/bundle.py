@@ -147,6 +147,7 @@ def displacement(found: Matches, cameras: Sequence[Camera], poses: F64) -> F64:
     off = np.full(len(found.of), np.nan)
     for j in np.unique(found.view):
         theirs = np.flatnonzero(found.view == j)
+        # not by `projection.pixels`, whose pixels are float32
         uv, ok = project(cameras[j], (place[theirs] - poses[j, :3, 3]) @ poses[j, :3, :3])
         off[theirs[ok]] = np.linalg.norm(uv[ok] - found.uv[theirs[ok]], axis=1)
     return off

@@ -178,7 +178,8 @@ def _observe(
     x = np.clip((uv[:, 0] + 0.5) * low.shape[1] / camera.width - 0.5, 0, low.shape[1] - 1).astype(np.float32)
     y = np.clip((uv[:, 1] + 0.5) * low.shape[0] / camera.height - 0.5, 0, low.shape[0] - 1).astype(np.float32)
     rgb = np.zeros((len(at), 3))
-    for first in range(0, len(at), 30_000):  # cv2.remap knows no more rows than 32767
+    # whole levels, by cv2.remap: `pipeline.sampling`'s fractions would bring other exposures, at four times the time
+    for first in range(0, len(at), 30_000):  # it knows no more rows than 32767
         part = slice(first, first + 30_000)
         rgb[part] = cv2.remap(low, x[part, None], y[part, None], cv2.INTER_LINEAR)[:, 0]
     usable = ((rgb > DARK) & (rgb < BRIGHT)).all(axis=1)

@@ -6,7 +6,7 @@ import pytest
 from scan2sim.pipeline.cameras import inside, parameters, project
 from scan2sim.pipeline.projection import pixels
 from scan2sim.pipeline.render import look_at
-from scan2sim.pipeline.sampling import allows, read, rescaled
+from scan2sim.pipeline.sampling import allows, page_colours, page_taps, read, rescaled
 from scan2sim.pipeline.types import Camera
 
 CAMERAS = {
@@ -58,3 +58,17 @@ def test_masks_hold_up_to_the_photos_border() -> None:
     mask[0, 0] = mask[6, 8] = 255
     assert allows(mask, p, -0.5, -0.5) and allows(mask, p, 96.49, 70.49)
     assert not allows(mask, p, 96.49, -0.5) and allows(np.zeros((0, 0), np.uint8), p, 3.0, 3.0)
+
+
+def test_pages_are_read_from_their_lower_left_corner_and_go_on_beyond_their_borders() -> None:
+    rng = np.random.default_rng(0)
+    page = rng.integers(0, 256, (5, 7, 3), np.uint8)
+    uv = rng.uniform(-0.2, 1.2, (200, 2)).astype(np.float32)
+    x, y = np.clip(uv[:, 0] * 7 - 0.5, 0, 6), np.clip((1 - uv[:, 1]) * 5 - 0.5, 0, 4)
+    left, top = np.minimum(x.astype(int), 5), np.minimum(y.astype(int), 3)
+    s, t = (x - left)[:, None], (y - top)[:, None]
+    upper = page[top, left] * (1 - s) + page[top, left + 1] * s
+    truth = upper * (1 - t) + (page[top + 1, left] * (1 - s) + page[top + 1, left + 1] * s) * t
+    assert np.allclose(page_colours(page, uv), truth, atol=1e-3)
+    texel, weight = page_taps(page, uv)
+    assert np.allclose((weight[..., None] * page.reshape(-1, 3)[texel]).sum(axis=1), truth, atol=1e-3)

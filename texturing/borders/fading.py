@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit, prange
 
+from scan2sim.pipeline.sampling import page_taps
 from scan2sim.pipeline.types import F32, F64, I32, I64, U8, Bools
 from scan2sim.texturing.borders.correspondences import SOFT
-from scan2sim.texturing.borders.sampling import taps
 from scan2sim.texturing.texels import box, frame
 
 LEAF = 8
@@ -222,7 +222,7 @@ def settle(page: U8, source: I32, uv: F32, wanted: F32) -> None:
         source: (H, W) of `sources`.
         uv, wanted: (L, 2) and (L, 3) grey levels, of the lookups.
     """
-    read, weight = taps(uv, page.shape[1], page.shape[0])
+    read, weight = page_taps(page, uv)
     texel, index = np.unique(source.ravel()[read], return_inverse=True)
     index = index.reshape(-1, 4)
     value = page.reshape(-1, 3)[texel].astype(np.float32)

@@ -80,6 +80,7 @@ def _level_pages(
     Args:
         shown, target: (P, 3) grey levels of the places, as they are and as they are to be.
     """
+    from scan2sim.pipeline.sampling import page_colours
     from scan2sim.texturing import texels
     from scan2sim.texturing.borders import fading, sampling
 
@@ -103,7 +104,7 @@ def _level_pages(
         fading.fade(page, owner, flat, corners[faces], near[faces], tree, reach)
         fading.settle(page, source, samples.uv[here], target[samples.place[here]])
         fading.follow(before, page, owner, source)
-        after[here] = sampling.sampled(page, samples.uv[here])
+        after[here] = page_colours(page, samples.uv[here])
         image.write(folder / f"page_{k}.png", page)
     return sampling.by_place(samples.place, after, len(border))
 
@@ -136,4 +137,4 @@ def _link_others(source: Path, folder: Path) -> None:
         pass_on(path, place)
 
 
-LEVEL = Step("level", 1, level, LevelParams, per_class=True, memory=(1.0, 3))
+LEVEL = Step("level", 2, level, LevelParams, per_class=True, memory=(1.0, 3))

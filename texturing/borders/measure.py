@@ -72,4 +72,4 @@ def colour_step(a: Textured, b: Textured) -> tuple[float, float, float]:
     return float(step.mean()), float(np.percentile(step, 95)), border.length[0]
 
 
-BORDERS = Step("borders", 1, borders, CellParams)
+BORDERS = Step("borders", 2, borders, CellParams)

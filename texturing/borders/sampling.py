@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from scan2sim.pipeline.io import image
-from scan2sim.pipeline.types import F32, F64, I64, U8
+from scan2sim.pipeline.sampling import page_colours
+from scan2sim.pipeline.types import F32, F64, I64
 from scan2sim.texturing.borders.correspondences import SOFT, Samples
 
 BLUR = 0.1
@@ -29,7 +30,7 @@ def colours(samples: Samples, pages: Sequence[Path], places: int) -> F32:
     shown = np.empty((len(samples.place), 3), np.float32)
     for k in np.unique(samples.page).tolist():
         here = samples.page == k
-        shown[here] = sampled(image.read_rgb(pages[k]), samples.uv[here])
+        shown[here] = page_colours(image.read_rgb(pages[k]), samples.uv[here])
     return by_place(samples.place, shown, places)
 
 
@@ -38,23 +39,6 @@ def by_place(place: I64, shown: F32, places: int) -> F32:
     total = np.stack([np.bincount(place, shown[:, k], places) for k in range(3)], axis=1)
     count = np.bincount(place, minlength=places)[:, None]
     return np.divide(total, count, out=np.full((places, 3), np.nan), where=count > 0).astype(np.float32)
-
-
-def sampled(page: U8, uv: F32) -> F32:
-    """(L, 3) bilinear grey levels of a page at uv (L, 2)."""
-    texel, weight = taps(uv, page.shape[1], page.shape[0])
-    return np.einsum("lt,ltc->lc", weight, page.reshape(-1, 3)[texel].astype(np.float32))
-
-
-def taps(uv: F32, width: int, height: int) -> tuple[I64, F32]:
-    """(L, 4) texels of a bilinear sample, counted along the rows of a page, and (L, 4) their weights."""
-    x, y = uv[:, 0] * width - 0.5, (1 - uv[:, 1]) * height - 0.5
-    x0, y0 = np.floor(x), np.floor(y)
-    fx, fy = (x - x0).astype(np.float32), (y - y0).astype(np.float32)
-    columns = np.clip(x0.astype(np.int64)[:, None] + [0, 1, 0, 1], 0, width - 1)
-    rows = np.clip(y0.astype(np.int64)[:, None] + [0, 0, 1, 1], 0, height - 1)
-    weight = np.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy], axis=1)
-    return rows * width + columns, weight
 
 
 def targets(xyz: F64, shown: F32, reach: float) -> F32:
