@@ -8,6 +8,7 @@ from typing import Any
 from scan2sim.flows.commands.app import App
 from scan2sim.flows.commands.display import console
 from scan2sim.flows.commands.options import options
+from scan2sim.services.monitoring.traffic import TrafficParams
 from scan2sim.services.monitoring.watched import DatasetParams, ListenerParams, TalkerParams, TopicParams
 
 app = App("The event bus: topics of ROS 2 watched, and what goes through them told.")
@@ -62,6 +63,16 @@ def monitor_listener(params: ListenerParams) -> None:
     from scan2sim.services.monitoring.nodes.listener import Listener
 
     _spin(lambda: Listener(params))
+
+
+@app.command("traffic")
+@options(TrafficParams, cameras="--cameras", from_hour="--from", to_hour="--to")
+def monitor_traffic(params: TrafficParams) -> None:
+    """Draw events of cameras over some hours of a day, for `dataset-talker`."""
+    from scan2sim.services.monitoring.traffic import write
+
+    count = write(params)
+    console.print(f"{count} events of {params.cameras} cameras in {params.out}", highlight=False, markup=False)
 
 
 def _spin(made: Callable[[], Any], finished: Callable[[Any], bool] = lambda _: False) -> None:
