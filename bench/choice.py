@@ -27,9 +27,14 @@ import numpy as np
 
 from bench.texture_ablation import figures
 from bench.texture_scenes import ROOT, SCENES, WARM, Scene, available, fresh, make, run
+from scan2sim.pipeline.steps.visibility import VISIBILITY
 from scan2sim.pipeline.types import F32, F64, I32, Bools, Mesh
 from scan2sim.texturing import mrf
+from scan2sim.texturing.agreement import AGREEMENT
 from scan2sim.texturing.choose import CHOOSE, Choice, ChooseParams, seams
+from scan2sim.texturing.exposure import EXPOSURE
+from scan2sim.texturing.texture import TEXTURE
+from scan2sim.texturing.unwrap import UNWRAP
 
 SWEEPS = 3
 UNSEEN = 1e3
@@ -161,10 +166,6 @@ def energy(chosen: I32, view: I32, cost: F32, pairs: I32, price: F32) -> float:
 
 def prepare(scene: Scene, folder: Path) -> dict[str, Path]:
     """The files that choice and painting read: views' exposures and agreement, candidates."""
-    from scan2sim.pipeline.steps.visibility import VISIBILITY
-    from scan2sim.texturing.agreement import AGREEMENT
-    from scan2sim.texturing.exposure import EXPOSURE
-
     if not scene.depth.is_dir():
         run(VISIBILITY, {"mesh.surface": scene.mesh, "views": scene.views} | scene.clouds, scene.depth.parent)
     files = {"mesh": scene.mesh, "views": scene.views, "depth": scene.depth} | scene.clouds
@@ -175,9 +176,6 @@ def prepare(scene: Scene, folder: Path) -> dict[str, Path]:
 
 def textured(files: dict[str, Path], choice: Choice, folder: Path) -> Path:
     """The texture that a choice leads to; its folder."""
-    from scan2sim.texturing.texture import TEXTURE
-    from scan2sim.texturing.unwrap import UNWRAP
-
     choice.save(folder / "choice.npz")
     files = files | {"choice": folder / "choice.npz"}
     for step in (UNWRAP, TEXTURE):

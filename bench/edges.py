@@ -20,7 +20,7 @@ import open3d as o3d
 from scipy.spatial import cKDTree
 
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.pipeline.steps.geometry import distances, truth_error
+from scan2sim.pipeline.steps.geometry import distances, spread, truth_error
 from scan2sim.pipeline.types import F32, F64, Mesh, PointCloud
 
 FOLD = float(np.cos(np.radians(30.0)))
@@ -205,8 +205,6 @@ def fold_places(mesh: Mesh) -> F64:
 
 def _beside(truth: Mesh, edges: F64, xyz: F32) -> F32:
     """Places of the true surface within `NEAR` of edges that were scanned, too."""
-    from scan2sim.pipeline.steps.geometry import spread
-
     assert truth.classification is not None
     points = spread(truth.keep(truth.classification == BUILDING), 20 * SAMPLES)
     close, _ = cKDTree(edges).query(points, distance_upper_bound=NEAR, workers=-1)

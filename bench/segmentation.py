@@ -27,6 +27,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from bench.measure import measure
@@ -34,6 +35,9 @@ from bench.segmentation_kitti import kitti, mean
 from bench.street import STREETS as STREETS_OF_KITTI
 from scan2sim.pipeline.channels import COUNT
 from scan2sim.pipeline.classes import CODE
+from scan2sim.pipeline.io.tile import read_tile
+from scan2sim.pipeline.types import Frame, Mesh, PointCloud
+from scan2sim.segmentation.backends import load
 from scan2sim.segmentation.score import MEAN_OF, Confusion, confusion
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -76,7 +80,6 @@ def street(out: Path, seed: int) -> Path:
 def segmented(tile: Path, out: Path, *settings: str) -> tuple[Confusion, float]:
     """Run `scan2sim segment` anew on a tile whose cloud has classes; how its classes compare, and seconds."""
     from scan2sim.pipeline.io.clouds import las
-    from scan2sim.pipeline.io.tile import read_tile
 
     shutil.rmtree(out, ignore_errors=True)
     seconds = scan2sim("segment", tile, "--out", out, "--overwrite", *(x for s in settings for x in ("--set", s)))
@@ -117,9 +120,6 @@ def time_of_nine_million(out: Path) -> float:
 
 def network() -> dict[str, float]:
     """Times and classes of the project's own network by onnxruntime and by torch."""
-    import cv2
-
-    from scan2sim.segmentation.backends import load
     from scan2sim.segmentation.backends.street import OWN
 
     bgr = cv2.imread(str(next((ROOT / "data_samples" / "tile" / "photos").glob("*_front.jpg"))))
@@ -142,7 +142,6 @@ def network() -> dict[str, float]:
 def mesh(out: Path) -> None:
     """Print metres from the meshes to the truth, by true classes and by those told: of their class, and of any."""
     from scan2sim.pipeline.steps.geometry import truth_error
-    from scan2sim.pipeline.types import Mesh
 
     tile = street(out, STREETS[0])
     truth = Mesh.load(tile / "truth" / "mesh.npz")
@@ -166,7 +165,6 @@ def mesh(out: Path) -> None:
 
 def semkitti() -> Confusion:
     """Shape alone on a labelled sweep."""
-    from scan2sim.pipeline.types import Frame, PointCloud
     from scan2sim.segmentation.geometric import classify
 
     folder = DATA / "semkitti"

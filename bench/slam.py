@@ -31,7 +31,11 @@ from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.similarity import umeyama
 from scan2sim.pipeline.types import Camera
 from scan2sim.slam.evaluate import Evaluation, evaluate, plot
+from scan2sim.slam.facets import Facets
+from scan2sim.slam.geometry import log_so3, relative_pose
 from scan2sim.slam.odometry import Odometry, OdometryParams
+from scan2sim.slam.relocalise import describe, matches
+from scan2sim.slam.trackers import named
 from scan2sim.slam.video import open_video
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -172,11 +176,6 @@ def pano() -> None:
     The reference holds world-to-camera poses in axes of its own: x back, y right, z up (told by its motion).
     """
     import cv2
-
-    from scan2sim.slam.facets import Facets
-    from scan2sim.slam.geometry import log_so3, relative_pose
-    from scan2sim.slam.relocalise import describe, matches
-    from scan2sim.slam.trackers import named
 
     folder = DATA / "pano360"
     numbers = (folder / "dense_transformation.dat").read_text().splitlines()[1].split()[1:]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from bench.street_world import World
-from scan2sim.pipeline.types import F64, U8
+from scan2sim.pipeline.types import F64, U8, PointCloud
 
 STREET: dict[str, Any] = {"length": 40.0, "points": 1.6e6, "photos": 16, "seed": 0}
 REACH = 0.1
@@ -35,7 +35,6 @@ def figures(folder: Path, run: Callable[..., float]) -> dict[str, float]:
 def static_lost(out: Path) -> float:
     """Share that `carve` dropped of the points that are of neither vehicles nor people."""
     from scan2sim.pipeline.classes import CODE
-    from scan2sim.pipeline.types import PointCloud
 
     classification = PointCloud.load(next((out / "steps" / "ingest").glob("*/cloud.npz"))).classification
     dropped = np.load(next((out / "steps" / "carve").glob("*/dropped.npy")))

@@ -30,9 +30,17 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from bench.measure import Measured, measure
 from bench.texture_scenes import KITTI, ROOT, SCENES, WARM, Scene, available, fresh, make, run
 from scan2sim.pipeline.isolate import die_with_parent
+from scan2sim.pipeline.steps.visibility import VISIBILITY
+from scan2sim.texturing.agreement import AGREEMENT
+from scan2sim.texturing.choose import CHOOSE
+from scan2sim.texturing.exposure import EXPOSURE
+from scan2sim.texturing.texture import TEXTURE
+from scan2sim.texturing.unwrap import UNWRAP
 
 METHODS = ("open3d", "nearest", "inverse_square", "ours")
 FIGURES = ("psnr_db", "psnr_gain_db", "ssim", "sharpness", "coverage")
@@ -40,18 +48,11 @@ FIGURES = ("psnr_db", "psnr_gain_db", "ssim", "sharpness", "coverage")
 
 def visibility(scene: Scene, out: Path) -> None:
     """Our depth maps, which all methods but Open3D's ask."""
-    from scan2sim.pipeline.steps.visibility import VISIBILITY
-
     run(VISIBILITY, {"mesh.surface": scene.mesh, "views": scene.views} | scene.clouds, out)
 
 
 def unwrap(scene: Scene, out: Path) -> None:
     """Our atlas, which all methods paint; its charts are cut by the photos that ours chooses."""
-    from scan2sim.texturing.agreement import AGREEMENT
-    from scan2sim.texturing.choose import CHOOSE
-    from scan2sim.texturing.exposure import EXPOSURE
-    from scan2sim.texturing.unwrap import UNWRAP
-
     files = {"mesh": scene.mesh, "views": scene.views, "depth": scene.depth}
     for step in (EXPOSURE, AGREEMENT, CHOOSE):
         files |= run(step, files, scene.folder / "choice" / step.name)
@@ -60,8 +61,6 @@ def unwrap(scene: Scene, out: Path) -> None:
 
 def ours(scene: Scene, out: Path) -> None:
     """Our texture by the step that follows those, with its defaults."""
-    from scan2sim.texturing.texture import TEXTURE
-
     choice = scene.folder / "choice"
     inputs = {
         "mesh": scene.atlas / "mesh.npz",
@@ -173,8 +172,6 @@ class Bench:
 
     def score(self, scene: Scene, rows: dict[str, Row]) -> None:
         """Compare renderings with the photos that were held out."""
-        import numpy as np
-
         from scan2sim.pipeline.render import Renderer, textured
         from scan2sim.texturing.evaluate import held_out
 
@@ -196,8 +193,6 @@ class Bench:
 
     def score_truth(self, scene: Scene, rows: dict[str, Row]) -> None:
         """Compare textures with the true surface colours, and say how near the photos themselves come."""
-        import numpy as np
-
         from bench.texture_truth import likeness, samples, truth_psnr
 
         truth = samples(scene)

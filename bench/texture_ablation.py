@@ -14,6 +14,11 @@ from typing import Any
 import numpy as np
 
 from bench.texture_scenes import ROOT, Scene, available, fresh, run
+from scan2sim.texturing.agreement import AGREEMENT
+from scan2sim.texturing.choose import CHOOSE
+from scan2sim.texturing.exposure import EXPOSURE
+from scan2sim.texturing.texture import TEXTURE
+from scan2sim.texturing.unwrap import UNWRAP
 
 OFF: dict[str, dict[str, dict[str, Any]]] = {
     "all parts on": {},
@@ -31,12 +36,6 @@ OFF: dict[str, dict[str, dict[str, Any]]] = {
 
 def paint(scene: Scene, given: dict[str, dict[str, Any]], folder: Path) -> Path:
     """Our texture of a scene with some parameters; its folder."""
-    from scan2sim.texturing.agreement import AGREEMENT
-    from scan2sim.texturing.choose import CHOOSE
-    from scan2sim.texturing.exposure import EXPOSURE
-    from scan2sim.texturing.texture import TEXTURE
-    from scan2sim.texturing.unwrap import UNWRAP
-
     files = {"mesh": scene.mesh, "views": scene.views, "depth": scene.depth} | scene.clouds
     for step in (EXPOSURE, AGREEMENT, CHOOSE, UNWRAP, TEXTURE):
         files |= run(step, files, fresh(folder / step.name), **given.get(step.name, {}))

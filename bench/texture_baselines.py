@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -68,8 +69,6 @@ def open3d(scene: Scene, out: Path) -> None:
 
 def _one_atlas(mesh: Mesh) -> Mesh:
     """The mesh with its pages laid out as the cells of a square grid on one."""
-    from dataclasses import replace
-
     assert mesh.uv is not None and mesh.page is not None
     side = math.ceil(math.sqrt(int(mesh.page.max()) + 1))
     cell = np.stack([mesh.page % side, mesh.page // side], axis=1)[:, None]

@@ -17,6 +17,15 @@ from scan2sim.pipeline.classes import GROUPS
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.step import Step, silent
+from scan2sim.pipeline.steps.decimate import DECIMATE
+from scan2sim.pipeline.steps.ingest import INGEST
+from scan2sim.pipeline.steps.islands import ISLANDS
+from scan2sim.pipeline.steps.path import PATH
+from scan2sim.pipeline.steps.poisson import POISSON
+from scan2sim.pipeline.steps.split import SPLIT
+from scan2sim.pipeline.steps.trim import TRIM
+from scan2sim.pipeline.steps.views import VIEWS
+from scan2sim.pipeline.steps.voxel import VOXEL
 from scan2sim.pipeline.types import Frame, Mesh, PointCloud, Tile, View
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -119,11 +128,6 @@ def _scan(name: str, tile: Path) -> None:
 
 def _surface(scene: Scene, depth: int | None, faces: int) -> None:
     """Mesh everything that belongs to a surface as one: 10 cm voxels, Poisson, trim, islands, decimate."""
-    from scan2sim.pipeline.steps.decimate import DECIMATE
-    from scan2sim.pipeline.steps.islands import ISLANDS
-    from scan2sim.pipeline.steps.poisson import POISSON
-    from scan2sim.pipeline.steps.trim import TRIM
-
     tile, steps = read_tile(scene.tile), scene.folder / "steps"
     thin = _thinned(tile, steps)
     for part, path in thin.items():
@@ -155,11 +159,6 @@ def _moved(cloud: PointCloud, frame: Frame) -> PointCloud:
 
 def _thinned(tile: Tile, steps: Path) -> dict[str, Path]:
     """`surface`, and `rest` where the points have classes: one point a voxel, normals towards the scanner."""
-    from scan2sim.pipeline.steps.ingest import INGEST
-    from scan2sim.pipeline.steps.path import PATH
-    from scan2sim.pipeline.steps.split import SPLIT
-    from scan2sim.pipeline.steps.voxel import VOXEL
-
     frame = {"crs": tile.frame.crs, "origin": tile.frame.origin, "unit": tile.frame.unit}
     whole = run(INGEST, {f"cloud.{i:04d}": path for i, path in enumerate(tile.clouds)}, steps / "ingest", **frame)
     scanner = run(PATH, {}, steps / "path", **scanner_path(tile))
@@ -176,8 +175,6 @@ def _thinned(tile: Tile, steps: Path) -> dict[str, Path]:
 
 
 def _views(scene: Scene, tile: Tile) -> None:
-    from scan2sim.pipeline.steps.views import VIEWS
-
     photos = {f"photo.{i}": view.photo for i, view in enumerate(tile.views)}
     poses = tuple(views_io.to_json(view, with_paths=False) for view in tile.views)
     run(VIEWS, photos | scene.clouds, scene.folder / "views", hold_out=HOLD_OUT, poses=poses)

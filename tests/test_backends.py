@@ -20,6 +20,7 @@ from scan2sim.pipeline import backends, decimation
 from scan2sim.pipeline.errors import SettingError, UnavailableError
 from scan2sim.pipeline.extras import EXTRA_OF
 from scan2sim.pipeline.io import clouds, decoders, gps, meshes, models
+from scan2sim.pipeline.types import Camera
 from scan2sim.segmentation import backends as networks
 from scan2sim.slam import features, matchers, solvers, trackers
 from tests.conftest import ROOT
@@ -114,7 +115,6 @@ Add = Callable[[ModuleType, str, str], None]
 
 
 def test_a_network_is_one_file(add: Add) -> None:
-    from scan2sim.pipeline.types import Camera
     from scan2sim.segmentation.label import LABEL
     from scan2sim.segmentation.photos import Classifier, class_map
 
@@ -143,7 +143,6 @@ def load(weights, device):
 
 
 def test_a_feature_is_one_file(add: Add) -> None:
-    from scan2sim.pipeline.types import Camera
     from scan2sim.slam.steps.track import TrackParams, tracker_of
 
     add(features, "blobs", """

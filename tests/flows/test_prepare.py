@@ -12,11 +12,12 @@ import pytest
 from typer.testing import CliRunner
 
 from scan2sim.flows.cli import app
-from scan2sim.flows.commands.drive import plan_drive
+from scan2sim.flows.commands.drive import PREPARED, plan_drive
 from scan2sim.flows.commands.drive import survey_of as made_of
 from scan2sim.flows.engine.execution import execute
+from scan2sim.flows.engine.lock import locked
 from scan2sim.flows.recipes.drive import Drive
-from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.errors import BusyError, InputError
 from scan2sim.pipeline.io.survey import read_survey
 from scan2sim.pipeline.steps.cut import CUT
 from scan2sim.pipeline.steps.import_sweeps import IMPORT_SWEEPS
@@ -125,9 +126,5 @@ def test_what_no_drive_says_is_told(tmp_path: Path, text: str, told: str) -> Non
 
 
 def test_two_at_once_are_told(corridor: Path, tmp_path: Path) -> None:
-    from scan2sim.flows.commands.drive import PREPARED
-    from scan2sim.flows.engine.lock import locked
-    from scan2sim.pipeline.errors import BusyError
-
     with locked(tmp_path / "out" / PREPARED), pytest.raises(BusyError):
         survey_of(corridor, tmp_path / "out")

@@ -9,6 +9,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -109,7 +110,6 @@ def test_a_package_that_is_missing_ends_all_commands_alike(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, package: str, command: str
 ) -> None:
     import cv2
-    import numpy as np
 
     (tmp_path / "frames").mkdir()
     for number in range(2):

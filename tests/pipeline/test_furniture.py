@@ -12,7 +12,7 @@ from scan2sim.data_samples import SMALL
 from scan2sim.data_samples.layout import FRAME, lay_out
 from scan2sim.pipeline import primitives
 from scan2sim.pipeline.classes import CODE
-from scan2sim.pipeline.plates import plates
+from scan2sim.pipeline.plates import OUTLINES, inside, plates
 from scan2sim.pipeline.standing import Columns, stems
 from scan2sim.pipeline.step import Done, silent
 from scan2sim.pipeline.steps.decimate import DECIMATE, DecimateParams
@@ -127,8 +127,6 @@ def test_a_fence_a_wall_and_a_bush_are_no_poles() -> None:
 
 @pytest.mark.parametrize("shape", ["rectangle", "disc", "triangle_down"])
 def test_a_plate_is_outlined_by_its_points(shape: str) -> None:
-    from scan2sim.pipeline.plates import OUTLINES, inside
-
     rng = np.random.default_rng(0)
     flat = rng.uniform(-1, 1, (4000, 2))
     flat = flat[inside(flat, OUTLINES[shape], 0)] * 0.35  # type: ignore[index]

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numba
 import numpy as np
 import open3d as o3d
 import pytest
@@ -191,8 +192,6 @@ def test_what_is_out_of_the_image_is_not_seen(street: list[Mesh]) -> None:
 
 
 def test_depth_is_the_same_whatever_the_number_of_threads(street: list[Mesh]) -> None:
-    import numba
-
     camera, pose = CAMERAS["equirectangular"], forward_pose()
     first = depth_map(camera, pose, scene(street)).range
     before = numba.get_num_threads()

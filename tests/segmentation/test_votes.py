@@ -14,7 +14,7 @@ from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.step import Done, silent
-from scan2sim.pipeline.types import U8
+from scan2sim.pipeline.types import U8, PointCloud
 from scan2sim.segmentation.label import LABEL, LabelParams
 from scan2sim.segmentation.labels import CLASSES, index_of_code
 from scan2sim.segmentation.score import confusion
@@ -26,7 +26,6 @@ from tests.present import present
 def labelled(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, U8]:
     """A street, its cloud without classes, its photos' true labels as probabilities; and the true classes."""
     from scan2sim.data_samples.street import generate
-    from scan2sim.pipeline.types import PointCloud
 
     folder = tmp_path_factory.mktemp("labelled")
     tile = read_tile(
@@ -51,7 +50,6 @@ def segment(
     files = {"views": "views.json", "labels": "labels", "path": "path.npz"}
     inputs = {"cloud": folder / "cloud.npz"} | {name: folder / files[name] for name in names}
     done = SEGMENT.run(inputs, SegmentParams(**params), out, silent)
-    from scan2sim.pipeline.types import PointCloud
 
     with np.load(done.files["confidence"]) as beside:
         return present(PointCloud.load(done.files["cloud"]).classification), dict(beside), done
@@ -101,7 +99,6 @@ def test_a_network_that_knows_only_vegetation_has_it_parted_by_height(
     (labels / "network.json").write_text(json.dumps({"tells": [c for c in CLASSES if c != "low_vegetation"]}))
     inputs = {"cloud": folder / "cloud.npz", "views": folder / "views.json", "labels": labels}
     done = SEGMENT.run(inputs, SEGMENT.params(), tmp_path, silent)
-    from scan2sim.pipeline.types import PointCloud
 
     iou = confusion(truth, present(PointCloud.load(done.files["cloud"]).classification)).iou
     assert iou["low_vegetation"] > 0.5 and iou["high_vegetation"] > 0.85
@@ -118,8 +115,6 @@ def test_photos_without_overlap_leave_it_to_shape(labelled: tuple[Path, U8], tmp
 
 
 def test_classes_that_are_there_are_kept_and_photos_not_looked_at(labelled: tuple[Path, U8], tmp_path: Path) -> None:
-    from scan2sim.pipeline.types import PointCloud
-
     folder, truth = labelled
     cloud = PointCloud.load(folder / "cloud.npz")
     PointCloud(cloud.frame, cloud.xyz, classification=truth).save(tmp_path / "own.npz")

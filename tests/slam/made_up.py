@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from scan2sim.pipeline.types import GpsTrack
+from scan2sim.pipeline.types import Camera, GpsTrack
 from scan2sim.slam.geometry import exp_so3, rigid
 from scan2sim.slam.odometry import Odometry, OdometryParams
 from scan2sim.slam.trackers import Tracks
@@ -110,7 +110,6 @@ def run(
     **params: Any,
 ) -> Odometry:
     """Odometry over a drive."""
-    from scan2sim.pipeline.types import Camera
 
     odometry = Odometry(
         Camera("equirectangular", 2048, 1024), OdometryParams(**params), tracker=follower, gps=gps, warn=warn

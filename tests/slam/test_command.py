@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
@@ -204,8 +205,6 @@ def test_bad_input_is_named(
 
 
 def test_a_video_that_ends_early_and_frames_of_another_size_are_told(corridor: Drive, tmp_path: Path) -> None:
-    import cv2
-
     for i in range(12):
         size = (256, 128) if i < 8 else (128, 64)
         cv2.imwrite(str(tmp_path / f"{i:03d}.png"), cv2.resize(corridor.greys[i], size))
@@ -235,8 +234,6 @@ def test_half_a_video_file_is_read_as_far_as_it_goes(corridor: Drive, tmp_path: 
 
 
 def test_frames_out_of_order_are_left_out_and_told(corridor: Drive, tmp_path: Path) -> None:
-    import cv2
-
     for i in range(4):
         cv2.imwrite(str(tmp_path / f"{i}.png"), corridor.greys[i])
     (tmp_path / "times.txt").write_text("0\n0.1\n0.05\n0.2\n")

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from scan2sim.pipeline import backends
+from scan2sim.pipeline.cameras import pixel_rays, project
 from scan2sim.pipeline.errors import SettingError
 from scan2sim.pipeline.types import F64, U8, Camera
 from scan2sim.slam import features, matchers
@@ -26,8 +27,6 @@ NUMBER = 400
 def seen(camera: Camera, R: F64, seed: int = 0) -> U8:
     """(H, W) what a camera, turned by R (3, 3) to the world, sees of noise that fills the world."""
     from scipy.ndimage import map_coordinates
-
-    from scan2sim.pipeline.cameras import pixel_rays
 
     rays = pixel_rays(camera).reshape(-1, 3) @ R.T
     rng = np.random.default_rng(seed)
@@ -112,8 +111,6 @@ def test_tracks_go_on_across_seam_and_poles(axis: tuple[float, float, float], st
 
 def test_real_panoramas_have_no_special_places(real_data: Path) -> None:
     import cv2
-
-    from scan2sim.pipeline.cameras import pixel_rays, project
 
     file = real_data / "pano360" / "R0010118_20180720134544.JPG"
     if not file.is_file():

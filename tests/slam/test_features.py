@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import pickle
 from pathlib import Path
@@ -400,7 +401,6 @@ def test_damaged_missing_and_dangerous_files(tmp_path: Path) -> None:
 
 def test_what_is_told_of_weights(tmp_path: Path) -> None:
     torch = pytest.importorskip("torch")
-    import hashlib
 
     from scan2sim.slam.features.superpoint import MODEL
 

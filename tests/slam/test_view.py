@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import av
+import cv2
 import numpy as np
 import pytest
 
@@ -59,8 +60,6 @@ def test_a_drive_is_recorded(corridor: Drive, tmp_path: Path) -> None:
 
 
 def enlarged(grey: np.ndarray, width: int) -> np.ndarray:
-    import cv2
-
     return cv2.resize(grey, (width, width // 2))
 
 

@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.render import look_at
+from scan2sim.pipeline.render import Body, Renderer, look_at
 from scan2sim.pipeline.step import Done
 from scan2sim.pipeline.types import F64, U8
-from tests.texturing.corner import CAMERAS, Street, photograph, points
+from tests.texturing.corner import BOX, CAMERAS, GROUND, Street, photograph, points
 from tests.texturing.test_texture import from_above
 
 CAMERA = CAMERAS["pinhole"]
@@ -21,8 +21,6 @@ POSES = [look_at((-4, y, 1.8), (0, y / 2, 0.6)) for y in (-3.0, -1.5, 0.0, 1.5, 
 def grainy(pose: F64) -> U8:
     """A photo of the corner with a fine pattern on its ground: something to tell sharpness and displacement by."""
     from scan2sim.pipeline.cameras import pixel_rays
-    from scan2sim.pipeline.render import Body, Renderer
-    from tests.texturing.corner import BOX, GROUND
 
     image = Renderer([Body(GROUND), Body(BOX)]).view(CAMERA, pose)
     at = pose[:3, 3] + (pixel_rays(CAMERA) @ pose[:3, :3].T) * np.where(image.hit, image.range, 0)[..., None]

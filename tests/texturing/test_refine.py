@@ -12,10 +12,10 @@ import pytest
 from scan2sim.flows.recipes.graph import NodeId, Output
 from scan2sim.flows.recipes.settings import Settings
 from scan2sim.flows.recipes.tile import recipe
-from scan2sim.pipeline.cameras import inside, project
+from scan2sim.pipeline.cameras import inside, pixel_rays, project
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.pipeline.render import look_at
+from scan2sim.pipeline.render import Body, Renderer, look_at
 from scan2sim.pipeline.step import Done, silent
 from scan2sim.pipeline.types import F64, U8, Camera, View
 from scan2sim.texturing.refine import RefineParams, lenses, refine
@@ -36,8 +36,6 @@ PHASES = RNG.uniform(0, 6, 60)
 
 def marbled(camera: Camera, pose: F64) -> U8:
     """A photo of the corner with a pattern that nowhere repeats: something to find again."""
-    from scan2sim.pipeline.cameras import pixel_rays
-    from scan2sim.pipeline.render import Body, Renderer
 
     image = Renderer([Body(GROUND), Body(WALLS)]).view(camera, pose)
     at = pose[:3, 3] + (pixel_rays(camera) @ pose[:3, :3].T) * np.where(image.hit, image.range, 0)[..., None]

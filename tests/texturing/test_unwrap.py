@@ -8,10 +8,12 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.step import Done, silent
-from scan2sim.pipeline.types import Frame, Mesh
+from scan2sim.pipeline.types import Camera, Frame, Mesh, View
 from scan2sim.texturing import unwrap as unwrap_module
 from scan2sim.texturing.atlas import Backend, manifold
+from scan2sim.texturing.choose import Choice
 from scan2sim.texturing.unwrap import UNWRAP, UnwrapParams, unwrap
 from tests.present import present
 
@@ -128,10 +130,6 @@ def test_vegetation_is_textured_at_three_centimetres() -> None:
 
 
 def test_what_an_orthophoto_drapes_is_laid_flat_at_half_its_pixels(tmp_path: Path) -> None:
-    from scan2sim.pipeline.io import views as views_io
-    from scan2sim.pipeline.types import Camera, View
-    from scan2sim.texturing.choose import Choice
-
     mesh = hills()
     down = np.diag([1.0, -1, -1, 1])
     down[:3, 3] = 0, 6, 12

@@ -14,9 +14,10 @@ from PIL import Image
 from bench.images import ADOBE, P3, SRGB, decoded, encoded, profile, to_xyz, write
 from scan2sim.pipeline.errors import InputError, UnavailableError
 from scan2sim.pipeline.io import image
+from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.step import silent
 from scan2sim.pipeline.steps.views import ViewsParams, views
-from scan2sim.pipeline.types import U8, Camera, View
+from scan2sim.pipeline.types import U8, Camera, Frame, PointCloud, View
 
 WIDTH, HEIGHT = 90, 70
 """No multiples of a tile's 16."""
@@ -131,7 +132,6 @@ def test_a_part_is_what_the_whole_shows_there(tmp_path: Path, rgb: U8, tile: int
 
 def orthophoto(folder: Path, name: str, rgb: U8) -> tuple[View, Path]:
     """Written there, and a cloud below a part of it."""
-    from scan2sim.pipeline.types import Frame, PointCloud
 
     write(folder / name, rgb, "uint8", 16 if name.endswith("f") else 0)
     pose = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -145,8 +145,6 @@ def orthophoto(folder: Path, name: str, rgb: U8) -> tuple[View, Path]:
 def test_of_an_orthophoto_larger_than_can_be_decoded_a_tile_reads_its_part(
     tmp_path: Path, rgb: U8, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from scan2sim.pipeline.io import views as views_io
-
     view, cloud = orthophoto(tmp_path, "o.tif", rgb)
     monkeypatch.setattr(image, "MAX_PIXELS", 40 * 40)
     with pytest.raises(InputError, match=r"6,?300|90 x 70"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sqlite3
 import struct
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +16,17 @@ from scan2sim.flows.recipes.settings import Settings
 from scan2sim.flows.recipes.tile import recipe
 from scan2sim.pipeline.classes import CODE
 from scan2sim.pipeline.errors import DataError, InputError
+from scan2sim.pipeline.heightfield import Raster
 from scan2sim.pipeline.io import footprints
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.step import Done, Step, silent
-from scan2sim.pipeline.steps.geometry import distances
+from scan2sim.pipeline.steps.geometry import GEOMETRY, distances
 from scan2sim.pipeline.steps.ground import GROUND, GroundParams, united
 from scan2sim.pipeline.steps.poisson import POISSON
 from scan2sim.pipeline.steps.trim import TRIM
 from scan2sim.pipeline.steps.voxel import VOXEL
 from scan2sim.pipeline.steps.walls import WALLS
-from scan2sim.pipeline.types import Frame, PointCloud
+from scan2sim.pipeline.types import Frame, Mesh, PointCloud
 
 FRAME = Frame("EPSG:32633", (500000.0, 5400000.0, 200.0))
 HOUSE, ANNEX = (-6.0, -4.0, 4.0, 4.0, 6.0), (4.0, -4.0, 9.0, 4.0, 3.0)  # x0, y0, x1, y1, height of the roof
@@ -115,7 +117,6 @@ def test_walls_stand_where_the_truths_walls_are(house: dict[str, Path]) -> None:
 def test_the_house_is_closed_and_the_roof_stays(house: dict[str, Path], tmp_path: Path) -> None:
     borne = {"cloud": house["building"], "made": house["walls"]}
     raw = go(POISSON, tmp_path / "poisson", borne).files["mesh"]
-    from scan2sim.pipeline.types import Mesh
 
     mesh = Mesh.load(go(TRIM, tmp_path / "trim", {"mesh": raw, **borne}).files["mesh"])
     t = np.linspace(0.3, 0.7, 5)
@@ -233,7 +234,6 @@ def test_only_clouds_from_the_air_get_what_is_made_up(tmp_path: Path) -> None:
     tile = read_tile(SAMPLE)
     nodes = {node.step.name: node for node in recipe(tile, Settings())}
     assert "walls" not in nodes and "things" in nodes["ground"].inputs  # a street's: what vehicles hid
-    from dataclasses import replace
 
     bare = replace(tile, views=(), trajectory=None)
     assert {"ground", "walls"} <= {node.step.name for node in recipe(bare, Settings())}
@@ -244,9 +244,6 @@ def test_only_clouds_from_the_air_get_what_is_made_up(tmp_path: Path) -> None:
 def test_points_far_from_the_mesh_are_warned_of_and_made_up_area_is_told(
     house: dict[str, Path], tmp_path: Path
 ) -> None:
-    from scan2sim.pipeline.steps.geometry import GEOMETRY
-    from scan2sim.pipeline.types import Mesh
-
     x0, y0, x1, y1, top = HOUSE
     roof = np.array([(x0, y0, top), (x1, y0, top), (x1, y1, top), (x0, y1, top)], np.float32)
     mesh = Mesh(FRAME, np.concatenate([roof, roof - np.array([0, 0, 3], np.float32)]),
@@ -277,9 +274,6 @@ def test_a_street_scanned_from_the_ground_gets_nothing_made_up_without_a_path_ei
 
 
 def test_points_that_became_no_surface_are_told(house: dict[str, Path], tmp_path: Path) -> None:
-    from scan2sim.pipeline.steps.geometry import GEOMETRY
-    from scan2sim.pipeline.types import Mesh
-
     nothing = Mesh(FRAME, np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
     nothing.save(tmp_path / "none.npz")
     done = go(GEOMETRY, tmp_path, {"mesh.building": tmp_path / "none.npz", "cloud.building": house["building"]})
@@ -287,8 +281,6 @@ def test_points_that_became_no_surface_are_told(house: dict[str, Path], tmp_path
 
 
 def test_a_raster_that_no_memory_holds_is_refused() -> None:
-    from scan2sim.pipeline.heightfield import Raster
-
     corners = np.array([[0, 0, 0], [5000, 5000, 0]], np.float32)
     assert Raster.over(0.5, [corners]).shape[0] > 10_000
     with pytest.raises(DataError, match="too many"):

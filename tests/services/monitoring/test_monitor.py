@@ -13,6 +13,7 @@ import pytest
 
 from scan2sim.services import kafka
 from scan2sim.services.monitoring.record import Record
+from scan2sim.services.records import Spool
 from tests.services.conftest import Broker, Start
 
 NODE = """
@@ -117,7 +118,6 @@ def test_a_broker_that_is_not_there_does_not_delay_a_node(tmp_path: Path, start:
     assert time.monotonic() - began < 30
     told = records(tmp_path / "log")
     assert sum(one["outgoing messages"] for one in told) > 100
-    from scan2sim.services.records import Spool
 
     assert len(Spool(tmp_path / "log.spool")) == len(told)  # they wait
 
