@@ -41,6 +41,52 @@ CLOCK = QoS(reliability="BEST_EFFORT", depth=100)
 """What comes late is of no use."""
 
 
+SPUN = 0.2
+"""Seconds after which a node that is to end notices it, at most."""
+
+
+class _Companion(ros.Node):  # type: ignore[misc]
+    """A hidden node beside a watched one, in a thread of its own: it tells records, and exchanges times with others.
+
+    So records go out though the watched node is busy, and watching doesn't slow its waiting down.
+    """
+
+    def __init__(self, node_name: str, namespace: str, topic: str) -> None:
+        super().__init__(f"_{node_name}_monitor", namespace=namespace, hidden=True)
+        string = ros.message_type(STRING)
+        self._records = self.create_publisher(string, topic, RECORDS)
+        self.clock = clock.Clock()
+        self._arrival: Arrival | None = None
+        self._times = self.create_publisher(string, clock.TOPIC, CLOCK)
+        self.create_subscription(string, clock.TOPIC, self._take_time, CLOCK)
+
+    def tell(self, record: Record) -> None:
+        """Send a record."""
+        self._exchange(self.clock.hello())
+        self._records.publish(ros.message(STRING, data=record.json_line()))
+
+    def offset(self, publisher: bytes | None) -> tuple[int, int] | None:
+        """As `Clock.offset`; who isn't known well is asked for the time."""
+        if publisher is None:
+            return None
+        self._exchange(self.clock.ping(publisher))
+        return self.clock.offset(publisher)
+
+    def received(self, arrival: Arrival) -> None:
+        """Keep what is known of the message that is handed on next."""
+        self._arrival = arrival
+
+    def _take_time(self, message: Any) -> None:
+        arrival = self._arrival
+        if arrival and arrival.publisher:
+            with contextlib.suppress(ValueError, TypeError):  # somebody else's message
+                self._exchange(self.clock.heard(json.loads(message.data), arrival.publisher, arrival.received))
+
+    def _exchange(self, told: dict[str, Any] | None) -> None:
+        if told:
+            self._times.publish(ros.message(STRING, data=json.dumps(told)))
+
+
 class Monitor(ros.Node):  # type: ignore[misc]
     """A node that is watched."""
 
@@ -60,12 +106,7 @@ class Monitor(ros.Node):  # type: ignore[misc]
         self._types: dict[str, str] = {}
         self._next_id, self._ended = new_ids(), threading.Event()
         super().__init__(node_name, namespace=namespace, **named)
-        string = ros.message_type(STRING)
-        self._told_on = super().create_publisher(string, watched.publisher_topic, RECORDS)
-        self._clocks = clock.Clock()
-        self._clock_arrival: Arrival | None = None
-        self._clock_topic = super().create_publisher(string, clock.TOPIC, CLOCK)
-        super().create_subscription(string, clock.TOPIC, self._take_time, CLOCK)
+        self._companion = _Companion(node_name, namespace, watched.publisher_topic)
         self._sinks = sinks.opened(watched, node_name)
         self._telling = threading.Thread(
             target=self._tell_periodically, args=(watched.period,), name=f"{node_name} monitor", daemon=True
@@ -93,14 +134,8 @@ class Monitor(ros.Node):  # type: ignore[misc]
             self._meter.published(topic, size)
 
     def received(self, arrival: Arrival) -> None:
-        """Count a message; its sender is asked for the time, if its clock isn't known."""
-        if arrival.topic == self._clock_topic.topic_name:
-            self._clock_arrival = arrival
-        elif arrival.publisher is None:
-            self._meter.received(arrival)
-        else:
-            self._meter.received(arrival, self._clocks.offset(arrival.publisher))
-            self._exchange(self._clocks.ping(arrival.publisher))
+        """Count a message."""
+        self._meter.received(arrival, self._companion.offset(arrival.publisher))
 
     def destroy_node(self) -> Any:
         """Tell the last record, and end."""
@@ -109,34 +144,24 @@ class Monitor(ros.Node):  # type: ignore[misc]
             self._telling.join()
             for sink in self._sinks:
                 sink.close()
+            self._companion.destroy_node()
         return super().destroy_node()
 
-    def _take_time(self, message: Any) -> None:
-        arrival = self._clock_arrival
-        if arrival and arrival.publisher:
-            with contextlib.suppress(ValueError, TypeError):  # somebody else's message
-                self._exchange(self._clocks.heard(json.loads(message.data), arrival.publisher, arrival.received))
-
-    def _exchange(self, told: dict[str, Any] | None) -> None:
-        if told:
-            self._clock_topic.publish(ros.message(STRING, data=json.dumps(told)))
-
     def _tell_periodically(self, period: float) -> None:
-        began = due = time.monotonic()
+        began, due = time.monotonic(), time.monotonic() + period
         while not self._ended.is_set():
-            due += period
-            self._ended.wait(due - time.monotonic())
+            ros.spin_once(self._companion, min(SPUN, max(0.0, due - time.monotonic())))
             now = time.monotonic()
-            try:
-                self._tell(now - began)
-            except Exception:  # a node goes on, whatever becomes of its records
-                log.exception("%s: a record could not be made", self.get_name())
-            began, due = now, max(due, now - period)
+            if now >= due or self._ended.is_set():
+                try:
+                    self._tell(now - began)
+                except Exception:  # a node goes on, whatever becomes of its records
+                    log.exception("%s: a record could not be made", self.get_name())
+                began, due = now, max(due + period, now)
 
     def _tell(self, seconds: float) -> None:
-        self._exchange(self._clocks.hello())
         record = self.record(seconds)
-        self._told_on.publish(ros.message(STRING, data=record.json_line()))
+        self._companion.tell(record)
         for sink in self._sinks:
             sink.send(record)
 
@@ -173,7 +198,7 @@ class Monitor(ros.Node):  # type: ignore[misc]
         )
 
     def _remarks(self, endpoints: Mapping[str, tuple[Endpoint, ...]]) -> list[str]:
-        jumped = self._clocks.jump()
+        jumped = self._companion.clock.jump()
         told = (
             [f"this machine's clock was set by {jumped:+.3f} s; latencies of this period are wrong"] if jumped else []
         )

@@ -36,7 +36,8 @@ class Node(Protocol):
     overrides them sees all that goes through the node (`services.monitoring.monitor`).
     """
 
-    def __init__(self, node_name: str, *, namespace: str = "/") -> None: ...
+    def __init__(self, node_name: str, *, namespace: str = "/", hidden: bool = False) -> None:
+        """Join the network; `hidden`: without parameters and a log of its own (its name should begin with _)."""
 
     def get_name(self) -> str:
         """Its name, without namespace."""

@@ -138,7 +138,8 @@ class Timer:
 class Node:
     """A node of ROS 2 without ROS 2 (`services.transport.Node`)."""
 
-    def __init__(self, node_name: str, *, namespace: str = "/") -> None:
+    def __init__(self, node_name: str, *, namespace: str = "/", hidden: bool = False) -> None:
+        """As `services.transport.Node`'s; hidden or not is told by the name alone."""
         self._name, self._namespace = node_name, namespace if namespace.startswith("/") else f"/{namespace}"
         self._entities = Entities(self._namespace, node_name)
         self._subscriptions: list[Subscription] = []

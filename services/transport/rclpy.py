@@ -14,7 +14,7 @@ from typing import Any
 import rclpy
 import rclpy.node
 from rclpy.duration import Duration, Infinite
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.publisher import Publisher as RosPublisher
 from rclpy.qos import (
     DurabilityPolicy,
@@ -44,8 +44,11 @@ class _Publisher(RosPublisher):  # type: ignore[misc]
 class Node(rclpy.node.Node):  # type: ignore[misc]
     """A node of rclpy that tells of every message (`services.transport.Node`)."""
 
-    def __init__(self, node_name: str, *, namespace: str = "/", **others: Any) -> None:
+    def __init__(self, node_name: str, *, namespace: str = "/", hidden: bool = False, **others: Any) -> None:
+        if hidden:
+            others |= {"start_parameter_services": False, "enable_rosout": False}
         super().__init__(node_name, namespace=namespace, **others)
+        self.own_executor: Any = None
 
     def create_publisher(self, msg_type: Any, topic: str, qos_profile: Any, **others: Any) -> Any:
         """As rclpy's; the profile may be ours."""
@@ -116,9 +119,12 @@ def type_name(msg_type: Any) -> str:
 
 
 def spin_once(node: Node, timeout_sec: float) -> None:
-    """Handle what comes within so long."""
+    """Handle what comes within so long; nodes may be spun by threads of their own."""
+    if node.own_executor is None:
+        node.own_executor = SingleThreadedExecutor()
+        node.own_executor.add_node(node)
     try:
-        rclpy.spin_once(node, timeout_sec=timeout_sec)
+        node.own_executor.spin_once(timeout_sec=timeout_sec)
     except ExternalShutdownException:
         raise KeyboardInterrupt from None
 
