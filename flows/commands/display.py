@@ -11,7 +11,7 @@ from pathlib import Path
 
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Column
 
 from scan2sim.flows.engine.frontier import Event
@@ -60,7 +60,7 @@ class RunDisplay:
     def __init__(self, nodes: int) -> None:
         self._bars = _progress()
         self._nodes = nodes
-        self._tasks: dict[str, int] = {}
+        self._tasks: dict[str, TaskID] = {}
         self._started: dict[str, float] = {}
         self._done = self._kept = 0
 
@@ -80,10 +80,10 @@ class RunDisplay:
             self._started[node.full_name] = time.perf_counter()
             self._tasks[node.full_name] = self._bars.add_task(node.full_name, total=1.0, message="")
         elif event == "progress":
-            self._bars.update(self._tasks[node.full_name], completed=fraction, message=escape(message))  # type: ignore[arg-type]
+            self._bars.update(self._tasks[node.full_name], completed=fraction, message=escape(message))
         elif event == "again":
             if node.full_name in self._tasks:
-                self._bars.remove_task(self._tasks.pop(node.full_name))  # type: ignore[arg-type]
+                self._bars.remove_task(self._tasks.pop(node.full_name))
             self._done, self._kept = self._done - 1, self._kept - 1
             console.print(f"[yellow]![/] {escape(message)}", highlight=False, soft_wrap=True)
         else:
@@ -91,7 +91,7 @@ class RunDisplay:
             self._kept += event == "kept"
             self._bars.update(self._whole, completed=self._done)
             if event in ("done", "failed"):
-                self._bars.remove_task(self._tasks.pop(node.full_name))  # type: ignore[arg-type]
+                self._bars.remove_task(self._tasks.pop(node.full_name))
                 seconds = time.perf_counter() - self._started[node.full_name]
                 mark = "[green]✓[/]" if event == "done" else "[red]✗[/]"
                 console.print(f"{mark} {node.full_name:<22}[dim]{seconds:7.1f} s  {self._done}/{self._nodes}")

@@ -88,7 +88,7 @@ def by_photos(model: Path, centres: F64, ups: F64, photos: Sequence[Path], crs: 
     notes: list[str] = []
     positions = [exif.place(photo) for photo in photos]
     some = [i for i, position in enumerate(positions) if position is not None]
-    high = [i for i in some if positions[i][2] is not None]  # type: ignore[index]
+    high = [i for i, position in enumerate(positions) if position is not None and position[2] is not None]
     if len(high) >= 3:
         some = high
     elif some:

@@ -2,7 +2,8 @@
 
 D3.2 drew its events from forty days of captured ones, which aren't public. Here a weekday has two rush hours, near 8 h
 and near 18 h, and little at night: the shape of a road of two directions in FHWA's Freeway Management and Operations
-Handbook (figure 1-3). `PEAK` is calibrated so that 10, 20 and 50 cameras ask for 1, 2 and 5 workers, as in D3.2's figure 5.
+Handbook (figure 1-3). `PEAK` is calibrated so that 10, 20 and 50 cameras ask for 1, 2 and 5 workers, as in D3.2's
+figure 5.
 """
 
 from __future__ import annotations

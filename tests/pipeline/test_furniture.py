@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from scan2sim.data_samples import SMALL
 from scan2sim.data_samples.layout import FRAME, lay_out
 from scan2sim.pipeline import primitives
 from scan2sim.pipeline.classes import CODE
-from scan2sim.pipeline.plates import OUTLINES, inside, plates
+from scan2sim.pipeline.plates import OUTLINES, Shape, inside, plates
 from scan2sim.pipeline.standing import Columns, stems
 from scan2sim.pipeline.step import Done, silent
 from scan2sim.pipeline.steps.decimate import DECIMATE, DecimateParams
@@ -33,7 +34,7 @@ def street(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return folder / "cloud.npz", folder / "path.npz"
 
 
-def _run(street: tuple[Path, Path], out: Path, **params: object) -> tuple[list[dict[str, object]], Done]:
+def _run(street: tuple[Path, Path], out: Path, **params: Any) -> tuple[list[dict[str, Any]], Done]:
     out.mkdir()
     done = FURNITURE.run({"cloud": street[0], "path": street[1]}, FurnitureParams(**params), out, silent)
     features = json.loads(done.files["geojson"].read_text())["features"]
@@ -48,7 +49,7 @@ def test_what_stands_in_a_street_is_found_and_nothing_else(street: tuple[Path, P
         places.append(layout.axis.place(post.s, post.t)[0])
         kinds.append("pole" if post.sign is None else "sign")
     trees = [layout.axis.place(tree.s, tree.t)[0] for tree in layout.trees if not tree.bush]
-    at = np.array([thing["at"][:2] for thing in found])  # type: ignore[index]
+    at = np.array([thing["at"][:2] for thing in found])
     for place, kind in zip(places, kinds, strict=True):
         near = np.hypot(*(at - place).T)
         thing = found[int(near.argmin())]
@@ -72,9 +73,9 @@ def test_signs_look_where_they_look_in_their_size(street: tuple[Path, Path], tmp
         if post.sign is None:
             continue
         place, heading = layout.axis.place(post.s, post.t)
-        sign = min(found, key=lambda thing: float(np.hypot(*(thing["at"][:2] - place))))  # type: ignore[index]
+        sign = min(found, key=lambda thing: float(np.hypot(*(thing["at"][:2] - place))))
         faces = np.degrees(heading) + (180 if post.towards == 1 else 0)
-        off = (float(sign["heading_deg"]) - (90 - faces) + 180) % 360 - 180  # type: ignore[arg-type]
+        off = (float(sign["heading_deg"]) - (90 - faces) + 180) % 360 - 180
         assert abs(off) < 3
         assert sign["shape"] == "rectangle"
         assert sign["plate_width_m"] == pytest.approx(0.72, abs=0.04)
@@ -126,10 +127,10 @@ def test_a_fence_a_wall_and_a_bush_are_no_poles() -> None:
 
 
 @pytest.mark.parametrize("shape", ["rectangle", "disc", "triangle_down"])
-def test_a_plate_is_outlined_by_its_points(shape: str) -> None:
+def test_a_plate_is_outlined_by_its_points(shape: Shape) -> None:
     rng = np.random.default_rng(0)
     flat = rng.uniform(-1, 1, (4000, 2))
-    flat = flat[inside(flat, OUTLINES[shape], 0)] * 0.35  # type: ignore[index]
+    flat = flat[inside(flat, OUTLINES[shape], 0)] * 0.35
     along = np.array([np.cos(0.5), np.sin(0.5)])
     xyz = np.column_stack([flat[:, :1] * along + (2, 1), flat[:, 1] + 2.4]) + rng.normal(0, 0.01, (len(flat), 3))
     (plate,) = plates(xyz, np.ones(len(xyz), bool), np.array([10.0, -3]))

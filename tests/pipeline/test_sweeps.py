@@ -31,6 +31,7 @@ from scan2sim.pipeline.io.sweeps import (
 )
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.types import F64, Camera, Frame, PointCloud, Tile, Trajectory
+from tests.present import present
 
 LOW, HIGH = np.array([-8.0, -6.0, 0.0]), np.array([30.0, 6.0, 5.0])  # the hall
 PAINT = np.array([[250, 30, 30], [30, 250, 30], [30, 30, 250], [250, 250, 30], [30, 250, 250], [250, 30, 250]])
@@ -434,7 +435,7 @@ def test_a_sweeps_own_colours_are_kept_without_photos(tmp_path: Path) -> None:
     xyz = np.random.default_rng(0).uniform(2, 5, (50, 3)).astype(np.float32)
     rgb = np.tile(np.array([10, 20, 30], np.uint8), (50, 1))
     las.write(tmp_path / "a.laz", PointCloud(Frame(), xyz, rgb))
-    assert np.array_equal(read_sweep(tmp_path / "a.laz")[2], rgb)  # type: ignore[arg-type]
+    assert np.array_equal(present(read_sweep(tmp_path / "a.laz")[2]), rgb)
     (tmp_path / "poses.tum").write_text("0 0 0 0 0 0 0 1\n")
     cloud = cloud_of(imported(sweeps=tmp_path / "a.laz", poses=tmp_path / "poses.tum", out=tmp_path / "tile"))[1]
     assert cloud.rgb is not None and (cloud.rgb == [10, 20, 30]).all()

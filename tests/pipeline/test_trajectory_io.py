@@ -146,7 +146,7 @@ def test_geojson_shows_the_path_and_where_it_is_unsure(tmp_path: Path) -> None:
     path = made_up()
     trajectory.write(tmp_path / "a.geojson", path, UTM)
     whole, *stretches = json.loads((tmp_path / "a.geojson").read_text())["features"]
-    lat, lon, height = crs.to_wgs84(UTM, path.positions[7])  # type: ignore[misc]
+    lat, lon, height = present(crs.to_wgs84(UTM, path.positions[7]))
     assert whole["geometry"]["type"] == "LineString"
     assert whole["geometry"]["coordinates"][7] == pytest.approx([lon, lat, height], abs=1e-3)
     assert whole["geometry"]["coordinates"][7][:2] == pytest.approx([lon, lat], abs=1e-7)
