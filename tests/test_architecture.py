@@ -104,12 +104,12 @@ def test_the_command_starts_without_anything_heavy() -> None:
 
 
 def test_the_version_and_the_help_are_told_by_little() -> None:
-    told = (
+    code = (
         "import sys; sys.argv[1:] = ['{}']\nfrom scan2sim.flows.cli import main\ntry: main()\nexcept SystemExit: pass"
     )
     more = ("pydantic", "jinja2", "fsspec", "asyncio", "http", "importlib.metadata", "multiprocessing")
-    assert not loaded_by(told.format("--version"), (*HEAVY, *more, "rich", "email")) & {*HEAVY, *more, "rich", "email"}
-    assert not loaded_by(told.format("--help"), (*HEAVY, *more)) & {*HEAVY, *more}
+    assert not loaded_by(code.format("--version"), (*HEAVY, *more, "rich", "email")) & {*HEAVY, *more, "rich", "email"}
+    assert not loaded_by(code.format("--help"), (*HEAVY, *more)) & {*HEAVY, *more}
 
 
 def test_the_help_says_of_commands_what_they_say_themselves() -> None:

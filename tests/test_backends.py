@@ -46,8 +46,8 @@ each = pytest.mark.parametrize(("package", "name"), ALL, ids=[f"{p.__name__.spli
 
 def keeps(module: Any, protocol: type) -> bool:
     """Whether a module has a protocol's constants, and its functions with their parameters in their order."""
-    asked = {name: value for name, value in vars(protocol).items() if inspect.isfunction(value) and name[0] != "_"}
-    for name, function in asked.items():
+    methods = {name: value for name, value in vars(protocol).items() if inspect.isfunction(value) and name[0] != "_"}
+    for name, function in methods.items():
         wanted = [parameter for parameter in inspect.signature(function).parameters if parameter != "self"]
         own = list(inspect.signature(getattr(module, name, lambda: None)).parameters.values())
         if [parameter.name for parameter in own[: len(wanted)]] != wanted:
@@ -175,7 +175,7 @@ def test_an_export_format_is_one_file(add: Add, tmp_path: Path) -> None:
     add(meshes, "off", """
 SUFFIX = ".off"
 
-def write(path, surface, look):
+def write(path, surface, names):
     rows = [f"{x} {y} {z}" for x, y, z in surface.mesh.vertices] + [f"3 {a} {b} {c}" for a, b, c in surface.mesh.faces]
     path.write_text("\\n".join(["OFF", f"{len(surface.mesh.vertices)} {len(surface)} 0", *rows]))
 """)  # fmt: skip

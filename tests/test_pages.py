@@ -154,10 +154,10 @@ def _model(annotation: Any) -> type[BaseModel]:
 @cache
 def project() -> tuple[str, ...]:
     """Files of the project."""
-    told = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True)
-    if told.returncode:
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True)
+    if listed.returncode:
         return tuple(path.relative_to(ROOT).as_posix() for path in ROOT.rglob("*"))
-    return tuple(told.stdout.split())
+    return tuple(listed.stdout.split())
 
 
 @pytest.mark.parametrize("page", named(PAGES + MODULES))

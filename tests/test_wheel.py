@@ -110,12 +110,12 @@ def test_a_users_folders_and_files_are_not_taken_for_ours(installed: Installed) 
     assert "poisson.terrain" in installed.scan2sim("plan", "tile")
     call = "from scan2sim.pipeline import isolate; print(isolate.call('operator:add', 1, 2, timeout=60))"
     assert installed.run(installed.environment / "bin" / "python", "-P", "-c", call) == "3\n"
-    told = installed.scan2sim("plan", "tile", "--set", "voxel.size=-1", code=2)
-    (page,) = re.findall(r"/\S+/docs/settings.md", told)  # hints name pages where they are
+    printed = installed.scan2sim("plan", "tile", "--set", "voxel.size=-1", code=2)
+    (page,) = re.findall(r"/\S+/docs/settings.md", printed)  # hints name pages where they are
     assert "voxel.size" in Path(page).read_text()
     (installed.user / "tile" / "cloud.laz").write_bytes(b"LASF")  # found out by the first step, in its own process
-    told = installed.scan2sim("run", "tile", "--out", "out", code=3)
-    assert "cloud.laz" in told and "the user's own" not in told and "Traceback" not in told
+    printed = installed.scan2sim("run", "tile", "--out", "out", code=3)
+    assert "cloud.laz" in printed and "the user's own" not in printed and "Traceback" not in printed
 
 
 def interpreter(version: str) -> Path | None:
@@ -123,10 +123,10 @@ def interpreter(version: str) -> Path | None:
     found = [shutil.which(f"python{version}"), *Path.home().glob(f".pyenv/versions/{version}.*/bin/python")]
     for python in map(str, filter(None, found)):
         try:
-            told = done(python, "-c", "import sys; print('%d.%d' % sys.version_info[:2])", cwd=Path.home())
+            printed = done(python, "-c", "import sys; print('%d.%d' % sys.version_info[:2])", cwd=Path.home())
         except (AssertionError, OSError):
             continue  # a shim of pyenv's, of a version that isn't there
-        if told.strip() == version:
+        if printed.strip() == version:
             return Path(python)
     return None
 
@@ -142,7 +142,7 @@ def test_a_world_is_made_from_the_wheel_alone(version: str, wheel: Path, tmp_pat
     done(pip, "install", "-c", ROOT / "constraints.txt", f"{wheel}[flows]", cwd=tmp_path)
     here = place(tmp_path / "venv", tmp_path / "user")
     here.scan2sim("sample", "--small", "tile")
-    told = here.scan2sim("run", "tile", "--out", "out", "--set", "segment.overwrite=true", *LIGHT)
-    assert "World:" in told and (here.user / "out" / "world" / "sample_street.sdf").is_file()
-    told = here.scan2sim("survey", "tile", "--out", "town", "--runner", "dask", "--jobs", "2", *LIGHT)
-    assert "Report:" in told and (here.user / "town" / "world").is_dir()
+    printed = here.scan2sim("run", "tile", "--out", "out", "--set", "segment.overwrite=true", *LIGHT)
+    assert "World:" in printed and (here.user / "out" / "world" / "sample_street.sdf").is_file()
+    printed = here.scan2sim("survey", "tile", "--out", "town", "--runner", "dask", "--jobs", "2", *LIGHT)
+    assert "Report:" in printed and (here.user / "town" / "world").is_dir()

@@ -82,13 +82,13 @@ def test_what_may_be_installed_is_said_and_installed(
     capfd: pytest.CaptureFixture[str],
     root: bool,
 ) -> None:
-    asked = tmp_path / "asked"
+    requests = tmp_path / "asked"
     monkeypatch.setattr(os, "geteuid", lambda: 0 if root else 1000)
-    monkeypatch.setattr(libraries, "loads", lambda name: name not in USB or asked.exists())
-    scripts = {"apt-get": f'echo "$@" >> {asked}', "env": 'shift; exec "$@"', "sudo": 'shift; "$@"'}
+    monkeypatch.setattr(libraries, "loads", lambda name: name not in USB or requests.exists())
+    scripts = {"apt-get": f'echo "$@" >> {requests}', "env": 'shift; exec "$@"', "sudo": 'shift; "$@"'}
     commands(tmp_path, monkeypatch, **scripts)
     install.install_system_packages(USB)
-    assert "install --no-install-recommends libusb-1.0-0" in asked.read_text()
+    assert "install --no-install-recommends libusb-1.0-0" in requests.read_text()
     assert "Installing these packages now, by apt-get as root" in capfd.readouterr().out
 
 

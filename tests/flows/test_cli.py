@@ -374,9 +374,9 @@ def test_damage_is_noticed_told_and_mended(street: Path, world: Path, tmp_path: 
     result = scan2sim("verify", out)
     assert result.returncode == 5 and "Traceback" not in result.stderr
     assert "decimate.terrain" in result.stdout and page.name in result.stdout
-    told = good(scan2sim(*options))
+    printed = good(scan2sim(*options))
     assert (kept.read_bytes(), page.read_bytes()) == whole
-    assert [line.split()[1] for line in told.splitlines() if line.startswith("✓")] == ["decimate.terrain"]
+    assert [line.split()[1] for line in printed.splitlines() if line.startswith("✓")] == ["decimate.terrain"]
     good(scan2sim("verify", out))
     bad(scan2sim("verify", tmp_path), 3, "holds no results")
 

@@ -106,11 +106,11 @@ def test_what_comes_out_the_same_ends_the_need_to_redo(run: Run, ran: Callable[[
 def test_digests_are_remembered_until_a_file_changes(tmp_path: Path, source: Path) -> None:
     file = tmp_path / "digests.json"
     first = Digests(file)
-    told = first(source)
+    known = first(source)
     first.save()
-    assert Digests(file)(source) == told == digest(source)
+    assert Digests(file)(source) == known == digest(source)
     source.write_text("2")
-    assert Digests(file)(source) == digest(source) != told
+    assert Digests(file)(source) == digest(source) != known
 
 
 def test_a_failure_is_noted_and_the_rest_goes_on(tmp_path: Path, source: Path, ran: Callable[[], str]) -> None:

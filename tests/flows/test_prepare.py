@@ -95,12 +95,12 @@ def test_steps_of_a_drive_are_done_again_by_newer_code_and_of_other_files(
 def test_a_drive_is_planned_like_a_tile(corridor: Path, tmp_path: Path) -> None:
     place = drive(tmp_path, 'corridor = "corridor"\n[tiles]\nlength = 6.0\nbuffer = 1.0\n')
 
-    def told() -> str:
+    def message() -> str:
         return CliRunner().invoke(app, ["plan", str(place), "--out", str(tmp_path / "out")]).output
 
-    assert re.search(r"cut +yes +it was never run", told())
+    assert re.search(r"cut +yes +it was never run", message())
     survey_of(place, tmp_path / "out")
-    assert re.search(r"cut +no +kept", told())
+    assert re.search(r"cut +no +kept", message())
 
 
 def test_a_survey_is_itself(corridor: Path, tmp_path: Path) -> None:
@@ -120,8 +120,8 @@ def test_a_survey_is_itself(corridor: Path, tmp_path: Path) -> None:
         ("corridor = [", "TOML"),
     ],
 )
-def test_what_no_drive_says_is_told(tmp_path: Path, text: str, told: str) -> None:
-    with pytest.raises(InputError, match=told):
+def test_what_no_drive_says_is_told(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
         Drive.read(drive(tmp_path, text))
 
 

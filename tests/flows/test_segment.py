@@ -16,14 +16,14 @@ from tests.flows.test_cli import bad, good, scan2sim
 
 
 @pytest.fixture(scope="module")
-def told(small_street: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+def segmented(small_street: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """The small street segmented anew, and what the command printed."""
     out = tmp_path_factory.mktemp("told")
     return out, good(scan2sim("segment", small_street, "--out", out, "--overwrite"))
 
 
-def test_points_get_their_classes_from_the_photos(small_street: Path, told: tuple[Path, str]) -> None:
-    out, printed = told
+def test_points_get_their_classes_from_the_photos(small_street: Path, segmented: tuple[Path, str]) -> None:
+    out, printed = segmented
     tile = read_tile(small_street)
     before = las.read(tile.clouds[0], tile.frame)
     after = las.read(out / "classified" / "cloud.laz", tile.frame)
@@ -35,8 +35,8 @@ def test_points_get_their_classes_from_the_photos(small_street: Path, told: tupl
     assert "known as" in printed and "road_sign" in printed
 
 
-def test_photos_get_labels_and_masks(small_street: Path, told: tuple[Path, str]) -> None:
-    out, _ = told
+def test_photos_get_labels_and_masks(small_street: Path, segmented: tuple[Path, str]) -> None:
+    out, _ = segmented
     for view in read_tile(small_street).views:
         codes = cv2.imread(str(out / "labels" / f"{view.photo.stem}.png"), cv2.IMREAD_GRAYSCALE)
         mask = cv2.imread(str(out / "masks" / f"{view.photo.stem}.png"), cv2.IMREAD_GRAYSCALE)
@@ -44,8 +44,8 @@ def test_photos_get_labels_and_masks(small_street: Path, told: tuple[Path, str])
         np.testing.assert_array_equal(mask == 0, np.isin(codes, (0, 66, 67)))
 
 
-def test_a_run_goes_on_from_there(small_street: Path, told: tuple[Path, str]) -> None:
-    out, _ = told
+def test_a_run_goes_on_from_there(small_street: Path, segmented: tuple[Path, str]) -> None:
+    out, _ = segmented
     plan = good(scan2sim("plan", small_street, "--out", out, "--set", "segment.overwrite=true"))
     again = {line.split()[0] for line in plan.splitlines() if " yes " in line}
     assert "split" in again and not again & {"label", "segment", "ingest"}
@@ -61,8 +61,8 @@ def test_classes_that_are_there_are_kept(small_street: Path, tmp_path: Path) -> 
     assert not list((tmp_path / "labels").glob("*.png"))
 
 
-def test_bad_weights_leave_earlier_results(small_street: Path, told: tuple[Path, str], tmp_path: Path) -> None:
-    out, _ = told
+def test_bad_weights_leave_earlier_results(small_street: Path, segmented: tuple[Path, str], tmp_path: Path) -> None:
+    out, _ = segmented
     before = (out / "classified" / "cloud.laz").read_bytes()
     (tmp_path / "w.pt").write_bytes(pickle.dumps({"x": 1}))
     command = ("segment", small_street, "--out", out, "--overwrite", "--set")

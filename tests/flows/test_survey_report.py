@@ -110,11 +110,11 @@ def test_borders_are_told_once_the_worst_first(tmp_path: Path) -> None:
 def test_rows_and_overview_for_other_programs(tmp_path: Path) -> None:
     assert rows(tmp_path) == [] and overview(tmp_path) == "No tile is made yet."
     written(tmp_path, tiles())
-    told = rows(tmp_path)
-    assert told[0] == {"tile": "town_0", "state": "done"} | {
+    lines = rows(tmp_path)
+    assert lines[0] == {"tile": "town_0", "state": "done"} | {
         k: v for k, v in (FIGURES | {"psnr_db": 20.0}).items() if k != "cloud_to_mesh_m"
     }
-    assert told[1] == {"tile": "town_1", "state": "failed"}
+    assert lines[1] == {"tile": "town_1", "state": "failed"}
     assert overview(tmp_path).splitlines() == [
         "**town**: 1 failed, 1 waiting, 3 done, 1 kept",
         "- town_1: cloud.laz: is <truncated>",

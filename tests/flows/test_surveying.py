@@ -38,12 +38,12 @@ def made(survey: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def told(out: Path) -> dict[str, Any]:
+def report_of(out: Path) -> dict[str, Any]:
     return json.loads((out / "survey.json").read_text())
 
 
 def test_tiles_share_their_borders(made: Path) -> None:
-    (border,) = told(made)["borders"]
+    (border,) = report_of(made)["borders"]
     assert border["length_m"] > 10
     assert border["gap_m"] < 0.3 and border["gap_p99_m"] == 0 and border["overlap_m"] < 1e-3
     assert border["shared"] > 0.99
@@ -90,7 +90,7 @@ def test_an_unchanged_survey_is_left_as_it_is(survey: Path, made: Path) -> None:
     said = good(scan2sim("survey", survey, "--out", made, *SMALL))
     assert "nothing to do" in said and f"World:  {made / 'world'}" in said and f"Report: {made / 'survey.html'}" in said
     assert {path: path.stat().st_mtime_ns for path in (made / "steps").rglob("manifest.json")} == before
-    assert {tile["state"] for tile in told(made)["tiles"].values()} == {"kept"}
+    assert {tile["state"] for tile in report_of(made)["tiles"].values()} == {"kept"}
 
 
 def test_a_tile_that_fails_is_told_and_the_others_are_made(survey: Path, made: Path, tmp_path: Path) -> None:
@@ -101,8 +101,8 @@ def test_a_tile_that_fails_is_told_and_the_others_are_made(survey: Path, made: P
     cloud.write_bytes(cloud.read_bytes()[: cloud.stat().st_size // 2])
     out = tmp_path / "out"
     bad(scan2sim("survey", broken, "--out", out, *SMALL), 5, "1 of 2 tiles failed", "truncated or damaged")
-    assert told(out)["tiles"].keys() == {tile.parent.name for tile in survey.glob("*/tile.toml")}
-    first, second = told(out)["tiles"].values()
+    assert report_of(out)["tiles"].keys() == {tile.parent.name for tile in survey.glob("*/tile.toml")}
+    first, second = report_of(out)["tiles"].values()
     assert first["state"] == "done" and second["state"] == "failed"
     assert "truncated or damaged" in second["reason"] and cloud.name in second["reason"]
     shutil.copyfile(sorted(survey.glob("*/cloud.laz"))[1], cloud)

@@ -23,8 +23,8 @@ def main() -> None:
     for kind in given.kinds:
         with TemporaryDirectory() as folder:
             tally = fuzz(kind, range(given.first, given.first + given.cases), Path(folder) / "x", child)
-        told = ", ".join(f"{code}: {n}" for code, n in sorted(tally.codes.items(), key=str))
-        print(f"{kind:24s} {told}; {tally.seconds:.1f} s, {tally.mb:.0f} MB at most", flush=True)
+        summary = ", ".join(f"{code}: {n}" for code, n in sorted(tally.codes.items(), key=str))
+        print(f"{kind:24s} {summary}; {tally.seconds:.1f} s, {tally.mb:.0f} MB at most", flush=True)
         for failure in tally.failures:
             print("  " + failure.replace("\n", "\n    "), flush=True)
         codes.update({str(code): n for code, n in tally.codes.items()})

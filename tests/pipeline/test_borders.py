@@ -99,7 +99,9 @@ def outward(mesh: Mesh) -> np.ndarray:
     return np.einsum("ij,ij->i", mesh.face_normal, out)
 
 
-def met(meshes: Mapping[str, Mesh], where: Mapping[str, Cell]) -> tuple[dict[str, Clipped], dict[str, Mesh]]:
+def clipped_and_joined(
+    meshes: Mapping[str, Mesh], where: Mapping[str, Cell]
+) -> tuple[dict[str, Clipped], dict[str, Mesh]]:
     """All clipped, and all joined."""
     clips = {name: clip(mesh, where[name]) for name, mesh in meshes.items()}
     return clips, {name: join(name, clips, 0.3, 0.5).mesh for name in meshes}
@@ -121,7 +123,7 @@ def go(step: Step, out: Path, inputs: Mapping[str, Path], **params: Any) -> Done
 def two() -> tuple[dict[str, Mesh], dict[str, Clipped], dict[str, Mesh]]:
     """The scene as two tiles have it: meshes, clipped, joined."""
     meshes = {"east": scene(EAST, 0.08, 1), "west": scene(WEST, 0.1, 2)}
-    return meshes, *met(meshes, cells(SEEDS))
+    return meshes, *clipped_and_joined(meshes, cells(SEEDS))
 
 
 def test_clip_keeps_the_own_side_and_the_surface(two: Any) -> None:
@@ -171,7 +173,7 @@ def test_the_surface_behind_the_border_goes_along(tmp_path: Path) -> None:
         for name, frame in (("east", EAST), ("west", WEST))
     }
     flat["west"] = replace(flat["west"], vertices=flat["west"].vertices - np.array([0, 0, 0.1], np.float32))
-    joined = met(flat, cells(SEEDS))[1]
+    joined = clipped_and_joined(flat, cells(SEEDS))[1]
     xyz = world(joined["west"])
     behind = -cells(SEEDS)["west"].beyond("east", xyz[:, :2])
     lift = xyz[:, 2] - Z - height(xyz[:, 0] - X, xyz[:, 1] - Y) + 0.1
@@ -184,7 +186,7 @@ def test_four_tiles_meet_in_one_vertex() -> None:
     where = cells(seeds)
     frames = {name: Frame("EPSG:32633", (x + 7 * k, y - 3 * k, Z)) for k, (name, (x, y)) in enumerate(seeds.items())}
     meshes = {name: scene(frames[name], 0.07 + 0.01 * k, k) for k, name in enumerate(seeds)}
-    _, joined = met(meshes, where)
+    _, joined = clipped_and_joined(meshes, where)
     corners = set()
     for name, mesh in joined.items():
         xyz = world(mesh)
@@ -204,7 +206,7 @@ def test_three_tiles_meet_where_the_first_has_a_hole() -> None:
     meshes = {name: scene(EAST, 0.07 + 0.01 * k, k) for k, name in enumerate(seeds)}
     near = np.hypot(*(world(meshes["a"])[meshes["a"].faces].mean(axis=1)[:, :2] - (X - 0.4, Y)).T) < 1
     meshes["a"] = meshes["a"].keep(~near)
-    _, joined = met(meshes, where)
+    _, joined = clipped_and_joined(meshes, where)
     between = gap(joined["b"], joined["c"], where["b"], "c")
     assert between.shared == 1 and between.max_m == 0
 
@@ -424,7 +426,7 @@ def test_a_real_reconstruction_cut_in_two_meets_again(tmp_path: Path) -> None:
         surface = go(POISSON, out / "2", {"cloud": thin}).files["mesh"]
         surface = go(TRIM, out / "3", {"mesh": surface, "cloud": thin}, **TRIM.class_defaults["terrain"]).files["mesh"]
         meshes[name] = Mesh.load(go(ISLANDS, out / "4", {"mesh": surface}).files["mesh"])
-    clips, joined = met(meshes, where)
+    clips, joined = clipped_and_joined(meshes, where)
     before = gap(clips["a"].mesh, clips["b"].mesh, where["a"], "b")
     assert before.shared < 0.1 and before.mean_m > 0.0005 and before.length_m > 20
     small = {name: simplify(mesh, 10_000) for name, mesh in joined.items()}

@@ -61,15 +61,15 @@ def test_what_is_written_here_is_read_as_ours(tmp_path: Path) -> None:
     las.write(tmp_path / "own.laz", PointCloud(Frame(), np.zeros((5, 3), np.float32), classification=LABEL[:5]))
     assert taken(tmp_path / "own.laz")[3] == 65
     code = np.full(N, 65, np.uint8)
-    write_classified(foreign(tmp_path / "a.las"), tmp_path / "told.laz", code, code, code)
-    assert taken(tmp_path / "told.laz")[3] == 65
+    write_classified(foreign(tmp_path / "a.las"), tmp_path / "classified.laz", code, code, code)
+    assert taken(tmp_path / "classified.laz")[3] == 65
 
 
 def test_classes_that_the_user_names(tmp_path: Path) -> None:
     assert parse("65=noise, 200=5,31=Road sign") == {65: 7, 200: 5, 31: 64}
     assert code_of("ground") == CODE["terrain"]
-    told = {"65": "names no class", "5=noise,5=6": "5=6.*again", "65=x": "no class 'x'", "x=6": "no code"}
-    for text, message in (told | {"256=6": "no code"}).items():
+    refused = {"65": "names no class", "5=noise,5=6": "5=6.*again", "65=x": "no class 'x'", "x=6": "no code"}
+    for text, message in (refused | {"256=6": "no code"}).items():
         with pytest.raises(SettingError, match=message):
             parse(text)
     (tmp_path / "tile.toml").write_text('name = "t"\ncrs = "local"\nclouds = ["a.las"]\n[classes]\n65 = "fog"\n')
@@ -86,15 +86,15 @@ def test_points_that_vanish_are_named_with_their_share_and_what_to_do(tmp_path: 
     assert len(done.warnings) == 1 and "codes 65 (20.0%) are the survey's own" in done.warnings[0]
     assert "--classes 65=building" in done.warnings[0]
     (tmp_path / "split").mkdir()
-    told = split({"cloud": done.files["cloud"]}, SplitParams(), tmp_path / "split", silent)
-    assert told.facts["points"] == {"terrain": 400, "building": 0, "vegetation": 400, "rest": 1200}
-    warning = next(w for w in told.warnings if "no class" in w and "%" in w)
+    parted = split({"cloud": done.files["cloud"]}, SplitParams(), tmp_path / "split", silent)
+    assert parted.facts["points"] == {"terrain": 400, "building": 0, "vegetation": 400, "rest": 1200}
+    warning = next(w for w in parted.warnings if "no class" in w and "%" in w)
     assert warning.startswith("60.0% of the points") and "unclassified 40.0%, code_31 20.0%" in warning
     assert '31 = "building"' in warning and "segment.overwrite=true" in warning
     cloud = PointCloud.load(done.files["cloud"])
     cloud.take(np.flatnonzero(present(cloud.classification) != 31)).save(tmp_path / "rest.npz")
-    told = split({"cloud": tmp_path / "rest.npz"}, SplitParams(), tmp_path / "split", silent)
-    assert "Have all classes told anew" in told.warnings[-1] and "[classes]" not in told.warnings[-1]
+    parted = split({"cloud": tmp_path / "rest.npz"}, SplitParams(), tmp_path / "split", silent)
+    assert "Have all classes told anew" in parted.warnings[-1] and "[classes]" not in parted.warnings[-1]
 
 
 def test_clouds_that_become_laz_keep_their_survey_s_codes_until_a_tile_says_what_they_are(tmp_path: Path) -> None:
@@ -106,9 +106,9 @@ def test_clouds_that_become_laz_keep_their_survey_s_codes_until_a_tile_says_what
 
 def test_tiles_of_a_survey_hold_codes_as_the_corridor_says(tmp_path: Path) -> None:
     path = import_las([foreign(tmp_path / "a.las")], tmp_path / "tile", crs="local", classes={65: 69})
-    told: list[str] = []
-    survey = read_survey(cut_survey(path, tmp_path / "survey", CutParams(length=100.0), warn=told.append))
-    assert len(told) == 1 and told[0].startswith("a.las: codes 200 (20.0%) are the survey's own")
+    warned: list[str] = []
+    survey = read_survey(cut_survey(path, tmp_path / "survey", CutParams(length=100.0), warn=warned.append))
+    assert len(warned) == 1 and warned[0].startswith("a.las: codes 200 (20.0%) are the survey's own")
     tile = read_tile(next(iter(survey.tiles.values())))
     codes = clouds.meanings(tile.clouds[0], tile.classes)[clouds.read(tile.clouds[0], tile.frame).classification]
     assert np.unique(codes).tolist() == [1, 2, 31, 69]

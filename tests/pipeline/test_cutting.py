@@ -204,10 +204,10 @@ def test_a_gap_ends_a_stretch_and_is_told() -> None:
     path = Trajectory(
         np.concatenate([first.times, 60 + second.times]), np.concatenate([first.positions, second.positions])
     )
-    told: list[str] = []
-    made = seeds("s", Frame(), 100.0, (0, 0), (1, 1), path, told.append)
+    warned: list[str] = []
+    made = seeds("s", Frame(), 100.0, (0, 0), (1, 1), path, warned.append)
     assert [x for x, _ in made.values()] == [50, 150, 250, 450, 550, 650]
-    assert len(told) == 1 and "gap of 100 m from 30.000 s to 60.000 s, at 300.0, 0.0" in told[0]
+    assert len(warned) == 1 and "gap of 100 m from 30.000 s to 60.000 s, at 300.0, 0.0" in warned[0]
 
 
 @pytest.mark.parametrize("path", [path_of((0, 0), (30, 0)), path_of((15, 0), (15, 0))])
@@ -319,12 +319,12 @@ def test_photos_go_to_the_tiles_that_they_see(bend: Path, cut: Path) -> None:
 
 
 def test_photos_are_copied_where_asked_for(bend: Path, tmp_path: Path) -> None:
-    told: list[str] = []
-    survey = cut_survey(bend, tmp_path / "out", CUT.model_copy(update={"copy_photos": True}), warn=told.append)
+    warned: list[str] = []
+    survey = cut_survey(bend, tmp_path / "out", CUT.model_copy(update={"copy_photos": True}), warn=warned.append)
     view = tiles(survey)["bend_0001"].views[0]
     assert view.photo == tmp_path / "out/bend_0001/photos/95.jpg" and view.photo.is_file()
     assert view.mask == tmp_path / "out/bend_0001/masks/mask.png" and view.mask.is_file()
-    assert any("1 of 4 photos are missing" in text and "lost.jpg" in text for text in told)
+    assert any("1 of 4 photos are missing" in text and "lost.jpg" in text for text in warned)
 
 
 def test_two_cuts_write_the_same_bytes(bend: Path, cut: Path) -> None:
@@ -373,9 +373,9 @@ def test_clouds_of_all_kinds_join_as_in_a_tile(tmp_path: Path) -> None:
     (folder / "2.ply").write_bytes(text.encode() + xyz.astype("<f8").tobytes())
     body = {"name": "bend", "crs": UTM.crs, "clouds": ["0.laz", "1.laz", "2.ply"], "trajectory": "path.csv"}
     (folder / "tile.toml").write_text(tomli_w.dumps(body))
-    told: list[str] = []
-    made = tiles(cut_survey(folder, tmp_path / "out", CUT, warn=told.append))
-    assert "2.ply: 1 points with NaN coordinates left out" in told
+    warned: list[str] = []
+    made = tiles(cut_survey(folder, tmp_path / "out", CUT, warn=warned.append))
+    assert "2.ply: 1 points with NaN coordinates left out" in warned
     first, middle, last = (clouds.read(tile.clouds[0], tile.frame) for tile in made.values())
     assert first.time is not None and first.intensity is not None and np.any(first.rgb != 128)
     assert middle.rgb is not None and (middle.rgb == 128).all(axis=1).mean() > 0.5
@@ -459,10 +459,12 @@ def test_tiles_with_few_points_go_to_their_neighbours(tmp_path: Path) -> None:
     xy = street(np.arange(0, 500, 0.5), np.zeros(1000))  # drives on where there are no clouds
     path = np.column_stack([np.arange(1000) / 20, xy, np.full(1000, 2.0)])
     folder = corridor(tmp_path / "corridor", n=20_000, path=path)
-    told: list[str] = []
-    made = tiles(cut_survey(folder, tmp_path / "out", CUT, warn=told.append))
+    warned: list[str] = []
+    made = tiles(cut_survey(folder, tmp_path / "out", CUT, warn=warned.append))
     assert list(made) == ["bend_0000", "bend_0001", "bend_0002"]
-    assert any("2 of 5 tiles have fewer than 1,000 points" in text and "bend_0003, bend_0004" in text for text in told)
+    assert any(
+        "2 of 5 tiles have fewer than 1,000 points" in text and "bend_0003, bend_0004" in text for text in warned
+    )
     assert all(name in made for tile in made.values() for name in (tile.cell.neighbours if tile.cell else ()))
 
 

@@ -45,11 +45,11 @@ def test_pictures_of_any_size_cover_the_photo(size: tuple[int, int]) -> None:
     ramp = np.stack([(column + 0.5) / width, (row + 0.5) / height, 0 * row], axis=-1)
     for u, v in ((-0.5, -0.5), (20.0, 30.0), (90.3, 60.1), (96.4, 70.4)):
         x, y = rescaled(p, u, v, ramp)
-        told = np.array(read(ramp, p, u, v, False)[:2])
+        sampled = np.array(read(ramp, p, u, v, False)[:2])
         place = np.array([(u + 0.5) / camera.width, (v + 0.5) / camera.height])
-        assert (abs(told - place) <= 0.5 / np.array([width, height]) + 1e-9).all()
+        assert (abs(sampled - place) <= 0.5 / np.array([width, height]) + 1e-9).all()
         if 0 <= x <= width - 1 and 0 <= y <= height - 1:
-            np.testing.assert_allclose(told, place, atol=1e-9)
+            np.testing.assert_allclose(sampled, place, atol=1e-9)
 
 
 def test_masks_hold_up_to_the_photos_border() -> None:

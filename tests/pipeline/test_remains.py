@@ -25,10 +25,10 @@ def boxes(path: Path, *kinds: str, heading: float = 0.0) -> Path:
     """A file of things of 4 x 2 x 1.5 m with a corner in the origin, turned by `heading` (radians)."""
     c, s = np.cos(heading), np.sin(heading)
     ring = np.array([[0, 0], [4, 0], [4, 2], [0, 2], [0, 0]]) @ np.array([[c, s], [-s, c]]) + FRAME.origin[:2]
-    told = {"ground_z": FRAME.origin[2], "height_m": 1.5}
+    properties = {"ground_z": FRAME.origin[2], "height_m": 1.5}
     features = [
         {"type": "Feature", "geometry": {"type": "Polygon", "coordinates": [ring.tolist()]},
-         "properties": {"kind": kind, **told}} for kind in kinds
+         "properties": {"kind": kind, **properties}} for kind in kinds
     ]  # fmt: skip
     path.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
     return path

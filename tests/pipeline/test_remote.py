@@ -24,14 +24,14 @@ def s3() -> Iterator[str]:
     pytest.importorskip("s3fs")
     server.start()
     host, port = server.get_host_and_port()
-    told = {"AWS_ENDPOINT_URL": f"http://{host}:{port}", "AWS_ACCESS_KEY_ID": "x", "AWS_SECRET_ACCESS_KEY": "x"}
-    told |= {"AWS_DEFAULT_REGION": "us-east-1"}
+    environment = {"AWS_ENDPOINT_URL": f"http://{host}:{port}", "AWS_ACCESS_KEY_ID": "x", "AWS_SECRET_ACCESS_KEY": "x"}
+    environment |= {"AWS_DEFAULT_REGION": "us-east-1"}
     before = dict(os.environ)
-    os.environ.update(told)
+    os.environ.update(environment)
     forkserver._forkserver._stop()  # type: ignore[attr-defined]  # nodes have the environment that it was started with
     import s3fs
 
-    s3fs.S3FileSystem(endpoint_url=told["AWS_ENDPOINT_URL"]).mkdir("survey", create_parents=True)
+    s3fs.S3FileSystem(endpoint_url=environment["AWS_ENDPOINT_URL"]).mkdir("survey", create_parents=True)
     yield "s3://survey"
     os.environ.clear()
     os.environ.update(before)

@@ -49,7 +49,7 @@ def way(times: F64) -> Trajectory:
     return Trajectory(times, positions, Rotation.from_euler("z", heading[:, None]).as_matrix())
 
 
-def meet(origin: F64, direction: F64) -> tuple[F64, np.ndarray]:
+def intersect(origin: F64, direction: F64) -> tuple[F64, np.ndarray]:
     """(N, 3) where rays from within the hall meet a wall, and (N,) which: low x, y, z, high x, y, z."""
     with np.errstate(divide="ignore"):
         far = np.concatenate([(LOW - origin) / direction, (HIGH - origin) / direction], axis=1)
@@ -67,14 +67,14 @@ def sweep(time: float, *, turning: bool) -> F64:
     when = time + (-azimuth / (2 * np.pi) * PERIOD if turning else np.zeros(len(ray)))
     poses = way(when)
     assert poses.rotations is not None
-    hits, _ = meet(poses.positions, np.einsum("nij,nj->ni", poses.rotations, ray))
+    hits, _ = intersect(poses.positions, np.einsum("nij,nj->ni", poses.rotations, ray))
     return np.einsum("nji,nj->ni", poses.rotations, hits - poses.positions)
 
 
 def photo(T_world_cam: F64) -> np.ndarray:
     """(H, W, 3) RGB: each wall in its colour."""
     rays = pixel_rays(CAMERA).reshape(-1, 3).astype(np.float64) @ T_world_cam[:3, :3].T
-    _, wall = meet(np.tile(T_world_cam[:3, 3], (len(rays), 1)), rays)
+    _, wall = intersect(np.tile(T_world_cam[:3, 3], (len(rays), 1)), rays)
     return PAINT[wall].reshape(CAMERA.height, CAMERA.width, 3).astype(np.uint8)
 
 
@@ -113,7 +113,7 @@ class Drive:
     camera: Trajectory
 
     @property
-    def asked(self) -> dict[str, Any]:
+    def arguments(self) -> dict[str, Any]:
         return {"sweeps": self.folder / "sweeps", "poses": self.folder / "camera.csv", "extrinsics": T_CAMERA_SCANNER}
 
     @property
@@ -144,10 +144,10 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
     return make(tmp_path_factory.mktemp("drive"))
 
 
-def imported(**asked: Any) -> Path:
+def imported(**arguments: Any) -> Path:
     """`import_sweeps`, its parameters and all else by their names."""
-    own = {name: asked.pop(name) for name in Placing.model_fields.keys() & asked.keys()}
-    return import_sweeps(**asked, placing=Placing(**own))
+    own = {name: arguments.pop(name) for name in Placing.model_fields.keys() & arguments.keys()}
+    return import_sweeps(**arguments, placing=Placing(**own))
 
 
 def cloud_of(path: Path) -> tuple[Tile, PointCloud, np.ndarray]:
@@ -159,19 +159,19 @@ def cloud_of(path: Path) -> tuple[Tile, PointCloud, np.ndarray]:
 
 def test_a_turning_scanners_walls_come_out_sharp(tmp_path: Path) -> None:
     drive = make(tmp_path, turning=True)
-    _, cloud, xyz = cloud_of(imported(**drive.asked, out=tmp_path / "tile", deskew="kitti"))
+    _, cloud, xyz = cloud_of(imported(**drive.arguments, out=tmp_path / "tile", deskew="kitti"))
     assert len(xyz) == SWEEPS * 600 * 24 and walls(xyz)[0].max() < 0.003
     assert cloud.time is not None
     assert np.allclose([cloud.time.min(), cloud.time.max()], [0.05, 0.65], atol=1e-3)
     assert cloud.intensity is not None and (cloud.intensity == 32768).all()
-    smeared = cloud_of(imported(**drive.asked, out=tmp_path / "smeared"))[2]
+    smeared = cloud_of(imported(**drive.arguments, out=tmp_path / "smeared"))[2]
     assert walls(smeared)[0].max() > 0.2
 
 
 @pytest.mark.parametrize("write", [to_bin, to_laz, to_open3d(".pcd"), to_open3d(".ply")])
 def test_sweeps_of_all_formats(tmp_path: Path, write: Callable[[Path, F64], None]) -> None:
     drive = make(tmp_path, write=write)
-    _, cloud, xyz = cloud_of(imported(**drive.asked, out=tmp_path / "tile"))
+    _, cloud, xyz = cloud_of(imported(**drive.arguments, out=tmp_path / "tile"))
     assert len(xyz) == SWEEPS * 600 * 24 and walls(xyz)[0].max() < 0.003
     assert cloud.intensity is not None and np.abs(cloud.intensity.astype(int) - 32768).max() < 300
 
@@ -192,7 +192,7 @@ def test_poses_may_be_the_scanners_own(drive: Drive, tmp_path: Path) -> None:
 
 
 def test_points_take_the_colour_of_their_wall_and_photos_their_pose(drive: Drive, tmp_path: Path) -> None:
-    tile, cloud, xyz = cloud_of(imported(**drive.asked, out=tmp_path / "tile", photos=drive.pictures, link=True))
+    tile, cloud, xyz = cloud_of(imported(**drive.arguments, out=tmp_path / "tile", photos=drive.pictures, link=True))
     assert cloud.rgb is not None
     off = np.abs(np.concatenate([xyz - LOW, xyz - HIGH], axis=1))
     inner = np.sort(off, axis=1)[:, 1] > 0.5  # away from the edges between walls
@@ -209,7 +209,7 @@ def test_a_mask_goes_with_the_photos_and_its_pixels_colour_nothing(drive: Drive,
     mask[128:] = 0
     cv2.imwrite(str(tmp_path / "mask.png"), mask)
     pictures = Pictures(drive.folder / "photos", CAMERA, mask=tmp_path / "mask.png")
-    tile, cloud, xyz = cloud_of(imported(**drive.asked, out=tmp_path / "tile", photos=pictures))
+    tile, cloud, xyz = cloud_of(imported(**drive.arguments, out=tmp_path / "tile", photos=pictures))
     assert cloud.rgb is not None and (cloud.rgb[xyz[:, 2] < 0.3] == 128).mean() > 0.8
     assert {view.mask for view in tile.views} == {tile.path.parent / "masks" / "mask.png"}
 
@@ -220,17 +220,19 @@ def test_what_is_unsure_is_left_out_and_told(drive: Drive, tmp_path: Path) -> No
     unsure[2:4] = True
     rotations = drive.camera.rotations
     trajectory_io.write(tmp_path / "lost.csv", Trajectory(drive.times, positions, rotations, unsure))
-    told: list[str] = []
-    asked = drive.asked | {"poses": tmp_path / "lost.csv", "photos": drive.pictures, "warn": told.append}
-    tile, _, xyz = cloud_of(imported(**asked, out=tmp_path / "tile"))
+    warned: list[str] = []
+    arguments = drive.arguments | {"poses": tmp_path / "lost.csv", "photos": drive.pictures, "warn": warned.append}
+    tile, _, xyz = cloud_of(imported(**arguments, out=tmp_path / "tile"))
     assert len(xyz) == (SWEEPS - 2) * 600 * 24 and walls(xyz)[0].max() < 0.003 and len(tile.views) == SWEEPS - 2
-    assert [text.partition(":")[0] for text in told] == [f"2 of 6 {what} are left out" for what in ("sweeps", "photos")]
-    told.clear()
-    tile, _, xyz = cloud_of(imported(**asked, out=tmp_path / "all", keep_unsure=True))
-    assert len(xyz) == SWEEPS * 600 * 24 and walls(xyz)[0].max() > 0.3 and not told
+    assert [text.partition(":")[0] for text in warned] == [
+        f"2 of 6 {what} are left out" for what in ("sweeps", "photos")
+    ]
+    warned.clear()
+    tile, _, xyz = cloud_of(imported(**arguments, out=tmp_path / "all", keep_unsure=True))
+    assert len(xyz) == SWEEPS * 600 * 24 and walls(xyz)[0].max() > 0.3 and not warned
     trajectory_io.write(tmp_path / "lost.csv", Trajectory(drive.times, positions, rotations, ~np.zeros(SWEEPS, bool)))
     with pytest.raises(DataError, match=r"none of 6 sweeps has a sure pose.*--keep-unsure"):
-        imported(**asked, out=tmp_path / "none")
+        imported(**arguments, out=tmp_path / "none")
 
 
 def test_times_come_from_a_file_from_names_or_from_the_order(drive: Drive, tmp_path: Path) -> None:
@@ -245,8 +247,8 @@ def test_times_come_from_a_file_from_names_or_from_the_order(drive: Drive, tmp_p
             (few / name).symlink_to(file)
         return few
 
-    asked = drive.asked | {"out": tmp_path / "tile", "overwrite": True}
-    told: list[str] = []
+    arguments = drive.arguments | {"out": tmp_path / "tile", "overwrite": True}
+    warned: list[str] = []
     (tmp_path / "times.txt").write_text("0.2\n0.4\n")
     for names, extra in (
         (["1.bin", "3.bin"], {}),  # frames' numbers
@@ -254,15 +256,15 @@ def test_times_come_from_a_file_from_names_or_from_the_order(drive: Drive, tmp_p
         (["1700000000200000000.bin", "1700000000400000000.bin"], {"time_offset": -1700000000.0}),
         (["a.bin", "b.bin"], {"times": tmp_path / "times.txt"}),
     ):
-        _, _, xyz = cloud_of(imported(**asked | {"sweeps": given(names), "warn": told.append} | extra))
+        _, _, xyz = cloud_of(imported(**arguments | {"sweeps": given(names), "warn": warned.append} | extra))
         assert len(xyz) == 2 * 600 * 24 and walls(xyz)[0].max() < 0.003, names
-    assert not told
+    assert not warned
     with pytest.raises(InputError, match=r"few: has 2 sweeps for 6 poses.*Give their times"):
-        imported(**asked | {"sweeps": given(["a.bin", "b.bin"])})
+        imported(**arguments | {"sweeps": given(["a.bin", "b.bin"])})
     with pytest.raises(InputError, match=r"camera.csv: spans 0.10 to 0.60 s, the 2 sweeps 70.20 to 70.40 s.*offset"):
-        imported(**asked | {"sweeps": given(["70.2.bin", "70.4.bin"])})
-    imported(**asked | {"sweeps": given(["0.2.bin", "70.4.bin"]), "warn": told.append})
-    assert told == ["1 of 2 sweeps are left out: outside the trajectory's times"]
+        imported(**arguments | {"sweeps": given(["70.2.bin", "70.4.bin"])})
+    imported(**arguments | {"sweeps": given(["0.2.bin", "70.4.bin"]), "warn": warned.append})
+    assert warned == ["1 of 2 sweeps are left out: outside the trajectory's times"]
 
 
 def test_nothing_is_placed_within_a_gap_of_the_trajectory(drive: Drive, tmp_path: Path) -> None:
@@ -270,43 +272,47 @@ def test_nothing_is_placed_within_a_gap_of_the_trajectory(drive: Drive, tmp_path
     late = Trajectory(np.where(t.times > 0.35, t.times + 5, t.times), t.positions, t.rotations)
     trajectory_io.write(tmp_path / "gap.csv", late)
     (tmp_path / "times.txt").write_text("0.1 0.2 0.3 3.0 5.5 5.6".replace(" ", "\n"))
-    told: list[str] = []
-    asked = drive.asked | {"poses": tmp_path / "gap.csv", "times": tmp_path / "times.txt", "warn": told.append}
-    imported(**asked, out=tmp_path / "tile")
-    assert told == ["1 of 6 sweeps are left out: in gaps of the trajectory"]
+    warned: list[str] = []
+    arguments = drive.arguments | {
+        "poses": tmp_path / "gap.csv",
+        "times": tmp_path / "times.txt",
+        "warn": warned.append,
+    }
+    imported(**arguments, out=tmp_path / "tile")
+    assert warned == ["1 of 6 sweeps are left out: in gaps of the trajectory"]
 
 
 def test_a_projected_crs_keeps_its_large_coordinates(tmp_path: Path) -> None:
     shift = np.array([500_000.0, 5_400_000.0, 200.0])
     drive = make(tmp_path, shift=shift)
-    tile, cloud, xyz = cloud_of(imported(**drive.asked, out=tmp_path / "tile", crs="EPSG:32633"))
+    tile, cloud, xyz = cloud_of(imported(**drive.arguments, out=tmp_path / "tile", crs="EPSG:32633"))
     assert tile.frame.crs == "EPSG:32633" and walls(xyz - shift)[0].max() < 0.003 and np.abs(cloud.xyz).max() < 100
 
 
 def test_thinning_keeps_a_point_a_voxel(drive: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = cloud_of(imported(**drive.asked, out=tmp_path / "whole"))[2]
-    thin = cloud_of(imported(**drive.asked, out=tmp_path / "thin", voxel=0.37))[2]
+    whole = cloud_of(imported(**drive.arguments, out=tmp_path / "whole"))[2]
+    thin = cloud_of(imported(**drive.arguments, out=tmp_path / "thin", voxel=0.37))[2]
     monkeypatch.setattr("scan2sim.pipeline.io.sweeps.PENDING", 20_000)  # the same on the way
-    often = cloud_of(imported(**drive.asked, out=tmp_path / "often", voxel=0.37))[2]
+    often = cloud_of(imported(**drive.arguments, out=tmp_path / "often", voxel=0.37))[2]
     origin = np.floor(drive.camera.positions[0])
     cells = [np.unique(np.floor((xyz - origin) / 0.37), axis=0) for xyz in (whole, thin)]
     assert 0.97 * len(cells[0]) < len(thin) < 1.03 * len(cells[0]) < 0.2 * len(whole) and len(often) == len(thin)
 
 
 def test_range_is_bounded(drive: Drive, tmp_path: Path) -> None:
-    asked = drive.asked | {"out": tmp_path / "tile", "overwrite": True}
+    arguments = drive.arguments | {"out": tmp_path / "tile", "overwrite": True}
     with pytest.raises(DataError, match="no points within range"):
-        imported(**asked, max_range=1.5)
-    xyz = cloud_of(imported(**asked, min_range=3.0, max_range=6.0))[2]
+        imported(**arguments, max_range=1.5)
+    xyz = cloud_of(imported(**arguments, min_range=3.0, max_range=6.0))[2]
     away = np.linalg.norm(xyz[:, None] - way(drive.times).positions, axis=2)
     assert 2.99 < away.min(axis=1).max() < 6.01
 
 
 def test_extrinsics_the_wrong_way_round_are_noticed(drive: Drive, tmp_path: Path) -> None:
-    told: list[str] = []
-    wrong = drive.asked | {"extrinsics": np.linalg.inv(T_CAMERA_SCANNER)}
-    imported(**wrong, out=tmp_path / "tile", warn=told.append)
-    assert any("right way round" in text for text in told)
+    warned: list[str] = []
+    wrong = drive.arguments | {"extrinsics": np.linalg.inv(T_CAMERA_SCANNER)}
+    imported(**wrong, out=tmp_path / "tile", warn=warned.append)
+    assert any("right way round" in text for text in warned)
 
 
 @pytest.mark.parametrize("form", ["rows", "three", "velo_to_cam", "odometry"])
@@ -344,7 +350,7 @@ def test_photos_of_kittis_second_camera_stand_beside_the_first(drive: Drive, tmp
     centres = []
     for i, extrinsics in enumerate((None, beside)):
         pictures = Pictures(own, CAMERA, extrinsics=extrinsics)
-        tile = read_tile(imported(**drive.asked, out=tmp_path / str(i), photos=pictures, link=True))
+        tile = read_tile(imported(**drive.arguments, out=tmp_path / str(i), photos=pictures, link=True))
         centres.append((tile.views[0].T_world_cam, tile.views[0].centre))
     moved = centres[0][0][:3, :3].T @ (centres[1][1] - centres[0][1])
     np.testing.assert_allclose(moved, -offset, atol=1e-6)
@@ -392,7 +398,7 @@ def test_a_camera_of_a_file_or_of_numbers(drive: Drive, tmp_path: Path) -> None:
 def garbage(drive: Drive, name: str) -> dict[str, Any]:
     """A drive's arguments with one of its files overwritten."""
     (drive.folder / name).write_bytes(b"nonsense!")
-    return drive.asked | {"photos": drive.pictures}
+    return drive.arguments | {"photos": drive.pictures}
 
 
 @pytest.mark.parametrize(
@@ -402,19 +408,19 @@ def garbage(drive: Drive, name: str) -> dict[str, Any]:
         (lambda d: garbage(d, "sweeps/000009.pcd") | {"times": d.folder / "t7.txt"}, InputError, r"000009\.pcd: is no"),
         (lambda d: garbage(d, "photos/000002.png"), InputError, r"000002\.png: can't be read"),
         (lambda d: garbage(d, "camera.csv"), InputError, r"camera\.csv: is no trajectory"),
-        (lambda d: d.asked | {"poses": d.folder / "flat.csv"}, InputError, r"flat\.csv: knows positions alone"),
-        (lambda d: d.asked | {"sweeps": d.folder / "photos"}, InputError, r"photos: holds no sweeps.*\.bin"),
-        (lambda d: d.asked | {"sweeps": d.folder / "no"}, InputError, r"no: is missing"),
-        (lambda d: d.asked | {"times": d.folder / "t7.txt"}, InputError, r"t7\.txt: has 7 times for 6 sweeps"),
+        (lambda d: d.arguments | {"poses": d.folder / "flat.csv"}, InputError, r"flat\.csv: knows positions alone"),
+        (lambda d: d.arguments | {"sweeps": d.folder / "photos"}, InputError, r"photos: holds no sweeps.*\.bin"),
+        (lambda d: d.arguments | {"sweeps": d.folder / "no"}, InputError, r"no: is missing"),
+        (lambda d: d.arguments | {"times": d.folder / "t7.txt"}, InputError, r"t7\.txt: has 7 times for 6 sweeps"),
         (
-            lambda d: d.asked | {"extrinsics": None, "photos": d.pictures},
+            lambda d: d.arguments | {"extrinsics": None, "photos": d.pictures},
             SettingError,
             "photos need the camera's place",
         ),
-        (lambda d: d.asked | {"crs": "EPSG:4326"}, InputError, "not projected"),
-        (lambda d: d.asked | {"min_range": 60.0}, SettingError, "max_range"),
+        (lambda d: d.arguments | {"crs": "EPSG:4326"}, InputError, "not projected"),
+        (lambda d: d.arguments | {"min_range": 60.0}, SettingError, "max_range"),
         (
-            lambda d: d.asked | {"photos": Pictures(d.folder / "photos", Camera("equirectangular", 64, 32))},
+            lambda d: d.arguments | {"photos": Pictures(d.folder / "photos", Camera("equirectangular", 64, 32))},
             InputError,
             r"000000\.png: is 512x256, but its calibration says 64x32",
         ),

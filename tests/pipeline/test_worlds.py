@@ -114,10 +114,10 @@ def test_nothing_is_done_where_nothing_has_changed(tmp_path: Path) -> None:
     edited = folder / "models/tile0/model.sdf"
     edited.write_text(edited.read_text() + "\n")
     before = _snapshot(folder)
-    told: list[str] = []
-    assemble(tmp_path, "town", row, warn=told.append)
+    warned: list[str] = []
+    assemble(tmp_path, "town", row, warn=warned.append)
     assert _snapshot(folder) == before  # a user's edit stays
-    assert len(told) == 1 and "tile0/model.sdf was changed since it was made" in told[0]
+    assert len(warned) == 1 and "tile0/model.sdf was changed since it was made" in warned[0]
     assemble(tmp_path, "town", row, buffer=5)
     assert _snapshot(folder) != before and _root(folder / "town.sdf").findtext(".//level/buffer") == "5"
     (folder / "models/tile1/meshes/collision.obj").unlink()

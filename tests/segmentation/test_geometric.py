@@ -66,8 +66,10 @@ def street(slope: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
 
 
 def recalls(classification: np.ndarray, truth: np.ndarray) -> dict[str, float]:
-    told, true = (np.array([GROUPS.get(code, "none") for code in codes.tolist()]) for codes in (classification, truth))
-    return {group: float(np.mean(told[true == group] == group)) for group in set(GROUPS.values())}
+    predicted, true = (
+        np.array([GROUPS.get(code, "none") for code in codes.tolist()]) for codes in (classification, truth)
+    )
+    return {group: float(np.mean(predicted[true == group] == group)) for group in set(GROUPS.values())}
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.06])
@@ -77,8 +79,8 @@ def test_a_street_is_told_apart(slope: float) -> None:
     recall = recalls(classification, truth)
     bars = {"ground": 0.98, "building": 0.95, "plant": 0.9, "vehicle": 0.8, "pole": 0.8}
     assert all(recall[group] >= bar for group, bar in bars.items()), recall
-    told = recalls(truth, classification)  # the other way round: precision
-    assert all(told[group] >= 0.8 for group in bars), told
+    predicted = recalls(truth, classification)  # the other way round: precision
+    assert all(predicted[group] >= 0.8 for group in bars), predicted
 
 
 def test_plants_are_classed_by_their_height() -> None:
@@ -147,5 +149,5 @@ def test_an_airborne_survey_agrees_with_its_own_classes(real_data: Path, tmp_pat
     classification, truth = classify(cloud)[known], cloud.classification[known]
     for group, bar in (("ground", 0.97), ("plant", 0.72), ("building", 0.76)):
         codes = [code for code, name in GROUPS.items() if name == group]
-        told, true = np.isin(classification, codes), np.isin(truth, codes)
-        assert (told & true).sum() / (told | true).sum() > bar, group
+        predicted, true = np.isin(classification, codes), np.isin(truth, codes)
+        assert (predicted & true).sum() / (predicted | true).sum() > bar, group

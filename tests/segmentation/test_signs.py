@@ -82,9 +82,9 @@ def _run(folder: Path, plates: list[Plate], known: list[Plate]) -> Done:
     for i, view in enumerate(views):
         rgb, sign = _photo(view, plates)
         image.write(view.photo, rgb)
-        told = np.zeros((*sign.shape, len(CLASSES)), np.uint8)
-        told[..., CLASSES.index("road_sign")] = sign
-        np.save(labels / f"{i}.npy", told)
+        probabilities = np.zeros((*sign.shape, len(CLASSES)), np.uint8)
+        probabilities[..., CLASSES.index("road_sign")] = sign
+        np.save(labels / f"{i}.npy", probabilities)
     views_io.save(folder / "views.json", views, [i == 5 for i in range(len(views))])
     parts = [(primitives.tube([(14.05, -3, 0), (14.05, -3, 3)], [0.04, 0.04], 8), CODE["pole"])]
     parts += [(sheet(plate), CODE["road_sign"]) for plate in known]
@@ -136,9 +136,11 @@ def test_a_sign_is_whole_where_photos_show_it(tmp_path: Path, known: list[Plate]
     assert ((pole - SIGN.centre) @ SIGN.normal).max() < 0  # it stands behind its plate
     assert (mesh.classification == 0).sum() == 1  # what points made before the plate is gone
     (feature,) = json.loads(done.files["geojson"].read_text())["features"]
-    told = feature["properties"]
-    assert told["kind"] == "sign" and told["shape"] == "disc" and told["radius_m"] == 0.04
-    assert told["height_m"] == pytest.approx(3.5, abs=0.03) and told["plate_width_m"] == pytest.approx(0.6, abs=0.03)
+    properties = feature["properties"]
+    assert properties["kind"] == "sign" and properties["shape"] == "disc" and properties["radius_m"] == 0.04
+    assert properties["height_m"] == pytest.approx(3.5, abs=0.03) and properties["plate_width_m"] == pytest.approx(
+        0.6, abs=0.03
+    )
 
 
 def test_where_photos_show_nothing_plates_stay_as_points_tell(tmp_path: Path) -> None:

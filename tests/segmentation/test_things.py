@@ -76,7 +76,7 @@ def go(inputs: dict[str, Path], out: Path, **params: Any) -> Done:
     return THINGS.run(inputs, THINGS.params(**params), out / "out", silent)
 
 
-def told(done: Done, *more: F32) -> dict[str, np.ndarray]:
+def classified(done: Done, *more: F32) -> dict[str, np.ndarray]:
     """Classes of every thing's points."""
     classification = PointCloud.load(done.files["cloud"]).classification
     assert classification is not None
@@ -96,19 +96,19 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> Done:
 
 
 def test_all_of_a_car_goes_though_photos_tell_only_the_half(done: Done) -> None:
-    after = told(done)
+    after = classified(done)
     assert (after["car"] == VEHICLE).mean() > 0.995 and (after["van"] == VEHICLE).mean() > 0.995
 
 
 def test_what_stands_beside_it_stays(done: Done) -> None:
-    after = told(done)
+    after = classified(done)
     assert (after["hedge"] == HEDGE).mean() > 0.97
     assert (after["container"] == BUILDING).all()
     assert (after["ground"] == ROAD).mean() > 0.9999
 
 
 def test_a_fence_is_no_vehicle_whatever_photos_say(done: Done) -> None:
-    assert (told(done)["fence"] != VEHICLE).mean() > 0.95
+    assert (classified(done)["fence"] != VEHICLE).mean() > 0.95
 
 
 def test_boxes_are_listed_where_the_vehicles_are(done: Done) -> None:
@@ -128,7 +128,7 @@ def test_a_car_seen_from_one_side_reaches_behind_it(tmp_path: Path) -> None:
     old = SCENE["car"]
     SCENE["car"] = (near, VEHICLE)
     try:
-        after = told(go(street(tmp_path), tmp_path))
+        after = classified(go(street(tmp_path), tmp_path))
     finally:
         SCENE["car"] = old
     assert (after["car"] == VEHICLE).mean() > 0.98 and (after["hedge"] == HEDGE).mean() > 0.95
@@ -139,7 +139,7 @@ def test_the_middle_of_what_moved_goes(tmp_path: Path) -> None:
     inputs = street(tmp_path, rest=rest)
     PointCloud(FRAME, rest[::2] + np.float32(0.1)).save(tmp_path / "moving.npz")
     done = go(inputs | {"moving": tmp_path / "moving.npz"}, tmp_path)
-    assert (told(done, rest)["0"] == VEHICLE).mean() > 0.95
+    assert (classified(done, rest)["0"] == VEHICLE).mean() > 0.95
 
 
 def test_the_end_of_a_trail_goes_with_it(tmp_path: Path) -> None:
@@ -152,7 +152,7 @@ def test_the_end_of_a_trail_goes_with_it(tmp_path: Path) -> None:
     replace(cloud, time=time).save(inputs["cloud"])
     before = [xyz[xyz[:, 0] < xyz[:, 0].min() + 0.1] - np.array([0.15, 0, 0], np.float32) for xyz in (end, bush)]
     PointCloud(FRAME, np.concatenate(before)).save(tmp_path / "moving.npz")
-    after = told(go(inputs | {"moving": tmp_path / "moving.npz"}, tmp_path), end, bush)
+    after = classified(go(inputs | {"moving": tmp_path / "moving.npz"}, tmp_path), end, bush)
     assert (after["0"] == VEHICLE).mean() > 0.97 and (after["1"] == HEDGE).all()
 
 
@@ -174,7 +174,7 @@ def test_people_are_whole(tmp_path: Path) -> None:
     replace(cloud, classification=classification).save(inputs["cloud"])
     done = go(inputs, tmp_path)
     assert done.facts["people"] == 1
-    assert (told(done, person)["0"][person[:, 2] > 0.25] == CODE["person"]).mean() > 0.98
+    assert (classified(done, person)["0"][person[:, 2] > 0.25] == CODE["person"]).mean() > 0.98
 
 
 def test_a_post_that_is_told_to_be_a_person_in_part_stays(tmp_path: Path) -> None:
@@ -187,7 +187,7 @@ def test_a_post_that_is_told_to_be_a_person_in_part_stays(tmp_path: Path) -> Non
     replace(cloud, classification=classification).save(inputs["cloud"])
     done = go(inputs, tmp_path)
     assert done.facts["people"] == 0
-    assert (told(done, post)["0"] == HEDGE).mean() > 0.95
+    assert (classified(done, post)["0"] == HEDGE).mean() > 0.95
 
 
 def test_without_a_path_nothing_is_looked_at(tmp_path: Path) -> None:

@@ -55,7 +55,7 @@ def test_votes_are_weighted_and_read_between_pixels(name: str, tmp_path: Path) -
     far = np.linalg.norm(local, axis=1)
     cos = np.abs(np.einsum("ij,ij->i", wall - pose[:3, 3], normal)) / far
     weight = (0.2 + 0.8 * cos) / (1 + (far / NEAR) ** 2)
-    told = between(labels, camera, uv)
-    expected = np.where(np.arange(len(CLASSES)) == SKY, 0, weight[:, None] * told)
+    probabilities = between(labels, camera, uv)
+    expected = np.where(np.arange(len(CLASSES)) == SKY, 0, weight[:, None] * probabilities)
     assert np.allclose(found.score[seen], expected[seen], atol=1e-3)
-    assert np.allclose(found.weight[seen], (weight * (1 - told[:, SKY]))[seen], atol=1e-3)
+    assert np.allclose(found.weight[seen], (weight * (1 - probabilities[:, SKY]))[seen], atol=1e-3)

@@ -59,15 +59,15 @@ def test_photos_that_are_right_make_points_right(labelled: tuple[Path, U8], tmp_
     folder, truth = labelled
     (tmp_path / "photos").mkdir()
     (tmp_path / "shape").mkdir()
-    told, beside, done = segment(folder, tmp_path / "photos")
-    found = confusion(truth, told)
+    predicted, beside, done = segment(folder, tmp_path / "photos")
+    found = confusion(truth, predicted)
     print(found.table())
     assert found.mean() > 0.85 and found.iou["road_sign"] > 0.6 and found.iou["road"] > 0.93
     shape, *_ = segment(folder, tmp_path / "shape", photos=False)
     assert found.mean() > confusion(truth, shape).mean() + 0.15
     assert done.facts["sky_share"] < 0.08 and done.facts["seen_share"] > 0.5
     sure, source = beside["confidence"], beside["source"]
-    right = told == truth
+    right = predicted == truth
     assert sure[right].mean() > sure[~right].mean() + 20, "confidence tells right from wrong"
     assert set(np.unique(source)) <= {1, 2} and (right[source == 1].mean()) > right[source == 2].mean()
 
@@ -129,8 +129,8 @@ def test_classes_that_are_there_are_kept_and_photos_not_looked_at(labelled: tupl
 
 def test_ground_codes_and_vehicles_have_their_own_classes(labelled: tuple[Path, U8], tmp_path: Path) -> None:
     folder, _ = labelled
-    told, *_ = segment(folder, tmp_path)
-    assert {CODE[n] for n in ("road", "sidewalk", "terrain", "building", "high_vegetation")} <= set(told.tolist())
+    predicted, *_ = segment(folder, tmp_path)
+    assert {CODE[n] for n in ("road", "sidewalk", "terrain", "building", "high_vegetation")} <= set(predicted.tolist())
 
 
 def test_weights_that_are_no_weights_are_named(tmp_path: Path) -> None:

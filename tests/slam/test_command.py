@@ -63,14 +63,14 @@ def test_it_writes_the_trajectory_in_all_formats_and_says_that_there_is_no_gps(
 
 
 def test_what_was_tracked_is_kept_when_only_its_placing_changes(corridor: Drive, tmp_path: Path) -> None:
-    asked = ("slam", corridor.folder / "video.mp4", "--out", tmp_path, "--set", "track.count=300", "--until", "0.5")
-    command(*asked, "--view")
+    options = ("slam", corridor.folder / "video.mp4", "--out", tmp_path, "--set", "track.count=300", "--until", "0.5")
+    command(*options, "--view")
     first = {path: path.stat().st_mtime_ns for path in tmp_path.glob("steps/track/*/*")}
     assert first and (tmp_path / "view.mp4").is_file()
-    said = command(*asked, "--view", "--local").output
+    said = command(*options, "--view", "--local").output
     assert "1 of 2 results kept" in said.replace("\n", " ")
     assert {path: path.stat().st_mtime_ns for path in tmp_path.glob("steps/track/*/*")} == first
-    command(*asked)
+    command(*options)
     assert not (tmp_path / "view.mp4").exists(), "of an earlier run nothing stays"
 
 

@@ -23,7 +23,7 @@ def sphere(seed: int = 0) -> Callable[[F64], F32]:
     faces = [cv2.GaussianBlur(rng.integers(0, 255, (400, 400), np.uint8), (0, 0), 2.0) for _ in range(6)]
     faces = [cv2.normalize(f, None, 0, 255, cv2.NORM_MINMAX) for f in faces]
 
-    def look(rays: F64) -> F32:
+    def frame_of(rays: F64) -> F32:
         axis = np.abs(rays).argmax(axis=-1)
         out = np.zeros(rays.shape[:-1], np.float32)
         for k in range(3):
@@ -33,7 +33,7 @@ def sphere(seed: int = 0) -> Callable[[F64], F32]:
                 out[at] = map_coordinates(faces[2 * k + s].astype(np.float32), (np.stack([a, b]) + 1) * 199.5, order=1)
         return out
 
-    return look
+    return frame_of
 
 
 def frame(world: Callable[[F64], F32], R: F64) -> U8:

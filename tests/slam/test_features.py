@@ -406,8 +406,11 @@ def test_what_is_told_of_weights(tmp_path: Path) -> None:
 
     file = saved(tmp_path / "superpoint_v1.pth", MODEL)
     backend = features.named("superpoint", file, device="cpu")
-    told = backend.describe()
-    assert hashlib.sha256(file.read_bytes()).hexdigest() in told and "not a file known to the project" in told
-    assert "Magic Leap" in told and "noncommercial" in told
+    description = backend.describe()
+    assert (
+        hashlib.sha256(file.read_bytes()).hexdigest() in description
+        and "not a file known to the project" in description
+    )
+    assert "Magic Leap" in description and "noncommercial" in description
     torch.save({name: value.half() for name, value in random_weights(MODEL, 1).items()}, file)
     assert features.named("superpoint", file, device="cpu").detect(picture()).descriptors.dtype == np.float32

@@ -52,8 +52,8 @@ def rows_of(out: Path) -> dict[tuple[str, str], dict[str, str]]:
 
 def test_cells_are_measured_kept_and_not_run_again(corridor: Drive, drive: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    asked = ("--heights", "128,256", "--bitrates", "1,0.1", "--rates", "10", "--jobs", 2)
-    studied(drive, out, *asked)
+    options = ("--heights", "128,256", "--bitrates", "1,0.1", "--rates", "10", "--jobs", 2)
+    studied(drive, out, *options)
     rows, text = rows_of(out), (out / "table.md").read_text()
     good, poor = rows["128", "1"], rows["128", "0.1"]
     assert not good["reason"] and float(good["global_mean_m"]) < 0.3 and int(good["frames"]) == len(corridor.truth)
@@ -62,16 +62,16 @@ def test_cells_are_measured_kept_and_not_run_again(corridor: Drive, drive: Path,
     assert "segments of 400 m: they are of 10 m" in text and "scale along the way by GPS" in text
     assert "| fps | Mbit/s | global, 128 px | global, 256 px | local, 128 px | local, 256 px |" in text
     line = next(line for line in text.splitlines() if line.startswith("| 10 | 1 |"))
-    told = [f"{float(good[key]):.2f}" for key in ("global_mean_m", "local_median_10_m")]
-    assert line == f"| 10 | 1 | {told[0]} | N/A | {told[1]} | N/A |"
+    errors = [f"{float(good[key]):.2f}" for key in ("global_mean_m", "local_median_10_m")]
+    assert line == f"| 10 | 1 | {errors[0]} | N/A | {errors[1]} | N/A |"
     assert "- the source has only 128 px: 256 px 0.1 Mbit/s 10 fps, 256 px 1 Mbit/s 10 fps" in text
     assert len(rows) == 4 and {rows["256", b]["reason"] for b in ("1", "0.1")} == {"the source has only 128 px"}
     assert cv2.imread(str(out / "plot.png")) is not None
 
-    assert "8 of 8 results kept" in studied(drive, out, *asked) and (out / "table.md").read_text() == text
+    assert "8 of 8 results kept" in studied(drive, out, *options) and (out / "table.md").read_text() == text
     next((out / "steps" / "evaluate.h128_b1_f10").rglob("manifest.json")).unlink()
-    assert "7 of 8 results kept" in studied(drive, out, *asked)
-    assert "2 of 8 results kept" in studied(drive, out, *asked, "--set", "track.count=60"), "videos are kept"
+    assert "7 of 8 results kept" in studied(drive, out, *options)
+    assert "2 of 8 results kept" in studied(drive, out, *options, "--set", "track.count=60"), "videos are kept"
 
 
 def test_a_cell_that_sees_nothing_is_na_with_its_reason(corridor: Drive, drive: Path, tmp_path: Path) -> None:
@@ -134,7 +134,7 @@ def test_a_camera_is_scaled_with_its_frames() -> None:
 
 
 def test_bad_numbers_and_what_is_missing_are_refused(drive: Path, tmp_path: Path) -> None:
-    for asked, message in (
+    for options, message in (
         (("--heights", "127"), "--heights"),
         (("--heights", ""), "--heights"),
         (("--bitrates", "0"), "--bitrates"),
@@ -142,7 +142,7 @@ def test_bad_numbers_and_what_is_missing_are_refused(drive: Path, tmp_path: Path
         (("--set", "track.windows=3"), "track.windows"),
     ):
         with pytest.raises(SettingError, match=message):
-            studied(drive, tmp_path / "out", *asked)
+            studied(drive, tmp_path / "out", *options)
     with pytest.raises(InputError, match="is missing"):
         studied(tmp_path / "no.mp4", tmp_path / "out", "--truth", drive / "truth.csv")
     assert not (tmp_path / "out").exists()

@@ -22,13 +22,13 @@ def test_torch_paints_the_same(street: Street, name: str, band: int) -> None:
         street.add(camera, pose, photograph(camera, pose, gain=1 + 0.1 * i), mask if i == 1 else None)
     street.clouds["terrain"] = points()
     mine, done = street.run(band=band, device="numba")
-    theirs, told = street.run(band=band, device="cpu")
+    theirs, again = street.run(band=band, device="cpu")
     for page in range(done.facts["pages"]):
         a, b = (image.read_rgb(folder / f"page_{page}.png").astype(int) for folder in (mine, theirs))
         seen = [image.read_levels(folder / f"page_{page}_seen.png") for folder in (mine, theirs)]
         assert (seen[0] == seen[1]).mean() > 0.99999
         assert (abs(a - b).max(axis=2) <= 1).mean() > 0.99999
-    assert told.facts["coverage"] == pytest.approx(done.facts["coverage"], abs=1e-4)
+    assert again.facts["coverage"] == pytest.approx(done.facts["coverage"], abs=1e-4)
 
 
 @pytest.mark.parametrize("band", [2, 0, -1])

@@ -55,10 +55,10 @@ def turned(pose: F64, turn: npt.ArrayLike, shift: npt.ArrayLike) -> F64:
 def made(folder: Path, camera: Camera, wrong: list[F64], held: tuple[int, ...] = ()) -> dict[str, Path]:
     """Inputs of the step: photos taken at POSES, said to be taken at `wrong`."""
     views = []
-    for i, (true, told) in enumerate(zip(POSES, wrong, strict=False)):
+    for i, (true, pose) in enumerate(zip(POSES, wrong, strict=False)):
         path = folder / f"{i}.png"
         cv2.imwrite(str(path), marbled(camera, true))
-        views.append(View(f"cam/{i}", camera, told, path, time=float(i)))
+        views.append(View(f"cam/{i}", camera, pose, path, time=float(i)))
     views_io.save(folder / "views.json", views, [i in held for i in range(len(views))])
     GROUND.save(folder / "ground.npz")
     WALLS.save(folder / "walls.npz")

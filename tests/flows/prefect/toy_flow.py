@@ -21,8 +21,8 @@ from tests.flows.prefect.toy_steps import STEPS, planned
 
 def toy_tiles(folder: str, tiles: int, gate: str | None, runner: str, pretend: str | None) -> int:
     """All tiles; returns the sum of what came out."""
-    told = {**versions(), **({"scan2sim": pretend} if pretend else {})}
-    with patch("scan2sim.flows.deployed.tile.versions", lambda: told):
+    pretended = {**versions(), **({"scan2sim": pretend} if pretend else {})}
+    with patch("scan2sim.flows.deployed.tile.versions", lambda: pretended):
         run = by_tasks(runner, 2)
     outcome = run(planned(Path(folder), tiles, Path(gate) if gate else None), Store(Path(folder) / "steps"))
     outcome.check()

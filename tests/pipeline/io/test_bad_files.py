@@ -129,9 +129,9 @@ def test_pipes_and_folders_are_no_files(tmp_path: Path) -> None:
 
 def test_photos_that_are_pipes_or_folders_are_left_out_and_no_digest_waits_for_them(tmp_path: Path) -> None:
     (tmp_path / "folder.jpg").mkdir()
-    for path, told in ((pipe(tmp_path, "pipe.jpg"), "pipe or device"), (tmp_path / "folder.jpg", "is a folder")):
+    for path, cause in ((pipe(tmp_path, "pipe.jpg"), "pipe or device"), (tmp_path / "folder.jpg", "is a folder")):
         assert digest(path) == ("missing" if path.name == "pipe.jpg" else digest(tmp_path / "folder.jpg"))
-        assert told in (_problem(View("1", Camera("pinhole", 64, 48, 50, 50, 31, 23), np.eye(4), path)) or "")
+        assert cause in (_problem(View("1", Camera("pinhole", 64, 48, 50, 50, 31, 23), np.eye(4), path)) or "")
 
 
 @pytest.mark.parametrize(

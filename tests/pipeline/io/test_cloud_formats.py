@@ -416,9 +416,9 @@ def test_columns_are_sniffed_and_what_was_assumed_is_told(tmp_path: Path, lines:
     (tmp_path / "c.txt").write_text(lines)
     assert note in clouds.read_header(tmp_path / "c.txt").notes[0]
     assert clouds.read(tmp_path / "c.txt", Frame()).xyz.tolist() == [[1, 2, 3], [4, 5, 6]]
-    told: list[str] = []
-    import_las([tmp_path / "c.txt"], tmp_path / "tile", crs="local", warn=told.append)
-    assert len(told) == 1 and note in told[0]
+    warned: list[str] = []
+    import_las([tmp_path / "c.txt"], tmp_path / "tile", crs="local", warn=warned.append)
+    assert len(warned) == 1 and note in warned[0]
 
 
 @pytest.mark.parametrize(

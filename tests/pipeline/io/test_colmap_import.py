@@ -254,9 +254,11 @@ def test_real_photos_are_placed_by_their_gps(real_data: Path, tmp_path: Path) ->
     assert best.num_reg_images() >= 15
     (tmp_path / "model").mkdir()
     best.write(tmp_path / "model")
-    told: list[str] = []
-    tile = read_tile(import_model("colmap", tmp_path / "model", images, tmp_path / "tile", gps=True, warn=told.append))
-    assert tile.frame.crs == "EPSG:32633" and "placed by the GPS of" in told[0]
+    warned: list[str] = []
+    tile = read_tile(
+        import_model("colmap", tmp_path / "model", images, tmp_path / "tile", gps=True, warn=warned.append)
+    )
+    assert tile.frame.crs == "EPSG:32633" and "placed by the GPS of" in warned[0]
     poses = np.array([view.T_world_cam for view in tile.views])
     assert -poses[:, 2, 1].mean() > 0.9  # the phone was held upright, which GPS doesn't know
     assert 50 < np.ptp(poses[:, 1, 3]) < 250 and np.ptp(poses[:, 2, 3]) < 15  # a level street of 170 m to the north

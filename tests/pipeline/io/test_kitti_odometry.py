@@ -87,10 +87,10 @@ def test_sweeps_lie_on_each_other_and_photos_show_them(sequence: Path, tmp_path:
 
 def test_the_command_and_poses_of_ones_own(sequence: Path, tmp_path: Path) -> None:
     (tmp_path / "poses" / "31.txt").rename(tmp_path / "mine.txt")
-    asked = ["import", "kitti-odometry", str(sequence), "-o", str(tmp_path / "tile")]
-    refused = CliRunner().invoke(app, asked)
+    options = ["import", "kitti-odometry", str(sequence), "-o", str(tmp_path / "tile")]
+    refused = CliRunner().invoke(app, options)
     assert isinstance(refused.exception, InputError) and "poses.txt" in str(refused.exception)
-    done = CliRunner().invoke(app, [*asked, "--poses", str(tmp_path / "mine.txt")])
+    done = CliRunner().invoke(app, [*options, "--poses", str(tmp_path / "mine.txt")])
     assert done.exit_code == 0 and len(read_tile(tmp_path / "tile").views) == FRAMES
 
 

@@ -58,7 +58,7 @@ def answers(n: int = N) -> tuple[U8, U8, U8]:
     return code, rng.integers(0, 256, n).astype(np.uint8), rng.integers(1, 4, n).astype(np.uint8)
 
 
-def check(source: Path, out: Path, told: tuple[U8, U8, U8]) -> Any:
+def check(source: Path, out: Path, columns: tuple[U8, U8, U8]) -> Any:
     """Compare what both files have, and the classes with what was told; returns the copy."""
     old, new = laspy.read(source), laspy.read(out)
     assert str(new.header.version) == "1.4" and new.header.are_points_compressed
@@ -81,7 +81,7 @@ def check(source: Path, out: Path, told: tuple[U8, U8, U8]) -> Any:
     if "scan_angle_rank" in old.point_format.dimension_names:
         assert np.abs(np.array(new.scan_angle) * 0.006 - old.scan_angle_rank).max() <= 0.003 + 1e-9
         assert np.array_equal(np.array(new.overlap) == 1, np.array(old.classification) == 12)
-    for name, values in zip(("classification", "confidence", "told_from"), told, strict=True):
+    for name, values in zip(("classification", "confidence", "told_from"), columns, strict=True):
         assert np.array_equal(np.array(new[name]), values), name
     extra = list(new.point_format.extra_dimension_names)
     assert len(extra) == len(set(extra)) and extra[-2:] == ["confidence", "told_from"]
@@ -92,9 +92,9 @@ def check(source: Path, out: Path, told: tuple[U8, U8, U8]) -> Any:
 @pytest.mark.parametrize("point_format", range(11))
 def test_everything_but_the_classes_is_kept(tmp_path: Path, point_format: int, suffix: str) -> None:
     source, out = made(tmp_path / f"a{suffix}", point_format), tmp_path / "b.laz"
-    told = answers()
-    write_classified(source, out, *told)
-    new = check(source, out, told)
+    columns = answers()
+    write_classified(source, out, *columns)
+    new = check(source, out, columns)
     assert {64, 69} <= set(np.unique(np.array(new.classification)).tolist())
     assert new.header.parse_crs() == CRS("EPSG:25832") or new.header.parse_crs().to_epsg() == 25832
     assert new.header.global_encoding.wkt
@@ -118,13 +118,13 @@ def test_the_classes_are_named(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("point_format", [1, 7])
 def test_the_pipeline_reads_the_same_cloud(tmp_path: Path, point_format: int) -> None:
-    source, told = made(tmp_path / "a.laz", point_format), answers()
-    write_classified(source, tmp_path / "b.laz", *told)
+    source, columns = made(tmp_path / "a.laz", point_format), answers()
+    write_classified(source, tmp_path / "b.laz", *columns)
     old, new = las.read(source, FRAME), las.read(tmp_path / "b.laz", FRAME)
     assert (
         np.array_equal(old.xyz, new.xyz)
         and new.classification is not None
-        and np.array_equal(new.classification, told[0])
+        and np.array_equal(new.classification, columns[0])
     )
     for name in ("time", "intensity", "rgb"):
         assert np.array_equal(getattr(old, name), getattr(new, name)), name
@@ -132,14 +132,14 @@ def test_the_pipeline_reads_the_same_cloud(tmp_path: Path, point_format: int) ->
 
 
 def test_it_goes_chunk_by_chunk_and_in_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    source, told = made(tmp_path / "a.laz", 3), answers()
+    source, columns = made(tmp_path / "a.laz", 3), answers()
     before = tmp_path / "before.laz"
     before.write_bytes(source.read_bytes())
     monkeypatch.setattr(las_classes, "CHUNK", 300)
-    write_classified(source, source, *told)
-    check(before, source, told)
+    write_classified(source, source, *columns)
+    check(before, source, columns)
     write_classified(source, source, *answers())
-    check(before, source, told)
+    check(before, source, columns)
 
 
 def test_a_file_without_crs(tmp_path: Path) -> None:

@@ -267,16 +267,18 @@ def test_a_cloud_without_a_crs_is_where_the_photos_are(tmp_path: Path) -> None:
     near = np.array([pose[:3, 3] for _, pose in shots()]) + [1.0, 2.0, 0.0]
     for name, points, where in (("model", near, "the model's coordinates"), ("crs", on_earth(near), "the CRS already")):
         np.savetxt(tmp_path / f"{name}.xyz", points, "%.4f")
-        told: list[str] = []
+        warned: list[str] = []
         cloud = tmp_path / f"{name}.xyz"
-        tile = read_tile(import_model("opensfm", path, images(), tmp_path / f"t_{name}", cloud=cloud, warn=told.append))
+        tile = read_tile(
+            import_model("opensfm", path, images(), tmp_path / f"t_{name}", cloud=cloud, warn=warned.append)
+        )
         read_back = clouds.read(tile.clouds[0], tile.frame)
         assert np.abs(tile.frame.to_crs(read_back.xyz) - on_earth(near)).max() < 0.02
-        assert any(where in line for line in told) and not any("units from the photos" in line for line in told)
+        assert any(where in line for line in warned) and not any("units from the photos" in line for line in warned)
     np.savetxt(tmp_path / "far.xyz", near + [90_000.0, 0, 0], "%.4f")
-    told = []
-    import_model("opensfm", path, images(), tmp_path / "t", cloud=tmp_path / "far.xyz", warn=told.append)
-    assert any("units from the photos: are they in the same coordinates?" in line for line in told)
+    warned = []
+    import_model("opensfm", path, images(), tmp_path / "t", cloud=tmp_path / "far.xyz", warn=warned.append)
+    assert any("units from the photos: are they in the same coordinates?" in line for line in warned)
 
 
 def test_metashape_chunks_lie_where_their_transform_says(tmp_path: Path) -> None:
@@ -389,7 +391,7 @@ def test_the_command_makes_a_tile(tmp_path: Path, kind: str) -> None:
     model = WRITERS[kind](tmp_path)
     cloud = tmp_path / "dense.xyz"
     np.savetxt(cloud, np.random.default_rng(0).uniform(0, 9, (50, 3)), "%.3f")
-    asked = [
+    options = [
         "import",
         kind,
         str(model),
@@ -401,7 +403,7 @@ def test_the_command_makes_a_tile(tmp_path: Path, kind: str) -> None:
         "--scale",
         "2",
     ]
-    done = CliRunner().invoke(app, asked)
+    done = CliRunner().invoke(app, options)
     assert done.exit_code == 0, done.output
     tile = read_tile(tmp_path / "t")
     poses = {Path(name).stem: pose for name, pose in shots()}

@@ -38,11 +38,11 @@ def photo(path: Path, place: F64 | None, altitude: bool = True) -> Path:
             degrees, minutes = int(value), int(value * 60 % 60)
             return float(degrees), float(minutes), round(value * 3600 % 60, 4)
 
-        told: dict[int, Any] = {1: "N", 2: angle(lat), 3: "E", 4: angle(lon)}
+        fixes: dict[int, Any] = {1: "N", 2: angle(lat), 3: "E", 4: angle(lon)}
         if altitude:
-            told |= {5: b"\x00", 6: round(float(place[2]), 2)}
-        tags.get_ifd(exif.GPS).update(told)
-        tags[exif.GPS] = told
+            fixes |= {5: b"\x00", 6: round(float(place[2]), 2)}
+        tags.get_ifd(exif.GPS).update(fixes)
+        tags[exif.GPS] = fixes
     Image.new("RGB", (64, 48)).save(path, exif=tags)
     return path
 
@@ -82,9 +82,9 @@ def test_exif_tells_places_and_their_lack(tmp_path: Path) -> None:
 
 def test_a_model_is_placed_in_spite_of_noise_and_wrong_fixes(tmp_path: Path) -> None:
     places, random = circle(40), np.random.default_rng(0)
-    told = places + random.normal(0, 1.5, places.shape)
-    told[[3, 17, 30]] += [120.0, -60.0, 10.0]
-    fit = by_photos(tmp_path, in_model(places), ups(40), photos(tmp_path, told), None)
+    fixes = places + random.normal(0, 1.5, places.shape)
+    fixes[[3, 17, 30]] += [120.0, -60.0, 10.0]
+    fit = by_photos(tmp_path, in_model(places), ups(40), photos(tmp_path, fixes), None)
     assert fit.crs == CRS and len(fit.used) == 37 and not {3, 17, 30} & set(fit.used)
     assert 1.5 < present(fit.rms) < 3.5  # 1.5 m in each of three directions
     assert np.abs(fit.onto.apply(in_model(places)) - places).max() < 2.0
@@ -100,15 +100,15 @@ def test_exact_gps_places_exactly(tmp_path: Path) -> None:
 
 def test_a_crs_in_feet_is_placed_in_feet(tmp_path: Path) -> None:
     feet = "+proj=utm +zone=33 +datum=WGS84 +units=us-ft +type=crs"
-    told = circle() + np.random.default_rng(0).normal(0, 1.5, (16, 3))
-    fit = by_photos(tmp_path, in_model(circle()), ups(16), photos(tmp_path, told), feet)
+    fixes = circle() + np.random.default_rng(0).normal(0, 1.5, (16, 3))
+    fit = by_photos(tmp_path, in_model(circle()), ups(16), photos(tmp_path, fixes), feet)
     assert np.abs(fit.onto.apply(in_model(circle())) * 1200 / 3937 - circle()).max() < 3
     assert len(fit.used) == 16 and fit.rms is not None and fit.rms < 3.5
 
 
 def test_on_a_straight_track_the_photos_own_up_tells_the_roll(tmp_path: Path) -> None:
-    told = line() + np.random.default_rng(0).normal(0, 1, (16, 3))
-    fit = by_photos(tmp_path, in_model(line()), ups(16), photos(tmp_path, told), CRS)
+    fixes = line() + np.random.default_rng(0).normal(0, 1, (16, 3))
+    fit = by_photos(tmp_path, in_model(line()), ups(16), photos(tmp_path, fixes), CRS)
     up = fit.onto.rotation @ TURN.apply([0.0, 0.0, 1.0])
     assert np.degrees(np.arccos(up[2])) < 3
     assert "GPS can't tell the roll" in fit.notes[1]
@@ -123,9 +123,9 @@ def test_on_a_straight_track_the_photos_own_up_tells_the_roll(tmp_path: Path) ->
     ],
 )
 def test_a_track_that_tells_too_little_is_refused(tmp_path: Path, places: F64, noise: float, cause: str) -> None:
-    told = places + np.random.default_rng(0).normal(0, 1, places.shape) * noise
+    fixes = places + np.random.default_rng(0).normal(0, 1, places.shape) * noise
     with pytest.raises(DataError, match=cause):
-        by_photos(tmp_path, in_model(places), ups(len(places)), photos(tmp_path, told), CRS)
+        by_photos(tmp_path, in_model(places), ups(len(places)), photos(tmp_path, fixes), CRS)
 
 
 def test_photos_without_altitudes_are_told(tmp_path: Path) -> None:
@@ -138,24 +138,24 @@ def test_the_command_places_model_and_cloud(tmp_path: Path) -> None:
     places = circle()
     photos(tmp_path / "images", places)
     photo(tmp_path / "images" / "none.jpg", None)
-    look = Rotation.from_matrix([[1, 0, 0], [0, 0, 1], [0, -1, 0]])  # ahead is north: x east, y down
+    axes = Rotation.from_matrix([[1, 0, 0], [0, 0, 1], [0, -1, 0]])  # ahead is north: x east, y down
     shots = {}
     for i, centre in enumerate(in_model(places)):
-        turn = (TURN * look).inv()
+        turn = (TURN * axes).inv()
         pose = {"rotation": turn.as_rotvec().tolist(), "translation": (-turn.apply(centre)).tolist()}
         shots[f"{i:03d}.jpg"] = {**pose, "camera": "c"}
     camera = {"projection_type": "perspective", "width": 64, "height": 48, "focal": 0.9}
     (tmp_path / "reconstruction.json").write_text(json.dumps([{"cameras": {"c": camera}, "shots": shots}]))
     points = places + [2.0, 3.0, 1.0]
     np.savetxt(tmp_path / "dense.xyz", in_model(points), "%.6f")
-    asked = [str(tmp_path / "reconstruction.json"), str(tmp_path / "images"), "-o", str(tmp_path / "t")]
-    asked += ["--cloud", str(tmp_path / "dense.xyz"), "--gps"]
-    done = CliRunner().invoke(app, ["import", "opensfm", *asked])
+    options = [str(tmp_path / "reconstruction.json"), str(tmp_path / "images"), "-o", str(tmp_path / "t")]
+    options += ["--cloud", str(tmp_path / "dense.xyz"), "--gps"]
+    done = CliRunner().invoke(app, ["import", "opensfm", *options])
     assert done.exit_code == 0 and "placed by the GPS of 16 of 16 photos" in done.output.replace("\n", " ")
     tile = read_tile(tmp_path / "t")
     assert tile.frame.crs == CRS
     assert np.abs(np.array([tile.frame.to_crs(v.centre) for v in tile.views]) - places).max() < 0.03
-    assert all(np.allclose(v.T_world_cam[:3, :3], look.as_matrix(), atol=2e-3) for v in tile.views)
+    assert all(np.allclose(v.T_world_cam[:3, :3], axes.as_matrix(), atol=2e-3) for v in tile.views)
     cloud = clouds.read(tile.clouds[0], tile.frame)
     assert np.abs(tile.frame.to_crs(cloud.xyz) - points).max() < 0.03
     with pytest.raises(SettingError, match="GPS tells them"):

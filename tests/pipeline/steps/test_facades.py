@@ -161,8 +161,8 @@ def test_a_window_that_rays_went_through_stays_open(tmp_path: Path) -> None:
     xyz, time = scanned(x, 9.0, z)  # a room's back wall: what of it is seen through the window
     from_ = PATH.at(time)
     share = (WALL - from_[:, 1]) / (xyz[:, 1] - from_[:, 1])
-    met = from_ + share[:, None] * (xyz - from_)
-    seen = (met[:, 0] > hole[0]) & (met[:, 0] < hole[2]) & (met[:, 2] > hole[1]) & (met[:, 2] < hole[3])
+    hit = from_ + share[:, None] * (xyz - from_)
+    seen = (hit[:, 0] > hole[0]) & (hit[:, 0] < hole[2]) & (hit[:, 2] > hole[1]) & (hit[:, 2] < hole[3])
     made, _ = built(tmp_path, wall(1.9, hole), Scene(1.9), (xyz[seen], time[seen]))
     inside = (made.xyz[:, 0] > 5.15) & (made.xyz[:, 0] < 5.45) & (made.xyz[:, 2] > 0.65) & (made.xyz[:, 2] < 0.95)
     assert not inside.any()
@@ -176,8 +176,8 @@ def test_the_uppermost_rays_of_a_tilted_scanner_are_found() -> None:
     elevation = limit - random.exponential(0.05, len(azimuth))
     level = random.uniform(5, 30, len(azimuth))
     ends = np.column_stack([level * np.cos(azimuth), level * np.sin(azimuth), level * np.tan(elevation)])
-    told = np.degrees(Rays.of(np.zeros_like(ends), ends.astype(np.float32)).limit)
-    assert told == pytest.approx([2.0, 3 * np.cos(1.0), 3 * np.sin(1.0)], abs=0.35)
+    limits = np.degrees(Rays.of(np.zeros_like(ends), ends.astype(np.float32)).limit)
+    assert limits == pytest.approx([2.0, 3 * np.cos(1.0), 3 * np.sin(1.0)], abs=0.35)
 
 
 def test_only_streets_with_rays_and_photos_have_the_step() -> None:

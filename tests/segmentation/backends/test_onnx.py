@@ -52,8 +52,8 @@ def write(
     graph = helper.make_graph(nodes, "net", takes, gives, [numpy_helper.from_array(weights, "weights")])
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
     text = labels if isinstance(labels, str) else json.dumps(labels)
-    told = {**({} if labels is None else {"labels": text}), **meta}
-    helper.set_model_props(model, told)
+    metadata = {**({} if labels is None else {"labels": text}), **meta}
+    helper.set_model_props(model, metadata)
     onnx.save(model, path)
     return path
 
@@ -69,7 +69,7 @@ def reference(rgb: np.ndarray, mean: np.ndarray = MEAN, std: np.ndarray = STD) -
     return np.asarray(powers / powers.sum(axis=0))
 
 
-def told_of(path: Path) -> InputError:
+def error_of(path: Path) -> InputError:
     """The one error of a file that can't be used, which tells what to do."""
     with pytest.raises(InputError) as caught:
         load("onnx", path, "cpu")
@@ -114,7 +114,7 @@ def test_photos_are_normalised_as_the_file_tells(tmp_path: Path) -> None:
     assert np.abs(load("onnx", path, "cpu").probabilities(photo()) - expected).max() < 1e-4
     wrongs: tuple[dict[str, Any], ...] = ({"std": "[1, 0, 1]"}, {"mean": "[1, 1]"}, {"mean": "grey"}, {"std": "null"})
     for wrong in wrongs:
-        assert "to normalise photos with" in told_of(write(path, **wrong)).cause
+        assert "to normalise photos with" in error_of(write(path, **wrong)).cause
 
 
 def test_labels_may_lie_beside_the_file(tmp_path: Path) -> None:
@@ -122,25 +122,25 @@ def test_labels_may_lie_beside_the_file(tmp_path: Path) -> None:
     (tmp_path / "net.labels.txt").write_text("\ufeffroad\r\nbuilding\r\n\nsky \ncar\n", "utf-8")
     assert load("onnx", path, "cpu").facts.labels == tuple(LABELS)
     (tmp_path / "net.labels.txt").write_bytes(b"\xff\xfe\x80")
-    assert told_of(path).where == str(tmp_path / "net.labels.txt")
+    assert error_of(path).where == str(tmp_path / "net.labels.txt")
     for too_few in ("", "road\nsky\n"):
         (tmp_path / "net.labels.txt").write_text(too_few)
-        assert "label" in told_of(path).cause
+        assert "label" in error_of(path).cause
     (tmp_path / "net.labels.txt").unlink()
-    error = told_of(path)
+    error = error_of(path)
     assert error.where == str(path) and "doesn't name its labels" in error.cause and "net.labels.txt" in error.remedy
 
 
 @pytest.mark.parametrize("labels", [{"0": "road"}, "road, sky", '"road"', [1, 2, 3, 4], 4])
 def test_labels_that_are_no_names_are_refused(tmp_path: Path, labels: object) -> None:
-    assert "no list of names" in told_of(write(tmp_path / "net.onnx", labels=labels)).cause
+    assert "no list of names" in error_of(write(tmp_path / "net.onnx", labels=labels)).cause
 
 
 def test_weights_must_be_given_and_be_there(tmp_path: Path) -> None:
     with pytest.raises(SettingError, match=r"label\.weights"):
         load("onnx", None, "cpu")
-    assert "is no file" in told_of(tmp_path / "none.onnx").cause
-    assert "is no file" in told_of(tmp_path).cause
+    assert "is no file" in error_of(tmp_path / "none.onnx").cause
+    assert "is no file" in error_of(tmp_path).cause
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9, 0.999])
@@ -148,7 +148,7 @@ def test_half_a_file_is_refused(tmp_path: Path, share: float) -> None:
     path = write(tmp_path / "net.onnx")
     whole = path.read_bytes()
     path.write_bytes(whole[: int(len(whole) * share)])
-    error = told_of(path)
+    error = error_of(path)
     assert error.where == str(path)
 
 
@@ -161,7 +161,7 @@ def test_large_weights_beside_the_file_count(tmp_path: Path) -> None:
     both = path.read_bytes() + (tmp_path / "net.onnx.data").read_bytes()
     assert network.facts.sha256 == hashlib.sha256(both).hexdigest()
     (tmp_path / "net.onnx.data").unlink()
-    assert "can't be loaded" in told_of(path).cause
+    assert "can't be loaded" in error_of(path).cause
 
 
 @pytest.mark.parametrize(
@@ -174,7 +174,7 @@ def test_large_weights_beside_the_file_count(tmp_path: Path) -> None:
     ],
 )
 def test_other_networks_are_refused(tmp_path: Path, how: dict[str, Any], said: str) -> None:
-    error = told_of(write(tmp_path / "net.onnx", **how))
+    error = error_of(write(tmp_path / "net.onnx", **how))
     assert error.where == str(tmp_path / "net.onnx") and said in error.cause
 
 
@@ -201,7 +201,7 @@ def test_numbers_of_another_kind_are_refused(tmp_path: Path, node: str, takes: i
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
     onnx.save(model, tmp_path / "net.onnx")
-    assert said in told_of(tmp_path / "net.onnx").cause
+    assert said in error_of(tmp_path / "net.onnx").cause
 
 
 def test_a_photo_that_it_cannot_take_is_told(tmp_path: Path) -> None:

@@ -60,11 +60,11 @@ def reference(rgb: np.ndarray, mean: Any = (0.485, 0.456, 0.406), std: Any = (0.
 
 
 def change(file: Path, **changes: object) -> None:
-    told = json.loads(file.read_text())
-    file.write_text(json.dumps({key: value for key, value in {**told, **changes}.items() if value is not None}))
+    config = json.loads(file.read_text())
+    file.write_text(json.dumps({key: value for key, value in {**config, **changes}.items() if value is not None}))
 
 
-def told_of(path: Path) -> InputError:
+def error_of(path: Path) -> InputError:
     """The one error of a file that can't be used, which tells what to do."""
     with pytest.raises(InputError) as caught:
         load("segformer", path, "cpu")
@@ -119,16 +119,16 @@ def test_a_single_file_beside_its_config_will_do(folder: Path, kind: str) -> Non
 
 
 def test_photos_are_normalised_as_the_folder_tells(folder: Path) -> None:
-    told = {"image_mean": [0.5, 0.4, 0.3], "image_std": [0.2, 0.3, 0.4], "do_normalize": True}
-    (folder / "preprocessor_config.json").write_text(json.dumps(told))
+    config = {"image_mean": [0.5, 0.4, 0.3], "image_std": [0.2, 0.3, 0.4], "do_normalize": True}
+    (folder / "preprocessor_config.json").write_text(json.dumps(config))
     found = load("segformer", folder, "cpu").probabilities(photo())
-    assert np.abs(found - reference(photo(), told["image_mean"], told["image_std"])).max() < 1e-4
+    assert np.abs(found - reference(photo(), config["image_mean"], config["image_std"])).max() < 1e-4
     change(folder / "preprocessor_config.json", do_normalize=False)
     found = load("segformer", folder, "cpu").probabilities(photo())
     assert np.abs(found - reference(photo(), (0, 0, 0), (1, 1, 1))).max() < 1e-4
     for wrong in ([0.5, 0.4], "grey", [1, 1, 0], None):
         (folder / "preprocessor_config.json").write_text(json.dumps({"image_std": wrong}))
-        assert told_of(folder).where.endswith("preprocessor_config.json")
+        assert error_of(folder).where.endswith("preprocessor_config.json")
 
 
 def test_narrow_photos_are_looked_at_too(folder: Path) -> None:
@@ -154,11 +154,11 @@ def test_the_licence_is_told_on(folder: Path, readme: str | None, licence: str) 
 def test_weights_must_be_given_and_be_there(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(SettingError, match=r"label\.weights"):
         load("segformer", None, "cpu")
-    assert "nothing is downloaded" in told_of(Path("nvidia/segformer-b0-finetuned-cityscapes-1024-1024")).remedy
+    assert "nothing is downloaded" in error_of(Path("nvidia/segformer-b0-finetuned-cityscapes-1024-1024")).remedy
     (tmp_path / "empty").mkdir()
-    assert "has no model.safetensors" in told_of(tmp_path / "empty").cause
+    assert "has no model.safetensors" in error_of(tmp_path / "empty").cause
     (folder / "config.json").unlink()
-    assert told_of(folder).where == str(folder / "config.json")
+    assert error_of(folder).where == str(folder / "config.json")
 
 
 @pytest.mark.parametrize("share", [0.0, 0.001, 0.5, 0.999])
@@ -169,7 +169,7 @@ def test_half_a_file_is_refused(folder: Path, name: str, share: float) -> None:
         torch.save(tiny().state_dict(), folder / name, _use_new_zipfile_serialization=name != "old.bin")
     whole = (folder / name).read_bytes()
     (folder / name).write_bytes(whole[: int(len(whole) * share)])
-    error = told_of(folder / name)
+    error = error_of(folder / name)
     assert error.where == str(folder / name) and "tensors" in error.cause
 
 
@@ -193,7 +193,7 @@ def test_code_in_a_pickle_is_not_run(folder: Path, tmp_path: Path, way: str) -> 
         file.write_bytes(pickle.dumps({"trap": Trap(made)}, 2 if way == "pickle" else 4))
     else:
         torch.save(held, file, _use_new_zipfile_serialization=way == "torch")
-    error = told_of(folder)
+    error = error_of(folder)
     assert not made.exists()
     assert error.where == str(file) and "safetensors" in error.remedy
     said = "tensors alone" if way == "new pickle" else "holds code or objects besides tensors; not run (posix.mkdir)"
@@ -206,7 +206,7 @@ def test_code_in_a_pickle_is_not_run(folder: Path, tmp_path: Path, way: str) -> 
 @pytest.mark.parametrize("held", [{"epoch": 3}, [1, 2], {"state_dict": {"a": 1}}])
 def test_a_pickle_of_something_else_is_refused(folder: Path, held: object) -> None:
     torch.save(held, folder / "other.bin")
-    assert "holds no tensors by name" in told_of(folder / "other.bin").cause
+    assert "holds no tensors by name" in error_of(folder / "other.bin").cause
 
 
 @pytest.mark.parametrize(
@@ -220,7 +220,7 @@ def test_a_pickle_of_something_else_is_refused(folder: Path, held: object) -> No
 )
 def test_another_architecture_is_named(folder: Path, changes: dict[str, object], said: str) -> None:
     change(folder / "config.json", **changes)
-    error = told_of(folder)
+    error = error_of(folder)
     assert error.where == str(folder / "config.json")
     assert said in error.cause and "SegformerForSemanticSegmentation" in error.cause
 
@@ -228,13 +228,13 @@ def test_another_architecture_is_named(folder: Path, changes: dict[str, object],
 @pytest.mark.parametrize("text", ["", "{", "[1]", '"segformer"'])
 def test_a_config_that_is_none_is_refused(folder: Path, text: str) -> None:
     (folder / "config.json").write_text(text)
-    assert told_of(folder).where == str(folder / "config.json")
+    assert error_of(folder).where == str(folder / "config.json")
 
 
 @pytest.mark.parametrize("labels", [None, {}, ["road"], {"0": "road", "2": "sky"}, {"a": "road"}])
 def test_every_channel_needs_a_label(folder: Path, labels: object) -> None:
     change(folder / "config.json", id2label=labels)
-    error = told_of(folder)
+    error = error_of(folder)
     assert error.where == str(folder / "config.json") and "id2label" in error.cause
 
 
@@ -254,7 +254,7 @@ def test_every_channel_needs_a_label(folder: Path, labels: object) -> None:
 )
 def test_weights_of_another_shape_are_refused(folder: Path, changes: dict[str, object]) -> None:
     change(folder / "config.json", **changes)
-    error = told_of(folder)
+    error = error_of(folder)
     assert error.where == str(folder / "model.safetensors") and "doesn't fit" in error.cause
 
 
@@ -277,7 +277,7 @@ def test_nothing_is_asked_of_the_net(folder: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(socket.socket, "connect", connect)
     monkeypatch.setattr(socket, "getaddrinfo", connect)
     load("segformer", folder, "cpu")
-    told_of(Path("nvidia/segformer-b0-finetuned-cityscapes-1024-1024"))
+    error_of(Path("nvidia/segformer-b0-finetuned-cityscapes-1024-1024"))
 
 
 def test_too_little_memory_on_the_device_is_told(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -70,12 +70,12 @@ def test_onnxruntime_and_torch_tell_the_same_classes(weights: Path, own: bool) -
 
 def test_classes_do_not_depend_on_the_number_of_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     photo = np.random.default_rng(0).integers(0, 255, (256, 320, 7), np.uint8)
-    told = []
+    predicted = []
     for cores in ("1", "2", "3"):
         monkeypatch.setenv("OMP_NUM_THREADS", cores)
-        told.append(load("street", None, "cpu").probabilities(photo))
-    np.testing.assert_array_equal(told[0], told[1])
-    np.testing.assert_array_equal(told[0], told[2])
+        predicted.append(load("street", None, "cpu").probabilities(photo))
+    np.testing.assert_array_equal(predicted[0], predicted[1])
+    np.testing.assert_array_equal(predicted[0], predicted[2])
 
 
 def test_a_damaged_network_is_named(weights: Path, tmp_path: Path) -> None:
@@ -94,8 +94,8 @@ def test_weights_of_another_network_are_named(tmp_path: Path) -> None:
     safetensors.save_file({"x": torch.zeros(3)}, tmp_path / "a.safetensors", {"network": "UNet", "labels": "[]"})
     with pytest.raises(InputError, match=r"UNet, not StreetNet"):
         load("street", tmp_path / "a.safetensors", "cpu")
-    told = {"network": "StreetNet", "labels": json.dumps(CLASSES)}
-    safetensors.save_file({"x": torch.zeros(3)}, tmp_path / "b.safetensors", told)
+    predicted = {"network": "StreetNet", "labels": json.dumps(CLASSES)}
+    safetensors.save_file({"x": torch.zeros(3)}, tmp_path / "b.safetensors", predicted)
     with pytest.raises(InputError, match="lacks weights"):
         load("street", tmp_path / "b.safetensors", "cpu")
 
