@@ -95,12 +95,12 @@ def test_steps_of_a_drive_are_done_again_by_newer_code_and_of_other_files(
 def test_a_drive_is_planned_like_a_tile(corridor: Path, tmp_path: Path) -> None:
     place = drive(tmp_path, 'corridor = "corridor"\n[tiles]\nlength = 6.0\nbuffer = 1.0\n')
 
-    def message() -> str:
+    def printed() -> str:
         return CliRunner().invoke(app, ["plan", str(place), "--out", str(tmp_path / "out")]).output
 
-    assert re.search(r"cut +yes +it was never run", message())
+    assert re.search(r"cut +yes +it was never run", printed())
     survey_of(place, tmp_path / "out")
-    assert re.search(r"cut +no +kept", message())
+    assert re.search(r"cut +no +kept", printed())
 
 
 def test_a_survey_is_itself(corridor: Path, tmp_path: Path) -> None:

@@ -136,11 +136,9 @@ def test_a_sign_is_whole_where_photos_show_it(tmp_path: Path, known: list[Plate]
     assert ((pole - SIGN.centre) @ SIGN.normal).max() < 0  # it stands behind its plate
     assert (mesh.classification == 0).sum() == 1  # what points made before the plate is gone
     (feature,) = json.loads(done.files["geojson"].read_text())["features"]
-    properties = feature["properties"]
-    assert properties["kind"] == "sign" and properties["shape"] == "disc" and properties["radius_m"] == 0.04
-    assert properties["height_m"] == pytest.approx(3.5, abs=0.03) and properties["plate_width_m"] == pytest.approx(
-        0.6, abs=0.03
-    )
+    row = feature["properties"]
+    assert row["kind"] == "sign" and row["shape"] == "disc" and row["radius_m"] == 0.04
+    assert row["height_m"] == pytest.approx(3.5, abs=0.03) and row["plate_width_m"] == pytest.approx(0.6, abs=0.03)
 
 
 def test_where_photos_show_nothing_plates_stay_as_points_tell(tmp_path: Path) -> None:
