@@ -111,7 +111,7 @@ def test_a_survey_is_itself(corridor: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("", "neither or both"),
         ('corridor = "a"\n[sweeps]\nfolder = "b"\nposes = "c"', "neither or both"),
