@@ -220,16 +220,16 @@ def test_what_is_unsure_is_left_out_and_told(drive: Drive, tmp_path: Path) -> No
     unsure[2:4] = True
     rotations = drive.camera.rotations
     trajectory_io.write(tmp_path / "lost.csv", Trajectory(drive.times, positions, rotations, unsure))
-    warned: list[str] = []
-    arguments = drive.arguments | {"poses": tmp_path / "lost.csv", "photos": drive.pictures, "warn": warned.append}
+    notes: list[str] = []
+    arguments = drive.arguments | {"poses": tmp_path / "lost.csv", "photos": drive.pictures, "warn": notes.append}
     tile, _, xyz = cloud_of(imported(**arguments, out=tmp_path / "tile"))
     assert len(xyz) == (SWEEPS - 2) * 600 * 24 and walls(xyz)[0].max() < 0.003 and len(tile.views) == SWEEPS - 2
-    assert [text.partition(":")[0] for text in warned] == [
+    assert [text.partition(":")[0] for text in notes] == [
         f"2 of 6 {what} are left out" for what in ("sweeps", "photos")
     ]
-    warned.clear()
+    notes.clear()
     tile, _, xyz = cloud_of(imported(**arguments, out=tmp_path / "all", keep_unsure=True))
-    assert len(xyz) == SWEEPS * 600 * 24 and walls(xyz)[0].max() > 0.3 and not warned
+    assert len(xyz) == SWEEPS * 600 * 24 and walls(xyz)[0].max() > 0.3 and not notes
     trajectory_io.write(tmp_path / "lost.csv", Trajectory(drive.times, positions, rotations, ~np.zeros(SWEEPS, bool)))
     with pytest.raises(DataError, match=r"none of 6 sweeps has a sure pose.*--keep-unsure"):
         imported(**arguments, out=tmp_path / "none")
@@ -248,7 +248,7 @@ def test_times_come_from_a_file_from_names_or_from_the_order(drive: Drive, tmp_p
         return few
 
     arguments = drive.arguments | {"out": tmp_path / "tile", "overwrite": True}
-    warned: list[str] = []
+    notes: list[str] = []
     (tmp_path / "times.txt").write_text("0.2\n0.4\n")
     for names, extra in (
         (["1.bin", "3.bin"], {}),  # frames' numbers
@@ -256,15 +256,15 @@ def test_times_come_from_a_file_from_names_or_from_the_order(drive: Drive, tmp_p
         (["1700000000200000000.bin", "1700000000400000000.bin"], {"time_offset": -1700000000.0}),
         (["a.bin", "b.bin"], {"times": tmp_path / "times.txt"}),
     ):
-        _, _, xyz = cloud_of(imported(**arguments | {"sweeps": given(names), "warn": warned.append} | extra))
+        _, _, xyz = cloud_of(imported(**arguments | {"sweeps": given(names), "warn": notes.append} | extra))
         assert len(xyz) == 2 * 600 * 24 and walls(xyz)[0].max() < 0.003, names
-    assert not warned
+    assert not notes
     with pytest.raises(InputError, match=r"few: has 2 sweeps for 6 poses.*Give their times"):
         imported(**arguments | {"sweeps": given(["a.bin", "b.bin"])})
     with pytest.raises(InputError, match=r"camera.csv: spans 0.10 to 0.60 s, the 2 sweeps 70.20 to 70.40 s.*offset"):
         imported(**arguments | {"sweeps": given(["70.2.bin", "70.4.bin"])})
-    imported(**arguments | {"sweeps": given(["0.2.bin", "70.4.bin"]), "warn": warned.append})
-    assert warned == ["1 of 2 sweeps are left out: outside the trajectory's times"]
+    imported(**arguments | {"sweeps": given(["0.2.bin", "70.4.bin"]), "warn": notes.append})
+    assert notes == ["1 of 2 sweeps are left out: outside the trajectory's times"]
 
 
 def test_nothing_is_placed_within_a_gap_of_the_trajectory(drive: Drive, tmp_path: Path) -> None:
@@ -272,14 +272,14 @@ def test_nothing_is_placed_within_a_gap_of_the_trajectory(drive: Drive, tmp_path
     late = Trajectory(np.where(t.times > 0.35, t.times + 5, t.times), t.positions, t.rotations)
     trajectory_io.write(tmp_path / "gap.csv", late)
     (tmp_path / "times.txt").write_text("0.1 0.2 0.3 3.0 5.5 5.6".replace(" ", "\n"))
-    warned: list[str] = []
+    notes: list[str] = []
     arguments = drive.arguments | {
         "poses": tmp_path / "gap.csv",
         "times": tmp_path / "times.txt",
-        "warn": warned.append,
+        "warn": notes.append,
     }
     imported(**arguments, out=tmp_path / "tile")
-    assert warned == ["1 of 6 sweeps are left out: in gaps of the trajectory"]
+    assert notes == ["1 of 6 sweeps are left out: in gaps of the trajectory"]
 
 
 def test_a_projected_crs_keeps_its_large_coordinates(tmp_path: Path) -> None:
@@ -309,10 +309,10 @@ def test_range_is_bounded(drive: Drive, tmp_path: Path) -> None:
 
 
 def test_extrinsics_the_wrong_way_round_are_noticed(drive: Drive, tmp_path: Path) -> None:
-    warned: list[str] = []
+    notes: list[str] = []
     wrong = drive.arguments | {"extrinsics": np.linalg.inv(T_CAMERA_SCANNER)}
-    imported(**wrong, out=tmp_path / "tile", warn=warned.append)
-    assert any("right way round" in text for text in warned)
+    imported(**wrong, out=tmp_path / "tile", warn=notes.append)
+    assert any("right way round" in text for text in notes)
 
 
 @pytest.mark.parametrize("form", ["rows", "three", "velo_to_cam", "odometry"])
