@@ -8,8 +8,9 @@ from typing import Any
 from scan2sim.flows.commands.app import App
 from scan2sim.flows.commands.display import console
 from scan2sim.flows.commands.options import options
+from scan2sim.services.monitoring.joined import AlarmsParams, ScaleParams
 from scan2sim.services.monitoring.traffic import TrafficParams
-from scan2sim.services.monitoring.watched import DatasetParams, ListenerParams, TalkerParams, TopicParams
+from scan2sim.services.monitoring.watched import DatasetParams, ListenerParams, TalkerParams, TopicParams, WorkParams
 
 app = App("The event bus: topics of ROS 2 watched, and what goes through them told.")
 
@@ -21,6 +22,8 @@ NODE_OPTIONS = {
     "prometheus_port": "--metrics",
 }
 """Names of `Watched`'s fields on the command line, where they are shorter there."""
+
+BUS_OPTIONS = {"kafka_bootstrap_servers": "--kafka", "log_file": "--log"}
 
 
 @app.command("topic")
@@ -73,6 +76,36 @@ def monitor_traffic(params: TrafficParams) -> None:
 
     count = write(params)
     console.print(f"{count} events of {params.cameras} cameras in {params.out}", highlight=False, markup=False)
+
+
+@app.command("work")
+@options(WorkParams, command="WORKER", **NODE_OPTIONS)
+def monitor_work(params: WorkParams) -> None:
+    """Have a topic's events worked on by local processes, as many as are asked for on the bus."""
+    from scan2sim.services.monitoring.work import Work
+
+    _spin(lambda: Work(params))
+
+
+@app.command("scale")
+@options(ScaleParams, **BUS_OPTIONS)
+def monitor_scale(params: ScaleParams) -> None:
+    """Ask for as many workers as the queues that are told of on the bus need."""
+    from scan2sim.services.monitoring.scaler import ScalerNode
+
+    _spin(lambda: ScalerNode(params))
+
+
+@app.command("alarms")
+@options(AlarmsParams, **BUS_OPTIONS)
+def monitor_alarms(params: AlarmsParams) -> None:
+    """Hold rules against what monitors tell: alarms go to the bus and to the console."""
+    from scan2sim.services.monitoring.alarms import AlarmsNode
+
+    def tell(alarm: Any) -> None:
+        console.print(f"{alarm.state} {alarm.rule}: {alarm.subject}, {alarm.value:.4g}", highlight=False, markup=False)
+
+    _spin(lambda: AlarmsNode(params, tell))
 
 
 def _spin(made: Callable[[], Any], finished: Callable[[Any], bool] = lambda _: False) -> None:

@@ -6,8 +6,9 @@ import math
 from collections import deque
 from typing import Annotated
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
+from scan2sim.pipeline.errors import SettingError
 from scan2sim.pipeline.step import Params
 from scan2sim.services.monitoring.forecast import Forecast, Kind, MovingAverage, Trend
 
@@ -37,12 +38,6 @@ class ScalingParams(Params):
         Field(ge=0, le=86_400, description="Seconds ahead that are forecast: those that a worker takes to start."),
     ] = 0.0
 
-    @model_validator(mode="after")
-    def _ordered(self) -> ScalingParams:
-        if self.min_workers > self.max_workers:
-            raise ValueError("min_workers must not be above max_workers")
-        return self
-
 
 def workers_for(rate: float, waiting: int, params: ScalingParams) -> int:
     """Workers for a rate, in events a second, and for all that waits to be done in time; within the limits.
@@ -59,7 +54,14 @@ class Scaler:
     """Asks for more at once, for fewer only when fewer have done for a while."""
 
     def __init__(self, params: ScalingParams, forecast: Forecast | None = None) -> None:
-        """`forecast` stands for the parameters' own, where it needs a history."""
+        """`forecast` stands for the parameters' own, where it needs a history.
+
+        Raises:
+            SettingError: the limits contradict each other.
+        """
+        if params.min_workers > params.max_workers:
+            limits = f"{params.min_workers} and {params.max_workers}"
+            raise SettingError("--min-workers", f"must not be above --max-workers (got {limits})", "Change one of them")
         self.params = params
         by_name: dict[Kind, type[MovingAverage | Trend]] = {"average": MovingAverage, "trend": Trend}
         self.forecast = forecast or by_name[params.forecast](params.window)

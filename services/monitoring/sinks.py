@@ -18,6 +18,17 @@ LOG_BYTES, LOG_FILES = 16 * 2**20, 4
 """Size of a log, and how many older ones are kept beside it."""
 
 
+class Told(Protocol):
+    """What has an id and is told as a line of JSON: a record, an event."""
+
+    @property
+    def id(self) -> str:
+        """Unlike any other's."""
+
+    def json_line(self) -> str:
+        """As one line of JSON."""
+
+
 class Sink(Protocol):
     """Takes records."""
 
@@ -25,7 +36,7 @@ class Sink(Protocol):
     def dropped(self) -> int:
         """Records that were given up, as there was no room for them."""
 
-    def send(self, record: Record) -> None:
+    def send(self, record: Record, /) -> None:
         """Take one, at once."""
 
     def close(self) -> None:
@@ -59,9 +70,9 @@ class Kafka:
         """Records that were given up, as there was no room for them on disk."""
         return self._spool.dropped
 
-    def send(self, record: Record) -> None:
+    def send(self, told: Told) -> None:
         """Keep it, to be sent."""
-        self._spool.append(record.id, record.json_line().encode())
+        self._spool.append(told.id, told.json_line().encode())
         self._sender.wake()
 
     def close(self) -> None:

@@ -63,6 +63,7 @@ class DatasetParams(Watched):
     topic: Topic
     data: Annotated[Path, Field(description="CSV: seconds from the start, bytes.")]
     speed: Annotated[float, Field(ge=0.001, le=10_000, description="So many times as fast as the file says.")] = 1.0
+    subscribers: Annotated[int, Field(ge=0, le=1000, description="Subscriptions to wait for before it begins.")] = 0
     size_as_field: Annotated[bool, Field(description="Send sizes as JSON, not so many bytes.")] = False
 
 
@@ -70,3 +71,18 @@ class ListenerParams(Watched):
     """Of a node that listens."""
 
     topic: Topic
+
+
+class WorkParams(Watched):
+    """Of a node that has events worked on."""
+
+    topic: Topic
+    command: Annotated[
+        str, Field(description="Worker: a program that reads a line of JSON an event, and answers it with a line.")
+    ]
+    max_workers: Annotated[int, Field(ge=1, le=1000, description="Workers that it starts, at most.")] = 5
+    deadline: Annotated[
+        float, Field(ge=0.01, le=86_400, description="Seconds for an event; then its worker is killed.")
+    ] = 60.0
+    with_text: Annotated[bool, Field(description="Tell workers messages' text as well as their size.")] = False
+    events_topic: Annotated[str, Field(description="Topic of ROS 2 and of Kafka with events.")] = "bus_events"

@@ -25,7 +25,8 @@ class DatasetTalker(Monitor):
         super().__init__(node_name, **params.monitored())
         self._speed, self._field = params.speed, params.size_as_field
         self._publisher = self.create_publisher(ros.message_type(STRING), params.topic, 100)
-        self._began = time.monotonic()
+        self._subscribers = params.subscribers
+        self._began: float | None = None
         self._next = next(self._events, None)
         self.create_timer(0.005, self._send_due)
 
@@ -35,6 +36,10 @@ class DatasetTalker(Monitor):
         return self._next is None
 
     def _send_due(self) -> None:
+        if self._began is None:
+            if self._publisher.get_subscription_count() < self._subscribers:
+                return
+            self._began = time.monotonic()
         now = (time.monotonic() - self._began) * self._speed
         while self._next is not None and self._next[0] <= now + LATE:
             seconds, size = self._next

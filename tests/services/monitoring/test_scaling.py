@@ -5,8 +5,8 @@ from __future__ import annotations
 import random
 
 import pytest
-from pydantic import ValidationError
 
+from scan2sim.pipeline.errors import SettingError
 from scan2sim.services.monitoring.forecast import DAY, Blend, MovingAverage, Trend, daily
 from scan2sim.services.monitoring.scaling import Scaler, ScalingParams, workers_for
 from scan2sim.services.monitoring.traffic import HOUR, rate
@@ -35,8 +35,8 @@ def test_no_stream_goes_beyond_the_limits() -> None:
 
 
 def test_limits_that_contradict_each_other_are_refused() -> None:
-    with pytest.raises(ValidationError, match="min_workers"):
-        ScalingParams(min_workers=6)
+    with pytest.raises(SettingError, match="must not be above --max-workers"):
+        Scaler(ScalingParams(min_workers=6))
 
 
 def test_forecasts_of_what_rises() -> None:

@@ -1,0 +1,67 @@
+"""A node's place on the bus: events and records over ROS 2 and, where there is one, Kafka."""
+
+from __future__ import annotations
+
+import tempfile
+import threading
+from pathlib import Path
+from typing import Any
+
+from scan2sim.services import kafka
+from scan2sim.services.monitoring.events import Event, Events
+from scan2sim.services.monitoring.joined import BusParams
+from scan2sim.services.monitoring.monitor import RECORDS, STRING, ros
+from scan2sim.services.monitoring.sinks import Kafka
+
+
+class Bus:
+    """Joins a node to the bus; what comes over both ways is taken once."""
+
+    def __init__(self, node: Any, params: BusParams, *, records: bool = False) -> None:
+        """`records`: whether it wants monitors' records as well as events."""
+        name = node.get_name()
+        self.events = Events(name)
+        self.events.outlets.append(_Topic(node, params.events_topic))
+        topics = [params.events_topic, *([params.records_topic] if records else [])]
+        for topic in topics:
+            node.create_subscription(ros.message_type(STRING), topic, self._take, RECORDS)
+        self._closed = threading.Event()
+        self._readers: list[threading.Thread] = []
+        if servers := params.kafka_bootstrap_servers:
+            spool = Path(tempfile.gettempdir()) / f"scan2sim-{name}.events"
+            self.events.outlets.append(Kafka(servers, params.events_topic, spool))
+            for topic in topics:
+                reader = threading.Thread(target=self._read, args=(servers, topic, f"scan2sim-{name}"), daemon=True)
+                reader.start()
+                self._readers.append(reader)
+
+    def _take(self, message: Any) -> None:
+        self.events.take(message.data)
+
+    def _read(self, servers: str, topic: str, group: str) -> None:
+        for body in kafka.read(servers, topic, group=group, wait=0.5):
+            if self._closed.is_set():
+                return
+            if body is not None:
+                self.events.take(body)
+
+    def close(self) -> None:
+        """Leave the bus."""
+        self._closed.set()
+        for outlet in self.events.outlets:
+            outlet.close()
+        for reader in self._readers:
+            reader.join(5.0)
+
+
+class _Topic:
+    """Events on a topic of ROS 2."""
+
+    def __init__(self, node: Any, topic: str) -> None:
+        self._publisher = node.create_publisher(ros.message_type(STRING), topic, RECORDS)
+
+    def send(self, told: Event) -> None:
+        self._publisher.publish(ros.message(STRING, data=told.json_line()))
+
+    def close(self) -> None:
+        """The node closes its publishers."""

@@ -1,0 +1,33 @@
+"""How programs join the bus: what they are told in their constructors as on the command line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+
+from scan2sim.pipeline.step import Params
+from scan2sim.services.monitoring.scaling import ScalingParams
+
+
+class BusParams(Params):
+    """Where events and records go and come from."""
+
+    kafka_bootstrap_servers: Annotated[
+        str | None, Field(description="Kafka beside ROS 2, as host:port,host:port; it need not be there yet.")
+    ] = None
+    records_topic: Annotated[str, Field(description="Topic of ROS 2 and of Kafka with records.")] = "monitor_data"
+    events_topic: Annotated[str, Field(description="Topic of ROS 2 and of Kafka with events.")] = "bus_events"
+
+
+class ScaleParams(BusParams, ScalingParams):
+    """Of a node that asks for workers."""
+
+    log_file: Annotated[Path | None, Field(description="File for what was decided, a line of JSON each time.")] = None
+
+
+class AlarmsParams(BusParams):
+    """Of a node that sends alarms."""
+
+    rules: Annotated[Path, Field(description="TOML file of rules (docs/event-bus.md).")]

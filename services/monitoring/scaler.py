@@ -1,0 +1,46 @@
+"""A node that asks for workers: of each queue that is told of on the bus, as many as it needs."""
+
+from __future__ import annotations
+
+import json
+import time
+from typing import Any
+
+from scan2sim.services.monitoring.bus import Bus
+from scan2sim.services.monitoring.events import QueueState, WorkersWanted
+from scan2sim.services.monitoring.joined import ScaleParams
+from scan2sim.services.monitoring.monitor import ros
+from scan2sim.services.monitoring.scaling import Scaler
+
+
+class ScalerNode(ros.Node):  # type: ignore[misc]
+    """Decides whenever a queue is told of."""
+
+    def __init__(self, params: ScaleParams, node_name: str = "scaler") -> None:
+        self._params, self._scalers = params, dict[str, Scaler]()
+        Scaler(params)  # refuses limits that contradict each other, before anything is joined
+        super().__init__(node_name)
+        if params.log_file:
+            params.log_file.parent.mkdir(parents=True, exist_ok=True)
+        self._log = params.log_file.open("a", buffering=1) if params.log_file else None
+        self._bus = Bus(self, params)
+        self._bus.events.on("queue", self._decide)
+
+    def _decide(self, state: QueueState) -> None:
+        scaler = self._scalers.setdefault(state.queue, Scaler(self._params))
+        wanted = scaler.decide(time.monotonic(), state.seconds, state.arrived, state.waiting)
+        rate = scaler.forecast.ahead(self._params.lead)
+        if wanted != state.workers:
+            told = WorkersWanted(queue=state.queue, workers=wanted, rate=rate, waiting=state.waiting)
+            self._bus.events.send("workers", told)
+        if self._log:
+            self._log.write(
+                json.dumps({"time": time.time(), "wanted": wanted, "rate": rate, **state.model_dump()}) + "\n"
+            )
+
+    def destroy_node(self) -> Any:
+        """Leave the bus, and end."""
+        self._bus.close()
+        if self._log:
+            self._log.close()
+        return super().destroy_node()

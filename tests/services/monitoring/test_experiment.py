@@ -1,0 +1,40 @@
+"""Real nodes, from cameras' events to workers that are asked for and done with them; alarms reach who listens."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import signal
+import time
+from pathlib import Path
+
+from scan2sim.services.monitoring.nodes import worker
+from tests.services.conftest import Start
+
+CLI = ("cyclone", "-m", "scan2sim.flows.cli", "monitor")
+
+
+def test_a_rush_is_given_workers_and_loses_nothing(tmp_path: Path, start: Start) -> None:
+    # a quiet second, three of 50 events a second, a quiet while: one worker does 20 a second
+    times = [0.1, *(1 + number / 50 for number in range(150)), 6.0]
+    (tmp_path / "data.csv").write_text("".join(f"{seconds},100000\n" for seconds in times))
+    (tmp_path / "rules.toml").write_text("[[rules]]\nname = 'queue'\nmetric = 'queue_length'\nabove = 5\n")
+    serve = shlex.join(worker.command(0.05))
+    alarms = start(*CLI, "alarms", tmp_path / "rules.toml")
+    scale = start(*CLI, "scale", "--capacity", "20", "--window", "1", "--cool-down", "1", "--max-workers", "3",
+                  "--log", tmp_path / "scale.log")  # fmt: skip
+    work = start(*CLI, "work", "/cars", serve, "--period", "0.25")
+    talker = start(*CLI, "dataset-talker", "/cars", tmp_path / "data.csv", "--subscribers", "1", "--size-as-field")
+    assert talker.wait(90) == 0
+    end = time.monotonic() + 30
+    states: list[dict[str, float]] = []
+    while sum(one["done"] for one in states) < len(times) and time.monotonic() < end:
+        time.sleep(0.5)
+        states = [json.loads(line) for line in (tmp_path / "scale.log").read_text().splitlines()]
+    assert sum(one["done"] for one in states) == sum(one["arrived"] for one in states) == len(times)
+    assert max(one["wanted"] for one in states) == max(one["workers"] for one in states) == 3
+    alarms.send_signal(signal.SIGINT)
+    assert "raised queue: /cars" in "".join(alarms.communicate(timeout=30))
+    for node in (scale, work):
+        node.send_signal(signal.SIGINT)
+        node.communicate(timeout=30)

@@ -1,0 +1,91 @@
+"""Workers are real processes: they start and stop as they are told, lose no event, and none outlives its maker."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import psutil
+
+from scan2sim.services.monitoring.actuators.processes import Processes
+from scan2sim.services.monitoring.nodes import worker
+from scan2sim.services.monitoring.queue import EventQueue
+from tests.conftest import ROOT
+
+WORKER = worker.command(0.05)
+
+
+def until(holds: Callable[[], bool], seconds: float = 30) -> bool:
+    end = time.monotonic() + seconds
+    while not holds() and time.monotonic() < end:
+        time.sleep(0.02)
+    return holds()
+
+
+def children() -> list[psutil.Process]:
+    return [one for one in psutil.Process().children() if "worker.py" in " ".join(one.cmdline())]
+
+
+def test_workers_start_and_stop_and_do_all() -> None:
+    queue = EventQueue("events")
+    pool = Processes(queue, WORKER)
+    for number in range(60):
+        assert queue.put(str(number), time.time())
+    pool.scale(3)
+    assert until(lambda: pool.workers() == 3 and len(children()) == 3)
+    pool.scale(1)
+    assert until(lambda: len(children()) == 1)
+    assert until(lambda: len(queue) == 0)
+    state = queue.state(1.0, pool.workers())
+    assert (state.arrived, state.done, state.refused, state.workers) == (60, 60, 0, 1)
+    pool.close()
+    assert children() == []
+
+
+def test_a_worker_that_is_killed_is_replaced_and_its_event_done() -> None:
+    queue = EventQueue("events")
+    pool = Processes(queue, [*WORKER[:-1], "0.5"])
+    pool.scale(1)
+    queue.put("a", time.time())
+    assert until(lambda: queue.state(1.0, 0).waiting == 1 and len(children()) == 1)
+    time.sleep(0.2)
+    children()[0].kill()
+    assert until(lambda: len(queue) == 0)
+    assert queue.state(1.0, 0).refused == 0
+    pool.close()
+
+
+def test_a_worker_that_hangs_is_killed_and_an_event_that_kills_all_is_given_up() -> None:
+    queue = EventQueue("events")
+    pool = Processes(queue, [*WORKER[:-1], "1000"], deadline=0.2)
+    queue.put("hangs", time.time())
+    pool.scale(1)
+    assert until(lambda: len(queue) == 0)
+    assert queue.state(1.0, 0).refused == 1
+    pool.close()
+    assert children() == []
+
+
+def test_a_full_queue_refuses_and_says_so() -> None:
+    queue = EventQueue("events", most=2)
+    assert [queue.put("x", 0.0) for _ in range(3)] == [True, True, False]
+    state = queue.state(1.0, 0)
+    assert (state.refused, state.waiting) == (1, 2) and state.oldest > 1e9
+
+
+def test_no_worker_outlives_a_maker_that_is_killed(tmp_path: Path) -> None:
+    code = (
+        "import sys, time\nfrom scan2sim.services.monitoring.actuators.processes import Processes\n"
+        "from scan2sim.services.monitoring.queue import EventQueue\n"
+        f"pool = Processes(EventQueue('q'), {WORKER!r})\npool.scale(2)\ntime.sleep(60)"
+    )
+    maker = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT)
+    family = psutil.Process(maker.pid)
+    assert until(lambda: len(family.children()) == 2)
+    workers = family.children()
+    maker.kill()
+    maker.wait()
+    assert until(lambda: not any(one.is_running() for one in workers))
