@@ -74,6 +74,13 @@ def install_project(extra: "str | None") -> None:
     subprocess.run([*pip, "-c", str(ROOT / "constraints.txt"), "-e", project], check=True)
 
 
+def drop_compiled() -> None:
+    """Remove kernels that were compiled by an earlier state of the code: numba can't read those of renamed modules."""
+    for room in ("pipeline", "segmentation", "slam", "texturing", "data_samples"):
+        for compiled in (ROOT / room).rglob("__pycache__/*.nb[ci]"):
+            compiled.unlink(missing_ok=True)
+
+
 def stop(*lines: str) -> NoReturn:
     """End with lines on standard error."""
     sys.exit("\n".join(lines))
@@ -87,6 +94,7 @@ def main() -> None:
         install_system_packages(wanted)
     try:
         install_project(sys.argv[1] if len(sys.argv) > 1 else None)
+        drop_compiled()
     except subprocess.CalledProcessError as error:
         stop(f"{' '.join(error.cmd)} failed; what it says is above. Mend that, then make again.")
 

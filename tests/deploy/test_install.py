@@ -136,3 +136,13 @@ def test_a_library_of_this_machine_alone_is_noticed() -> None:
 
     wanted = {"libusb-1.0.so.0": ["a.so"], "libc.so.6": ["a.so"], "libpython3.so": ["a.so"], "libcuda.so.1": ["b.so"]}
     assert nowhere(wanted) == {"libpython3.so": ["a.so"]}
+
+
+def test_kernels_of_an_earlier_state_go(install: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(install, "ROOT", tmp_path)
+    cache = tmp_path / "pipeline" / "steps" / "__pycache__"
+    cache.mkdir(parents=True)
+    for name in ("voxel.thin-9.py311.nbi", "voxel.thin-9.py311.1.nbc", "voxel.cpython-311.pyc"):
+        (cache / name).touch()
+    install.drop_compiled()
+    assert [path.name for path in cache.iterdir()] == ["voxel.cpython-311.pyc"]
