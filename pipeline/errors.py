@@ -94,6 +94,14 @@ def exit_code(error: BaseException) -> int:
     return 1
 
 
+def http_status(error: BaseException) -> int:
+    """A service's HTTP status for an error; 500 for one that the table doesn't know."""
+    for kind, (_, status, _) in EXIT_CODES.items():
+        if isinstance(error, kind):
+            return status
+    return 500
+
+
 def from_os_error(error: OSError, path: str | Path) -> ScanError:
     """Turn an operating system's refusal to write into a `SpaceError` that names the path."""
     where = error.filename or path

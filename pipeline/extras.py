@@ -28,6 +28,8 @@ EXTRA_OF = {
     "confluent_kafka": "bus",
     "psutil": "bus",
     "prometheus_client": "bus",
+    "fastapi": "bus",
+    "uvicorn": "bus",
 }
 """A package's import name to the extra of `scan2sim` that installs it."""
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import logging
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from scan2sim.pipeline import extras
 from scan2sim.services.records import Kept, Once
+
+log = logging.getLogger(__name__)
 
 ACKNOWLEDGED_WITHIN = 10.0
 """Seconds for a batch; then the broker counts as lost."""
@@ -70,14 +73,44 @@ class Topic:
 
 
 def read(
-    servers: str, topic: str, *, group: str, from_start: bool = False, wait: float = 1.0
+    servers: str,
+    topic: str,
+    *,
+    group: str,
+    from_start: bool = False,
+    since: float | None = None,
+    connected: Callable[[bool], None] = lambda _: None,
+    wait: float = 1.0,
 ) -> Iterator[bytes | None]:
     """Bodies of a topic's records, each once, for ever; None after `wait` seconds without one.
 
     Records of no id (other programs') are handed on as they come.
+
+    Args:
+        servers: as "host:port,host:port"; they need not be there yet.
+        topic: its name; it is made if it isn't there.
+        group: of readers, who share a topic's records.
+        from_start: begin with the oldest record that is kept, if the group is new; else with what comes.
+        since: seconds since the epoch: begin with the records that came to Kafka from then on.
+        connected: is told when the broker has given the topic out, and when it is gone.
+        wait: seconds.
     """
     extras.need("Kafka", "confluent_kafka")
-    from confluent_kafka import Consumer
+    from confluent_kafka import Consumer, KafkaError, KafkaException
+
+    def failed(error: Any) -> None:
+        if error.code() == KafkaError._ALL_BROKERS_DOWN:
+            connected(False)
+
+    def assigned(consumer: Any, partitions: list[Any]) -> None:
+        connected(True)
+        if since is not None:
+            for one in partitions:
+                one.offset = int(1000 * since)
+            try:
+                consumer.assign(consumer.offsets_for_times(partitions, ACKNOWLEDGED_WITHIN))
+            except KafkaException as error:
+                log.warning("%s: earlier records can't be had, only what comes (%s)", topic, error)
 
     consumer = Consumer(
         {
@@ -89,9 +122,10 @@ def read(
             "allow.auto.create.topics": True,
             "topic.metadata.refresh.interval.ms": 1000,  # a topic may come later
             "logger": _silent(),
+            "error_cb": failed,
         }
     )
-    consumer.subscribe([topic])
+    consumer.subscribe([topic], on_assign=assigned)
     once = Once()
     try:
         while True:
@@ -99,6 +133,7 @@ def read(
             if message is None or message.error():
                 yield None
                 continue
+            connected(True)
             record_id = dict(message.headers() or ()).get(ID)
             if not isinstance(record_id, bytes) or once.new(record_id.decode()):
                 yield message.value()
@@ -106,9 +141,7 @@ def read(
         consumer.close()
 
 
-def _silent() -> Any:
-    import logging
-
+def _silent() -> logging.Logger:
     logger = logging.getLogger("scan2sim.kafka")
     logger.setLevel(logging.CRITICAL)
     return logger

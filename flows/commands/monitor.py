@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Annotated, Any
+
+import typer
 
 from scan2sim.flows.commands.app import App
 from scan2sim.flows.commands.display import console
 from scan2sim.flows.commands.options import options
+from scan2sim.pipeline import extras
 from scan2sim.services.monitoring.joined import AlarmsParams, ScaleParams
+from scan2sim.services.monitoring.shown import PageParams
 from scan2sim.services.monitoring.traffic import TrafficParams
 from scan2sim.services.monitoring.watched import DatasetParams, ListenerParams, TalkerParams, TopicParams, WorkParams
 
@@ -106,6 +110,22 @@ def monitor_alarms(params: AlarmsParams) -> None:
         console.print(f"{alarm.state} {alarm.rule}: {alarm.subject}, {alarm.value:.4g}", highlight=False, markup=False)
 
     _spin(lambda: AlarmsNode(params, tell))
+
+
+@app.command("page")
+@options(PageParams, kafka_bootstrap_servers="--kafka")
+def monitor_page(
+    params: PageParams,
+    limit: Annotated[
+        list[str] | None,
+        typer.Option("--limit", metavar="KEY=VALUE", help=PageParams.model_fields["limit"].description),
+    ] = None,
+) -> None:
+    """Show what nodes tell by Kafka as a page in the browser, live."""
+    extras.need("the page", "fastapi", "uvicorn", "prometheus_client", "confluent_kafka")
+    from scan2sim.services.monitoring.page import serve
+
+    serve(params, lambda text: console.print(text, highlight=False, markup=False))
 
 
 def _spin(made: Callable[[], Any], finished: Callable[[Any], bool] = lambda _: False) -> None:

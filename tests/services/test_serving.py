@@ -1,0 +1,186 @@
+"""Whatever is served: health by its workers, a token, errors by one table, limits, TLS, headers."""
+
+from __future__ import annotations
+
+import ssl
+import subprocess
+import threading
+import time
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from scan2sim.pipeline.errors import EXIT_CODES, InputError, ScanError, SettingError
+from scan2sim.services.served import Served
+
+pytest.importorskip("fastapi", reason="the extra bus isn't installed")
+from fastapi import FastAPI, Request, WebSocket
+from fastapi.testclient import TestClient
+from starlette.websockets import WebSocketDisconnect
+
+from scan2sim.services import serving
+
+TOKEN = "0123456789abcdef"
+
+
+class Worker:
+    """Lives until it is told not to."""
+
+    alive = True
+
+    def is_alive(self) -> bool:
+        return self.alive
+
+
+@pytest.fixture
+def token(tmp_path: Path) -> Path:
+    path = tmp_path / "token"
+    path.write_text(f"{TOKEN}\n")
+    return path
+
+
+def app_of(served: Served | None = None, **more: Any) -> FastAPI:
+    app = serving.application("a test", served or Served(), **({"alive": {}} | more))
+
+    @app.get("/number")
+    def number(value: float = 0) -> float:
+        return value
+
+    @app.post("/length")
+    async def length(request: Request) -> int:
+        return len(await request.body())
+
+    @app.get("/fail/{kind}")
+    def fail(kind: str) -> None:
+        for error in EXIT_CODES:
+            if error.__name__ == kind and issubclass(error, ScanError):
+                raise error("tile.toml", "is wrong", "Mend it")
+        raise ZeroDivisionError("a secret")
+
+    @app.websocket("/socket")
+    async def socket(socket: WebSocket) -> None:
+        await socket.accept()
+        await socket.close()
+
+    return app
+
+
+def test_health_is_that_of_the_workers() -> None:
+    worker, broker = Worker(), Worker()
+    client = TestClient(app_of(alive={"reader": worker.is_alive}, ready={"Kafka": broker.is_alive}))
+    assert client.get("/health/live").status_code == client.get("/health/ready").status_code == 200
+    broker.alive = False
+    assert client.get("/health/live").status_code == 200
+    ready = client.get("/health/ready")
+    assert (ready.status_code, ready.json()) == (503, {"failing": ["Kafka"]})
+    worker.alive = False
+    assert client.get("/health/live").json() == {"failing": ["reader"]}
+    assert client.get("/health/ready").json() == {"failing": ["reader", "Kafka"]}
+    assert 'scan2sim_worker_alive{worker="reader"} 0.0' in client.get("/metrics").text
+
+
+@pytest.mark.parametrize("kind", [kind for kind in EXIT_CODES if issubclass(kind, ScanError)])
+def test_errors_have_the_statuses_of_the_table(kind: type[ScanError]) -> None:
+    answer = TestClient(app_of()).get(f"/fail/{kind.__name__}")
+    assert answer.status_code == EXIT_CODES[kind][1]
+    assert answer.json() == {"where": "tile.toml", "cause": "is wrong", "remedy": "Mend it"}
+
+
+@pytest.mark.parametrize(("path", "status"), [("/nix", 404), ("/number?value=x", 422), ("/fail/other", 500)])
+def test_every_error_names_place_cause_and_remedy_alone(path: str, status: int) -> None:
+    answer = TestClient(app_of()).get(path)
+    assert answer.status_code == status and set(answer.json()) == {"where", "cause", "remedy"}
+    assert "secret" not in answer.text
+
+
+def test_without_the_token_only_health_and_files_of_pages_are_shown(token: Path) -> None:
+    client = TestClient(app_of(Served(token=token), public=("/",)))
+    for path in ("/number", "/metrics", "/openapi.json", "/health", "/nix", "/pages/../number"):
+        for given in ({}, {"Authorization": "Bearer 0123456789abcdeX"}, {"Authorization": TOKEN}):
+            answer = client.get(path, headers=given)
+            assert answer.status_code == 401 and answer.headers["WWW-Authenticate"] == "Bearer", path
+    assert client.get("/health/live").status_code == client.get("/pages/style.css").status_code == 200
+    assert client.get("/number?value=3", headers={"Authorization": f"Bearer {TOKEN}"}).json() == 3
+    with pytest.raises(WebSocketDisconnect), client.websocket_connect("/socket"):
+        pass
+
+
+@pytest.mark.parametrize("text", ["", "short", "two words that are long", "ümläutümläutümläut"])
+def test_a_token_that_is_none_is_refused(text: str, token: Path) -> None:
+    token.write_text(text)
+    with pytest.raises(InputError, match="openssl rand"):
+        Served(token=token).secret()
+    with pytest.raises(InputError, match="can't be read"):
+        Served(token=token.parent / "nowhere").secret()
+
+
+@pytest.mark.parametrize("told", [True, False], ids=["with a length", "in chunks"])
+def test_requests_that_are_too_large_are_refused(told: bool) -> None:
+    client = TestClient(app_of(largest=1000))
+
+    def sent(size: int) -> Any:
+        chunks = (b"x" * 100 for _ in range(size // 100))
+        return client.post("/length", content=b"x" * size if told else chunks)
+
+    assert sent(1000).json() == 1000
+    assert sent(1100).status_code == 413 and "1000 bytes" in sent(1100).json()["cause"]
+
+
+def test_answers_forbid_what_pages_do_not_need() -> None:
+    client = TestClient(app_of())
+    for path in ("/pages/style.css", "/nix", "/fail/other", "/health/live"):
+        headers = client.get(path).headers
+        assert "default-src 'none'; script-src 'self'" in headers["Content-Security-Policy"], path
+        assert headers["X-Content-Type-Options"] == "nosniff"
+    assert client.get("/pages/%2e%2e/serving.py").status_code == 404
+
+
+@pytest.fixture
+def certificate(tmp_path: Path) -> tuple[Path, Path]:
+    """Of localhost, by nobody but itself."""
+    paths = tmp_path / "certificate.pem", tmp_path / "key.pem"
+    made = subprocess.run(
+        ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes", "-days", "2",
+         "-subj", "/CN=localhost", "-addext", "subjectAltName=DNS:localhost", "-out", paths[0], "-keyout", paths[1]],
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert made.returncode == 0, made.stderr
+    return paths
+
+
+@pytest.fixture
+def served(certificate: tuple[Path, Path]) -> Iterator[str]:
+    """Address of a service that runs, by TLS."""
+    told: list[str] = []
+    served = Served(port=0, host="localhost", certificate=certificate[0], key=certificate[1])
+    thread = threading.Thread(target=serving.run, args=(app_of(served), served, told.append), daemon=True)
+    thread.start()
+    for _ in range(600):
+        if told:
+            break
+        time.sleep(0.05)
+    yield told[0]
+
+
+def test_it_is_served_by_tls(served: str, certificate: tuple[Path, Path]) -> None:
+    trusting = ssl.create_default_context(cafile=certificate[0])
+    with urllib.request.urlopen(f"{served}number?value=2", context=trusting, timeout=60) as answer:
+        assert answer.read() == b"2.0"
+    with pytest.raises(OSError), urllib.request.urlopen(served.replace("https", "http"), timeout=60):
+        pass
+
+
+def test_what_can_not_be_served_is_told_before(certificate: tuple[Path, Path], tmp_path: Path) -> None:
+    with pytest.raises(SettingError, match="--key"):
+        Served(certificate=certificate[0]).check_tls()
+    (tmp_path / "other.pem").write_text("no key")
+    with pytest.raises(InputError, match=r"other\.pem"):
+        Served(certificate=certificate[0], key=tmp_path / "other.pem").check_tls()
+    with Served(port=0).listen() as taken, pytest.raises(SettingError, match="Choose another --port"):
+        Served(port=taken.getsockname()[1]).listen()
+    with pytest.raises(SettingError, match="192.0.2.1"):
+        Served(host="192.0.2.1").listen()
+    assert Served(host="0.0.0.0").is_open() and not Served().is_open()
