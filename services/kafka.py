@@ -80,6 +80,7 @@ def read(
     from_start: bool = False,
     since: float | None = None,
     connected: Callable[[bool], None] = lambda _: None,
+    dropped: Callable[[str], None] = lambda _: None,
     wait: float = 1.0,
 ) -> Iterator[bytes | None]:
     """Bodies of a topic's records, each once, for ever; None after `wait` seconds without one.
@@ -93,6 +94,7 @@ def read(
         from_start: begin with the oldest record that is kept, if the group is new; else with what comes.
         since: seconds since the epoch: begin with the records that came to Kafka from then on.
         connected: is told when the broker has given the topic out, and when it is gone.
+        dropped: is told the ids of doubles.
         wait: seconds.
     """
     extras.need("Kafka", "confluent_kafka")
@@ -137,6 +139,8 @@ def read(
             record_id = dict(message.headers() or ()).get(ID)
             if not isinstance(record_id, bytes) or once.new(record_id.decode()):
                 yield message.value()
+            else:
+                dropped(record_id.decode())
     finally:
         consumer.close()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable
 from typing import Annotated, Any
 
@@ -132,6 +133,7 @@ def _spin(made: Callable[[], Any], finished: Callable[[Any], bool] = lambda _: F
     """Run a node until it has finished, or Ctrl-C."""
     from scan2sim.services.monitoring.monitor import ros
 
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # what ends services ends them as Ctrl-C does
     ros.init()
     node = made()
     try:
