@@ -100,8 +100,9 @@ class _Node:
 class History:
     """Takes records as they come, and tells windows of them; may be used from any thread."""
 
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
+    def __init__(self, began: float) -> None:
+        """Records from before `began`, seconds since the epoch, are from back then: their nodes were silent since."""
+        self._began, self._lock = began, threading.Lock()
         self._nodes: dict[str, _Node] = {}
         self._numbered = 0
         self.counts: Counter[str] = Counter()
@@ -123,15 +124,16 @@ class History:
 
     def _node(self, record: Record) -> _Node:
         name, now = full_name(record), time.monotonic()
+        came = now - max(0.0, self._began - record.time)
         node = self._nodes.get(name)
         if node is None:
             if len(self._nodes) >= NODES:
                 self._forget_one(now)
-            node = self._nodes[name] = _Node(self._numbered, record, now)
+            node = self._nodes[name] = _Node(self._numbered, record, came)
             self._numbered += 1
         if record.time >= node.last.time:
             node.last = record
-        node.came = now
+        node.came = max(node.came, came)
         return node
 
     def _forget_one(self, now: float) -> None:

@@ -155,7 +155,7 @@ def serve(params: PageParams, told: Callable[[str], None]) -> None:
         SettingError: it can't listen where it is to.
         InputError: token, certificate or key can't be read.
     """
-    history = History()
+    history = History(time.time())
     reader = Reader(params, history)
     app = application(params, history, reader)
 

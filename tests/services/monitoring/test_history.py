@@ -17,8 +17,8 @@ from tests.services.monitoring.telling import body, record
 START = 1_700_000_000.0
 
 
-def history_of(*bodies: bytes) -> History:
-    made = History()
+def history_of(*bodies: bytes, began: float = 0.0) -> History:
+    made = History(began)
     for one in bodies:
         made.take(one)
     return made
@@ -152,13 +152,19 @@ def test_a_silent_node_is_gone_after_three_periods(monkeypatch: pytest.MonkeyPat
     assert [node["gone"] for node in of.state()["nodes"]] == [False, True]
 
 
+def test_a_node_that_ended_before_the_page_began_is_gone_at_once() -> None:
+    state = history_of(body("a", START - 600), body("b", START - 1), body("c", START + 1), began=START).state()
+    assert [node["gone"] for node in state["nodes"]] == [True, False, False]
+    assert state["nodes"][0]["silent"] == pytest.approx(600, abs=5)
+
+
 def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "ROWS", 1000)
     monkeypatch.setattr(module, "NODES", 3)
     monkeypatch.setattr(module, "parsed", lambda told: told)
     now = 1000.0
     monkeypatch.setattr(time, "monotonic", lambda: now)
-    of = History()
+    of = History(0.0)
     for i in range(5000):
         of.take(record("a", START + i, messages=i))  # type: ignore[arg-type]
     (kept,) = of._nodes.values()

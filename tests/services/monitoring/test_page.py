@@ -56,7 +56,7 @@ def until(true: Callable[[], Any], seconds: float = 60) -> None:
 @contextmanager
 def shown(params: PageParams, *, reading: bool = True) -> Iterator[Shown]:
     """A page in a thread, of what comes from Kafka, or of what tests put into its history."""
-    history, told = History(), list[str]()
+    history, told = History(time.time()), list[str]()
     reader = Reader(params, history)
     app = application(params, history, reader)
     if reading:
@@ -136,6 +136,10 @@ def test_records_come_from_kafka_to_the_page_once(broker: Broker, page: Page) ->
             served.get("health/ready")
         assert served.get("health/live") == {"failing": []}
         page.until("document.getElementById('status').textContent === 'Kafka is gone'")
+        broker.start()  # which has forgotten all
+        Topic(broker.servers, params.topic).send(records(["late"], 5))
+        page.until("document.querySelectorAll('#nodes tbody tr').length === 4")
+        page.until("document.getElementById('status').textContent === 'live'")
 
 
 @pytest.fixture(scope="module")
@@ -200,6 +204,17 @@ def test_a_node_is_chosen_and_a_range_is_picked(filled: Shown, page: Page) -> No
     assert 25 < page.value("range.to - range.from") < 35
     page.value("document.querySelector('[data-seconds=\"900\"]').click()")
     page.until("document.getElementById('status').textContent !== 'past' && held && held.step === 5")
+
+
+def test_a_live_window_moves_on_whole(filled: Shown, page: Page) -> None:
+    open_page(page, filled.url)
+    begin, end = page.value("[held.times[0], held.times.at(-1)]")
+    fill(filled.history, ["late"], seconds=1)  # a 21st node
+    page.until(f"held.times.at(-1) > {end + 2} && held.nodes.some(node => node.name === '/late')")
+    times = page.value("held.times")
+    assert times[0] > begin and set(np.diff(times)) == {1.0} and len(times) in (300, 301)
+    lengths = page.value("held.nodes.flatMap(n => METRICS.flatMap(m => Object.values(n[m]).map(list => list.length)))")
+    assert set(lengths) == {len(times)} == set(page.value("Object.values(held.sums).map(list => list.length)"))
 
 
 def test_the_stream_goes_on_where_the_window_ends(filled: Shown) -> None:
