@@ -80,9 +80,13 @@ class Served(Params):
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"{'https' if self.certificate else 'http'}://{host}:{port}/"
 
+    def is_local(self) -> bool:
+        """Whether this machine's users alone reach it."""
+        return self.host in ("localhost", "::1") or self.host.startswith("127.")
+
     def is_open(self) -> bool:
-        """Whether others than this machine's users may ask, without a token."""
-        return self.token is None and self.host not in ("localhost", "::1") and not self.host.startswith("127.")
+        """Whether others may ask, without a token."""
+        return self.token is None and not self.is_local()
 
 
 def _text(path: Path) -> str:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import hmac
 import logging
+import re
 from collections.abc import Awaitable, Callable, Mapping, MutableMapping
 from pathlib import Path
 from typing import Any
@@ -39,6 +40,8 @@ LARGEST = 2**20
 """Bytes of a request's body, unless a service says otherwise."""
 CONNECTIONS = 256
 """Open at once; more are sent away (503)."""
+OWN_NAME = re.compile(r"(localhost|127(\.\d{1,3}){3}|\[::1\])(:\d+)?", re.IGNORECASE)
+"""Names of this machine for itself. Others that lead here may be a website's, whose pages would read along."""
 HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
@@ -77,7 +80,7 @@ def application(
         InputError: the token can't be read.
     """
     app = FastAPI(title=name, docs_url=None, redoc_url=None)
-    app.add_middleware(_Guard, secret=served.secret(), public=public, largest=largest)
+    app.add_middleware(_Guard, secret=served.secret(), local=served.is_local(), public=public, largest=largest)
     app.add_exception_handler(ScanError, _of_ours)
     app.add_exception_handler(StarletteHTTPException, _of_http)
     app.add_exception_handler(RequestValidationError, _of_request)
@@ -138,36 +141,43 @@ def _tell_figures(app: FastAPI, alive: Mapping[str, Check]) -> None:
 
 
 class _Guard:
-    """Around all that is served: headers, token, size of requests, errors that nobody expected."""
+    """Around all that is served: headers, who may ask, size of requests, errors that nobody expected."""
 
-    def __init__(self, app: Any, *, secret: str | None, public: tuple[str, ...], largest: int) -> None:
-        self._app, self._public, self._largest = app, public, largest
+    def __init__(self, app: Any, *, secret: str | None, local: bool, public: tuple[str, ...], largest: int) -> None:
+        self._app, self._local, self._public, self._largest = app, local, public, largest
         self._wanted = None if secret is None else f"Bearer {secret}".encode()
 
     async def __call__(self, scope: Message, receive: Receive, send: Send) -> None:
         if scope["type"] == "lifespan":
             await self._app(scope, receive, send)
-        elif not self._may(scope):
-            await self._send_away(scope, receive, send)
+        elif (refusal := self._refused(scope)) is not None:
+            await self._send_away(refusal, scope, receive, send)
         elif scope["type"] == "http":
             await self._answer(scope, self._limited(receive), _with_headers(send))
         else:
             await self._app(scope, receive, send)
 
-    def _may(self, scope: Message) -> bool:
-        path = scope["path"]
-        if self._wanted is None or path in self._public or path.startswith(PUBLIC):
-            return True
-        given = dict(scope["headers"]).get(b"authorization", b"")
-        return hmac.compare_digest(given, self._wanted)
+    def _refused(self, scope: Message) -> Response | None:
+        """What who may not ask is told."""
+        path, headers = scope["path"], dict(scope["headers"])
+        if path in self._public or path.startswith(PUBLIC):
+            return None
+        if self._wanted is not None:
+            if hmac.compare_digest(headers.get(b"authorization", b""), self._wanted):
+                return None
+            answer = _refusal(401, path, "needs a token", "Send the header Authorization: Bearer TOKEN")
+            answer.headers["WWW-Authenticate"] = "Bearer"
+            return answer
+        host = headers.get(b"host", b"").decode("latin-1")
+        if self._local and not OWN_NAME.fullmatch(host):
+            return _refusal(421, path, "is asked for by a name that isn't this machine's own", "Ask localhost for it")
+        return None
 
-    async def _send_away(self, scope: Message, receive: Receive, send: Send) -> None:
+    async def _send_away(self, refusal: Response, scope: Message, receive: Receive, send: Send) -> None:
         if scope["type"] == "websocket":
             await send({"type": "websocket.close", "code": 1008})
-            return
-        answer = _refusal(401, scope["path"], "needs a token", "Send the header Authorization: Bearer TOKEN")
-        answer.headers["WWW-Authenticate"] = "Bearer"
-        await answer(scope, receive, _with_headers(send))
+        else:
+            await refusal(scope, receive, _with_headers(send))
 
     async def _answer(self, scope: Message, receive: Receive, send: Send) -> None:
         begun = False

@@ -68,9 +68,13 @@ def app_of(served: Served | None = None, **more: Any) -> FastAPI:
     return app
 
 
+def client_of(app: FastAPI, host: str = "localhost") -> TestClient:
+    return TestClient(app, base_url=f"http://{host}", raise_server_exceptions=False)
+
+
 def test_health_is_that_of_the_workers() -> None:
     worker, broker = Worker(), Worker()
-    client = TestClient(app_of(alive={"reader": worker.is_alive}, ready={"Kafka": broker.is_alive}))
+    client = client_of(app_of(alive={"reader": worker.is_alive}, ready={"Kafka": broker.is_alive}))
     assert client.get("/health/live").status_code == client.get("/health/ready").status_code == 200
     broker.alive = False
     assert client.get("/health/live").status_code == 200
@@ -84,20 +88,20 @@ def test_health_is_that_of_the_workers() -> None:
 
 @pytest.mark.parametrize("kind", [kind for kind in EXIT_CODES if issubclass(kind, ScanError)])
 def test_errors_have_the_statuses_of_the_table(kind: type[ScanError]) -> None:
-    answer = TestClient(app_of()).get(f"/fail/{kind.__name__}")
+    answer = client_of(app_of()).get(f"/fail/{kind.__name__}")
     assert answer.status_code == EXIT_CODES[kind][1]
     assert answer.json() == {"where": "tile.toml", "cause": "is wrong", "remedy": "Mend it"}
 
 
 @pytest.mark.parametrize(("path", "status"), [("/nix", 404), ("/number?value=x", 422), ("/fail/other", 500)])
 def test_every_error_names_place_cause_and_remedy_alone(path: str, status: int) -> None:
-    answer = TestClient(app_of()).get(path)
+    answer = client_of(app_of()).get(path)
     assert answer.status_code == status and set(answer.json()) == {"where", "cause", "remedy"}
     assert "secret" not in answer.text
 
 
 def test_without_the_token_only_health_and_files_of_pages_are_shown(token: Path) -> None:
-    client = TestClient(app_of(Served(token=token), public=("/",)))
+    client = client_of(app_of(Served(token=token), public=("/",)))
     for path in ("/number", "/metrics", "/openapi.json", "/health", "/nix", "/pages/../number"):
         for given in ({}, {"Authorization": "Bearer 0123456789abcdeX"}, {"Authorization": TOKEN}):
             answer = client.get(path, headers=given)
@@ -106,6 +110,15 @@ def test_without_the_token_only_health_and_files_of_pages_are_shown(token: Path)
     assert client.get("/number?value=3", headers={"Authorization": f"Bearer {TOKEN}"}).json() == 3
     with pytest.raises(WebSocketDisconnect), client.websocket_connect("/socket"):
         pass
+
+
+def test_websites_whose_names_lead_here_read_nothing() -> None:
+    for host in ("localhost", "127.0.0.1:8080", "[::1]:8080", "LOCALHOST:80"):
+        assert client_of(app_of(), host).get("/number").status_code == 200, host
+    for host in ("evil.example", "localhost.evil.example", "127.0.0.1.evil.example:8080"):
+        answer = client_of(app_of(), host).get("/number")
+        assert answer.status_code == 421 and set(answer.json()) == {"where", "cause", "remedy"}, host
+    assert client_of(app_of(Served(host="0.0.0.0")), "robot.example").get("/number").status_code == 200
 
 
 @pytest.mark.parametrize("text", ["", "short", "two words that are long", "ümläutümläutümläut"])
@@ -119,7 +132,7 @@ def test_a_token_that_is_none_is_refused(text: str, token: Path) -> None:
 
 @pytest.mark.parametrize("told", [True, False], ids=["with a length", "in chunks"])
 def test_requests_that_are_too_large_are_refused(told: bool) -> None:
-    client = TestClient(app_of(largest=1000))
+    client = client_of(app_of(largest=1000))
 
     def sent(size: int) -> Any:
         chunks = (b"x" * 100 for _ in range(size // 100))
@@ -130,7 +143,7 @@ def test_requests_that_are_too_large_are_refused(told: bool) -> None:
 
 
 def test_answers_forbid_what_pages_do_not_need() -> None:
-    client = TestClient(app_of())
+    client = client_of(app_of())
     for path in ("/pages/style.css", "/nix", "/fail/other", "/health/live"):
         headers = client.get(path).headers
         assert "default-src 'none'; script-src 'self'" in headers["Content-Security-Policy"], path
