@@ -12,7 +12,7 @@ from scan2sim.flows.commands.app import App
 from scan2sim.flows.commands.display import console
 from scan2sim.flows.commands.options import options
 from scan2sim.pipeline import extras
-from scan2sim.services.monitoring.joined import AlarmsParams, ScaleParams
+from scan2sim.services.monitoring.joined import AlarmsParams, PoolParams, ScaleParams
 from scan2sim.services.monitoring.shown import PageParams
 from scan2sim.services.monitoring.traffic import TrafficParams
 from scan2sim.services.monitoring.watched import DatasetParams, ListenerParams, TalkerParams, TopicParams, WorkParams
@@ -101,6 +101,15 @@ def monitor_scale(params: ScaleParams) -> None:
     _spin(lambda: ScalerNode(params))
 
 
+@app.command("pool")
+@options(PoolParams, **BUS_OPTIONS)
+def monitor_pool(params: PoolParams) -> None:
+    """Start and stop workers of a Prefect pool as the bus asks for them."""
+    from scan2sim.services.monitoring.pool import PoolNode
+
+    _spin(lambda: PoolNode(params))
+
+
 @app.command("alarms")
 @options(AlarmsParams, **BUS_OPTIONS)
 def monitor_alarms(params: AlarmsParams) -> None:
@@ -130,7 +139,7 @@ def monitor_page(
 
 
 def _spin(made: Callable[[], Any], finished: Callable[[Any], bool] = lambda _: False) -> None:
-    """Run a node until it has finished, or Ctrl-C."""
+    """Run a node until it has finished, or is told to end, by Ctrl-C or SIGTERM."""
     from scan2sim.services.monitoring.monitor import ros
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # what ends services ends them as Ctrl-C does

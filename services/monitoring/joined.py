@@ -8,7 +8,7 @@ from typing import Annotated
 from pydantic import Field
 
 from scan2sim.pipeline.step import Params
-from scan2sim.services.monitoring.scaling import ScalingParams
+from scan2sim.services.monitoring.scaling import MOST, ScalingParams
 
 
 class BusParams(Params):
@@ -24,7 +24,24 @@ class BusParams(Params):
 class ScaleParams(BusParams, ScalingParams):
     """Of a node that asks for workers."""
 
+    history: Annotated[
+        Path | None,
+        Field(
+            description="CSV of whole days, seconds from a Monday's midnight: forecast as on other days at that hour."
+        ),
+    ] = None
     log_file: Annotated[Path | None, Field(description="File for what was decided, a line of JSON each time.")] = None
+
+
+class PoolParams(BusParams):
+    """Of a node that starts and stops workers of a Prefect pool."""
+
+    pool: Annotated[str, Field(description="Its name, as scan2sim-process; it must be there.")]
+    queue: Annotated[str | None, Field(description="Queue whose events are followed; default: called as the pool.")] = (
+        None
+    )
+    min_workers: Annotated[int, Field(ge=0, le=MOST, description="Workers, at least.")] = 1
+    max_workers: Annotated[int, Field(ge=1, le=MOST, description="Workers, at most.")] = 5
 
 
 class AlarmsParams(BusParams):

@@ -8,8 +8,10 @@ from typing import Any
 
 from scan2sim.services.monitoring.bus import Bus
 from scan2sim.services.monitoring.events import QueueState, WorkersWanted
+from scan2sim.services.monitoring.forecast import DAY, Blend, daily
 from scan2sim.services.monitoring.joined import ScaleParams
 from scan2sim.services.monitoring.monitor import ros
+from scan2sim.services.monitoring.nodes.dataset_talker import read_events
 from scan2sim.services.monitoring.scaling import Scaler
 
 
@@ -18,7 +20,8 @@ class ScalerNode(ros.Node):  # type: ignore[misc]
 
     def __init__(self, params: ScaleParams, node_name: str = "scaler") -> None:
         self._params, self._scalers = params, dict[str, Scaler]()
-        Scaler(params)  # refuses limits that contradict each other, before anything is joined
+        self._usual = daily((seconds, 1) for seconds, _ in read_events(params.history)) if params.history else None
+        self._scaler()  # refuses limits that contradict each other, before anything is joined
         super().__init__(node_name)
         if params.log_file:
             params.log_file.parent.mkdir(parents=True, exist_ok=True)
@@ -26,9 +29,12 @@ class ScalerNode(ros.Node):  # type: ignore[misc]
         self._bus = Bus(self, params)
         self._bus.events.on("queue", self._decide)
 
+    def _scaler(self) -> Scaler:
+        return Scaler(self._params, Blend(self._params.window, self._usual) if self._usual else None)
+
     def _decide(self, state: QueueState) -> None:
-        scaler = self._scalers.setdefault(state.queue, Scaler(self._params))
-        wanted = scaler.decide(time.monotonic(), state.seconds, state.arrived, state.waiting)
+        scaler = self._scalers.get(state.queue) or self._scalers.setdefault(state.queue, self._scaler())
+        wanted = scaler.decide(_local(), state.seconds, state.arrived, state.waiting)
         rate = scaler.forecast.ahead(self._params.lead)
         if wanted != state.workers:
             told = WorkersWanted(queue=state.queue, workers=wanted, rate=rate, waiting=state.waiting)
@@ -44,3 +50,9 @@ class ScalerNode(ros.Node):  # type: ignore[misc]
         if self._log:
             self._log.close()
         return super().destroy_node()
+
+
+def _local() -> float:
+    """Seconds since a Monday's midnight, by the clock on the wall here: 1970 began on a Thursday."""
+    now = time.time()
+    return now + time.localtime(now).tm_gmtoff - 4 * DAY

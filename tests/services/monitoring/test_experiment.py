@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shlex
-import signal
 import time
 from pathlib import Path
 
@@ -33,8 +32,8 @@ def test_a_rush_is_given_workers_and_loses_nothing(tmp_path: Path, start: Start)
         states = [json.loads(line) for line in (tmp_path / "scale.log").read_text().splitlines()]
     assert sum(one["done"] for one in states) == sum(one["arrived"] for one in states) == len(times)
     assert max(one["wanted"] for one in states) == max(one["workers"] for one in states) == 3
-    alarms.send_signal(signal.SIGINT)
+    alarms.terminate()
     assert "raised queue: /cars" in "".join(alarms.communicate(timeout=30))
     for node in (scale, work):
-        node.send_signal(signal.SIGINT)
+        node.terminate()
         node.communicate(timeout=30)
