@@ -108,7 +108,8 @@ class _Run:
         serve = shlex.join(worker.command(1 / (CAPACITY * speed)))
         self._watching = [
             self._start("scale", "--capacity", CAPACITY * speed, "--delay", DELAY / speed, "--window", WINDOW / speed,
-                        "--cool-down", WINDOW / speed, "--min-workers", told.min_workers, "--log", folder / "scale.log"),
+                        "--cool-down", WINDOW / speed, "--min-workers", told.min_workers,
+                        "--log", folder / "scale.log"),
             self._start("work", TOPIC, serve, "--period", PERIOD / speed, "--log", folder / "work.log"),
         ]  # fmt: skip
         self.sent = 0
