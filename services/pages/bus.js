@@ -1,4 +1,4 @@
-// The live page of the event bus: six plots of what the service tells (/api/live, /api/history), nodes and their remarks.
+// The live page of the event bus: six plots of what the service tells (/api/live, /api/history), nodes, their remarks.
 "use strict";
 
 const PLOTS = [
@@ -9,13 +9,18 @@ const PLOTS = [
   { key: "messages", title: "Messages a period", unit: "count" },
   { key: "size", title: "Mean size of messages", unit: "bytes" },
 ];
-const METRICS = ["bandwidth", "latency", "lost", "messages", "size"], KINDS = ["mean", "min", "max"];
-const SUMS = [["in", 0], ["out", 1], ["difference", 3]];
+const METRICS = ["bandwidth", "latency", "lost", "messages", "size"],
+  KINDS = ["mean", "min", "max"];
+const SUMS = [
+  ["in", 0],
+  ["out", 1],
+  ["difference", 3],
+];
 
 const byId = (id) => document.getElementById(id);
-const chosen = new Set();          // names of nodes that are shown; none: all
-let range = { seconds: 300 };      // or {from, to}
-let held = null;                   // the window that is shown
+const chosen = new Set(); // names of nodes that are shown; none: all
+let range = { seconds: 300 }; // or {from, to}
+let held = null; // the window that is shown
 let plots = null;
 let stopped = new AbortController();
 
@@ -31,16 +36,24 @@ function element(tag, text, name) {
 // A window with another's later buckets in the place of its own, from `begin` on.
 function merged(old, fresh, begin) {
   if (!old || old.step !== fresh.step) return fresh;
-  const middle = begin + old.step / 2 - 1e-6, first = old.times.findIndex((time) => time >= middle);
+  const middle = begin + old.step / 2 - 1e-6,
+    first = old.times.findIndex((time) => time >= middle);
   const after = old.times.findIndex((time) => time >= fresh.times[0] - 1e-6);
-  const past = after < 0 ? old.times.length : after, kept = first < 0 ? 0 : Math.max(0, past - first);
+  const past = after < 0 ? old.times.length : after,
+    kept = first < 0 ? 0 : Math.max(0, past - first);
   if (!kept) return fresh;
-  const join = (a, b) => [...(a ? a.slice(first, past) : Array(kept).fill(null)), ...(b ?? Array(fresh.times.length).fill(null))];
-  const before = new Map(old.nodes.map((node) => [node.name, node])), now = new Map(fresh.nodes.map((node) => [node.name, node]));
+  const join = (a, b) => [
+    ...(a ? a.slice(first, past) : Array(kept).fill(null)),
+    ...(b ?? Array(fresh.times.length).fill(null)),
+  ];
+  const before = new Map(old.nodes.map((node) => [node.name, node])),
+    now = new Map(fresh.nodes.map((node) => [node.name, node]));
   const nodes = [...new Map([...before, ...now]).values()].map(({ name, number }) => {
     const node = { name, number };
     for (const metric of METRICS) {
-      const a = before.get(name)?.[metric], b = now.get(name)?.[metric], kinds = a?.min || b?.min ? KINDS : ["mean"];
+      const a = before.get(name)?.[metric],
+        b = now.get(name)?.[metric],
+        kinds = a?.min || b?.min ? KINDS : ["mean"];
       node[metric] = Object.fromEntries(kinds.map((kind) => [kind, join(a?.[kind] ?? a?.mean, b?.[kind] ?? b?.mean)]));
     }
     return node;
@@ -51,9 +64,10 @@ function merged(old, fresh, begin) {
 
 function draw(from, to) {
   for (const plot of plots) {
-    const series = plot.key === "sums"
-      ? SUMS.map(([name, number]) => ({ name, number, mean: held.sums[name] }))
-      : held.nodes.map(({ name, number, ...metrics }) => ({ name, number, ...metrics[plot.key] }));
+    const series =
+      plot.key === "sums"
+        ? SUMS.map(([name, number]) => ({ name, number, mean: held.sums[name] }))
+        : held.nodes.map(({ name, number, ...metrics }) => ({ name, number, ...metrics[plot.key] }));
     plot.plot.show(held.times, series, [from, to]);
   }
 }
@@ -61,7 +75,10 @@ function draw(from, to) {
 function take(told) {
   tellState(told.state);
   if (!plots) {
-    plots = PLOTS.map((one) => ({ key: one.key, plot: new Plot(byId("plots"), { ...one, limit: told.state.limits[one.key], ranged: showPast }) }));
+    plots = PLOTS.map((one) => ({
+      key: one.key,
+      plot: new Plot(byId("plots"), { ...one, limit: told.state.limits[one.key], ranged: showPast }),
+    }));
   }
   if (range.seconds) {
     held = merged(held, told, told.begin);
@@ -80,49 +97,88 @@ function tellState({ topic, servers, connected, limits, nodes, counts, last_refu
   nodes.sort((a, b) => (a.name < b.name ? -1 : 1));
   const empty = byId("empty");
   empty.hidden = nodes.length > 0;
-  empty.textContent = connected ? `No node has told anything on ${topic} yet.` : `Kafka at ${servers} doesn't answer; the page goes on trying.`;
+  empty.textContent = connected
+    ? `No node has told anything on ${topic} yet.`
+    : `Kafka at ${servers} doesn't answer; the page goes on trying.`;
   tellChips(nodes);
   byId("nodes").tBodies[0].replaceChildren(...nodes.map((node) => row(node, limits)));
   const remarks = nodes.flatMap((node) => [
     ...node.remarks.map((text) => `${node.name}: ${text}`),
     ...(node.dropped ? [`${node.name}: ${node.dropped} records were dropped, as there was no room for them`] : []),
   ]);
-  byId("remarks").replaceChildren(...(remarks.length ? [...new Set(remarks)] : ["none"]).map((text) => element("li", text)));
-  const refused = Object.entries(counts).filter(([why]) => why !== "shown").map(([why, count]) => `${count} ${why}`);
-  byId("counts").textContent = `${counts.shown ?? 0} records shown` + (refused.length ? `; not shown: ${refused.join(", ")} (last: ${last_refused})` : "");
+  byId("remarks").replaceChildren(
+    ...(remarks.length ? [...new Set(remarks)] : ["none"]).map((text) => element("li", text)),
+  );
+  const refused = Object.entries(counts)
+    .filter(([why]) => why !== "shown")
+    .map(([why, count]) => `${count} ${why}`);
+  byId("counts").textContent =
+    `${counts.shown ?? 0} records shown` +
+    (refused.length ? `; not shown: ${refused.join(", ")} (last: ${last_refused})` : "");
 }
 
 function tellChips(nodes) {
-  const chips = byId("chips"), shown = JSON.stringify([nodes.map(({ name, gone }) => [name, gone]), [...chosen], document.documentElement.dataset.theme]);
+  const chips = byId("chips"),
+    shown = JSON.stringify([
+      nodes.map(({ name, gone }) => [name, gone]),
+      [...chosen],
+      document.documentElement.dataset.theme,
+    ]);
   if (chips.dataset.shown === shown) return; // what is about to be clicked stays
   chips.dataset.shown = shown;
   chips.classList.toggle("some", chosen.size > 0);
-  chips.replaceChildren(...nodes.map(({ name, number, gone }) => {
-    const chip = element("button", undefined, gone ? "gone" : "");
-    chip.type = "button";
-    chip.title = chosen.has(name) ? `${name}: show others, too` : `${name}: show it alone, or beside those chosen`;
-    chip.setAttribute("aria-pressed", chosen.has(name));
-    chip.append(key(number), element("span", name));
-    chip.addEventListener("click", () => {
-      if (!chosen.delete(name)) chosen.add(name);
-      begin();
-    });
-    return chip;
-  }));
+  chips.replaceChildren(
+    ...nodes.map(({ name, number, gone }) => {
+      const chip = element("button", undefined, gone ? "gone" : "");
+      chip.type = "button";
+      chip.title = chosen.has(name) ? `${name}: show others, too` : `${name}: show it alone, or beside those chosen`;
+      chip.setAttribute("aria-pressed", chosen.has(name));
+      chip.append(key(number), element("span", name));
+      chip.addEventListener("click", () => {
+        if (!chosen.delete(name)) chosen.add(name);
+        begin();
+      });
+      return chip;
+    }),
+  );
 }
 
 function row(node, limits) {
-  const made = element("tr"), name = element("td");
+  const made = element("tr"),
+    name = element("td");
   name.append(key(node.number), element("span", node.name));
-  made.append(name, element("td", node.gone ? `gone, silent for ${Math.round(node.silent)} s` : `every ${+node.period.toPrecision(3)} s`, node.gone ? "bad" : ""));
+  made.append(
+    name,
+    element(
+      "td",
+      node.gone ? `gone, silent for ${Math.round(node.silent)} s` : `every ${+node.period.toPrecision(3)} s`,
+      node.gone ? "bad" : "",
+    ),
+  );
   const machine = element("td");
   machine.append(element("span", [node.host, node.ip].filter(Boolean).join(" · ")));
   made.append(machine);
-  for (const [metric, unit] of [["bandwidth", "rate"], ["latency", "seconds"], ["lost", "count"], ["messages", "count"], ["size", "bytes"]]) {
+  for (const [metric, unit] of [
+    ["bandwidth", "rate"],
+    ["latency", "seconds"],
+    ["lost", "count"],
+    ["messages", "count"],
+    ["size", "bytes"],
+  ]) {
     const value = node.latest[metric];
-    made.append(element("td", value === null ? "–" : UNITS[unit](value), value !== null && value > limits[metric] ? "n bad" : "n"));
+    made.append(
+      element(
+        "td",
+        value === null ? "–" : UNITS[unit](value),
+        value !== null && value > limits[metric] ? "n bad" : "n",
+      ),
+    );
   }
-  made.append(element("td", node.topics, "n"), element("td", node.cpu === null ? "–" : `${Math.round(node.cpu)} %`, "n"), element("td", node.dropped, node.dropped ? "n bad" : "n"));
+  made.append(
+    element("td", node.topics, "n"),
+    element("td", node.cpu === null ? "–" : `${Math.round(node.cpu)} %`, "n"),
+    element("td", node.dropped, node.dropped ? "n bad" : "n"),
+  );
   return made;
 }
 
@@ -148,7 +204,10 @@ async function begin() {
         status("past", "past");
         return;
       }
-      await follow(`/api/live?${query(range)}`, signal, (told) => { pause = 500; if (!signal.aborted) take(told); });
+      await follow(`/api/live?${query(range)}`, signal, (told) => {
+        pause = 500;
+        if (!signal.aborted) take(told);
+      });
     } catch (error) {
       if (signal.aborted) return;
       if (error instanceof NoToken) return askForToken();
@@ -181,14 +240,20 @@ function showPast(from, to) {
 // Writes a range, seconds, into the form, which speaks of local time.
 function fill(from, to) {
   const local = (time) => new Date(time - 60000 * new Date(time).getTimezoneOffset()).toISOString().slice(0, 19);
-  for (const [name, seconds] of [["from", from], ["to", to]]) byId("range").elements[name].value = local(1000 * seconds);
+  for (const [name, seconds] of [
+    ["from", from],
+    ["to", to],
+  ])
+    byId("range").elements[name].value = local(1000 * seconds);
 }
 
 function press() {
-  for (const button of document.querySelectorAll("[data-seconds]")) button.setAttribute("aria-pressed", Number(button.dataset.seconds) === range.seconds);
+  for (const button of document.querySelectorAll("[data-seconds]"))
+    button.setAttribute("aria-pressed", Number(button.dataset.seconds) === range.seconds);
 }
 
-for (const button of document.querySelectorAll("[data-seconds]")) button.addEventListener("click", () => showLive(Number(button.dataset.seconds)));
+for (const button of document.querySelectorAll("[data-seconds]"))
+  button.addEventListener("click", () => showLive(Number(button.dataset.seconds)));
 byId("range").addEventListener("submit", (event) => {
   event.preventDefault();
   const at = (name) => new Date(event.target.elements[name].value).getTime() / 1000;

@@ -1,20 +1,34 @@
-// A plot of lines over time, as all pages have it: the mean as a line, strokes from least to most, red dots beyond a limit.
+// A plot of lines over time, as all pages have it: means as lines, strokes from least to most, red dots beyond a limit.
 "use strict";
 
-const HUES = [212, 32, 140, 275, 182, 55, 318, 95, 245], DASHES = [[], [7, 4], [2, 4], [10, 4, 2, 4]];
+const HUES = [212, 32, 140, 275, 182, 55, 318, 95, 245],
+  DASHES = [[], [7, 4], [2, 4], [10, 4, 2, 4]];
 
 function look(number) {
   return { hue: HUES[number % HUES.length], dash: DASHES[Math.floor(number / HUES.length) % DASHES.length] };
 }
 
-function styled(name) { return getComputedStyle(document.documentElement).getPropertyValue(name).trim(); }
+function styled(name) {
+  return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+}
 
-function colour(number) { return `hsl(${look(number).hue} 62% ${styled("--light")})`; }
+function colour(number) {
+  return `hsl(${look(number).hue} 62% ${styled("--light")})`;
+}
 
 // How a line looks, for legends.
 function key(number) {
-  const svg = document.createElementNS("http://www.w3.org/2000/svg", "svg"), line = document.createElementNS(svg.namespaceURI, "line");
-  const shape = { x1: 0, x2: 20, y1: 4, y2: 4, stroke: colour(number), "stroke-width": 3, "stroke-dasharray": look(number).dash.join(" ") };
+  const svg = document.createElementNS("http://www.w3.org/2000/svg", "svg"),
+    line = document.createElementNS(svg.namespaceURI, "line");
+  const shape = {
+    x1: 0,
+    x2: 20,
+    y1: 4,
+    y2: 4,
+    stroke: colour(number),
+    "stroke-width": 3,
+    "stroke-dasharray": look(number).dash.join(" "),
+  };
   for (const [name, value] of Object.entries(shape)) line.setAttribute(name, value);
   svg.setAttribute("class", "key");
   svg.append(line);
@@ -29,10 +43,34 @@ function scaled(value, units) {
 }
 
 const UNITS = {
-  bytes: (v) => scaled(v, [[0, "B", 1], [1e3, "kB", 1e3], [1e6, "MB", 1e6], [1e9, "GB", 1e9]]),
-  rate: (v) => scaled(v, [[0, "B/s", 1], [1e3, "kB/s", 1e3], [1e6, "MB/s", 1e6], [1e9, "GB/s", 1e9]]),
-  seconds: (v) => v === 0 ? "0" : scaled(v, [[0, "µs", 1e-6], [1e-3, "ms", 1e-3], [1, "s", 1]]),
-  count: (v) => scaled(v, [[0, "", 1], [1e5, "k", 1e3], [1e6, "M", 1e6]]),
+  bytes: (v) =>
+    scaled(v, [
+      [0, "B", 1],
+      [1e3, "kB", 1e3],
+      [1e6, "MB", 1e6],
+      [1e9, "GB", 1e9],
+    ]),
+  rate: (v) =>
+    scaled(v, [
+      [0, "B/s", 1],
+      [1e3, "kB/s", 1e3],
+      [1e6, "MB/s", 1e6],
+      [1e9, "GB/s", 1e9],
+    ]),
+  seconds: (v) =>
+    v === 0
+      ? "0"
+      : scaled(v, [
+          [0, "µs", 1e-6],
+          [1e-3, "ms", 1e-3],
+          [1, "s", 1],
+        ]),
+  count: (v) =>
+    scaled(v, [
+      [0, "", 1],
+      [1e5, "k", 1e3],
+      [1e6, "M", 1e6],
+    ]),
 };
 
 class Plot {
@@ -44,7 +82,8 @@ class Plot {
     this.ranged = ranged;
     this.legend = legend;
     this.figure = document.createElement("figure");
-    const caption = document.createElement("figcaption"), name = document.createElement("b");
+    const caption = document.createElement("figcaption"),
+      name = document.createElement("b");
     name.textContent = title;
     this.told = document.createElement("output");
     caption.append(name, this.told);
@@ -57,39 +96,76 @@ class Plot {
     this.series = [];
   }
 
-  size() { return { width: Math.max(200, this.box.clientWidth), height: 190 }; }
+  size() {
+    return { width: Math.max(200, this.box.clientWidth), height: 190 };
+  }
 
   // `times`: seconds; `series`: [{name, number, mean, min, max}], lists as long as times, null where nothing is known.
   show(times, series, window) {
     const lines = (list) => JSON.stringify(list.map((one) => [one.name, one.number]));
     const same = this.chart && lines(series) === lines(this.series);
     [this.times, this.series, this.window] = [times, series, window];
-    if (same) this.chart.setData(this.data()); else this.rebuild();
+    if (same) this.chart.setData(this.data());
+    else this.rebuild();
     this.tell();
   }
 
-  data() { return [this.times, ...this.series.map((one) => one.mean)]; }
+  data() {
+    return [this.times, ...this.series.map((one) => one.mean)];
+  }
 
   rebuild() {
     this.chart?.destroy();
-    const axis = { stroke: styled("--soft"), grid: { stroke: styled("--line"), width: 1 }, ticks: { show: false }, font: "12px system-ui" };
+    this.focused = null;
+    const axis = {
+      stroke: styled("--soft"),
+      grid: { stroke: styled("--line"), width: 1 },
+      ticks: { show: false },
+      font: "12px system-ui",
+    };
     const options = {
-      ...this.size(), legend: { show: false }, padding: [8, 6, 0, 0],
-      cursor: { sync: { key: "time", setSeries: false }, drag: { x: true, y: false, setScale: false }, focus: { prox: 24 }, y: false },
+      ...this.size(),
+      legend: { show: false },
+      padding: [8, 6, 0, 0],
+      cursor: {
+        sync: { key: "time", setSeries: false },
+        drag: { x: true, y: false, setScale: false },
+        focus: { prox: 24 },
+        y: false,
+      },
       focus: { alpha: 0.25 },
       scales: { x: { time: true, range: () => this.window }, y: { range: () => this.range() } },
-      axes: [{ ...axis, size: 26, values: clock, space: 54 }, { ...axis, size: 70, values: (_, ticks) => ticks.map(this.unit) }],
-      series: [{}, ...this.series.map((one) => ({
-        label: one.name, stroke: colour(one.number), dash: look(one.number).dash, width: 1.5, points: { show: true, filter: lonely, size: 4, fill: colour(one.number) },
-      }))],
+      axes: [
+        { ...axis, size: 26, values: clock, space: 54 },
+        { ...axis, size: 70, values: (_, ticks) => ticks.map(this.unit) },
+      ],
+      series: [
+        {},
+        ...this.series.map((one) => ({
+          label: one.name,
+          stroke: colour(one.number),
+          dash: look(one.number).dash,
+          width: 1.5,
+          points: { show: true, filter: lonely, size: 4, fill: colour(one.number) },
+        })),
+      ],
       hooks: {
-        drawAxes: [(u) => this.drawSpread(u)], draw: [(u) => this.drawLimit(u)],
-        setCursor: [() => this.chart && this.tell()], setSeries: [() => this.chart && this.tell()],
-        setSelect: [(u) => {
-          if (u.select.width < 8) return;
-          this.ranged(u.posToVal(u.select.left, "x"), u.posToVal(u.select.left + u.select.width, "x"));
-          u.setSelect({ left: 0, width: 0, top: 0, height: 0 }, false);
-        }],
+        drawAxes: [(u) => this.drawSpread(u)],
+        draw: [(u) => this.drawLimit(u)],
+        setCursor: [() => this.chart && this.tell()],
+        setSeries: [
+          (_, line) => {
+            this.focused = line; // the one that is nearest to the pointer; null: none is near
+            if (this.chart) this.tell();
+          },
+        ],
+        setSelect: [
+          (u) => {
+            if (u.select.width < 8) return;
+            this.ranged(u.posToVal(u.select.left, "x"), u.posToVal(u.select.left + u.select.width, "x"));
+            u.setSelect({ left: 0, width: 0, top: 0, height: 0 }, false);
+          },
+        ],
       },
     };
     this.box.replaceChildren();
@@ -97,7 +173,8 @@ class Plot {
   }
 
   range() {
-    let low = 0, high = 0;
+    let low = 0,
+      high = 0;
     for (const one of this.series) {
       for (const v of one.min ?? one.mean) if (v < low) low = v;
       for (const v of one.max ?? one.mean) if (v > high) high = v;
@@ -147,16 +224,20 @@ class Plot {
   // Where nodes were beyond the limit: [index, value] each.
   beyond() {
     const found = [];
-    for (const one of this.series) (one.max ?? one.mean).forEach((value, i) => { if (value !== null && value > this.limit) found.push([i, value]); });
+    for (const one of this.series)
+      (one.max ?? one.mean).forEach((value, i) => {
+        if (value !== null && value > this.limit) found.push([i, value]);
+      });
     return found;
   }
 
   // Beside the title: what is under the pointer, else what is beyond the limit.
   tell() {
-    const { idx, left } = this.chart.cursor, at = this.chart.series.findIndex((one, i) => i && one._focus);
+    const { idx, left } = this.chart.cursor;
     this.told.className = "";
     if (left >= 0 && idx !== null && idx !== undefined) {
-      const one = this.series[at - 1], value = one?.mean[idx];
+      const one = this.series[this.focused - 1],
+        value = one?.mean[idx];
       const shown = one ? ` · ${one.name} · ${value === null ? "–" : this.unit(value)}` : "";
       this.told.textContent = new Date(1000 * this.times[idx]).toLocaleTimeString([], { hour12: false }) + shown;
     } else if (this.limit !== undefined) {
@@ -169,25 +250,35 @@ class Plot {
   }
 }
 
-// Calls `draw(context, x, y)`, whose `x` and `y` turn seconds and values into pixels of the canvas; clipped to the plot.
+// Calls `draw(context, x, y)`, whose `x` and `y` turn seconds and values into pixels of the canvas, inside the plot.
 function inside(u, draw) {
   const { ctx, bbox } = u;
   ctx.save();
   ctx.beginPath();
   ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
   ctx.clip();
-  draw(ctx, (seconds) => u.valToPos(seconds, "x", true), (value) => u.valToPos(value, "y", true));
+  draw(
+    ctx,
+    (seconds) => u.valToPos(seconds, "x", true),
+    (value) => u.valToPos(value, "y", true),
+  );
   ctx.restore();
 }
 
 // Points that have no neighbour, and so no line.
-function lonely(u, number, _, gaps) {
+function lonely(u, number) {
   const values = u.data[number];
   return values.flatMap((value, i) => (value != null && values[i - 1] == null && values[i + 1] == null ? [i] : []));
 }
 
 function clock(_, ticks, axis, space, step) {
   const days = ticks.length && ticks.at(-1) - ticks[0] > 86400;
-  const told = { hour12: false, hour: "2-digit", minute: "2-digit", ...(step < 60 && { second: "2-digit" }), ...(days && { day: "2-digit", month: "2-digit" }) };
+  const told = {
+    hour12: false,
+    hour: "2-digit",
+    minute: "2-digit",
+    ...(step < 60 && { second: "2-digit" }),
+    ...(days && { day: "2-digit", month: "2-digit" }),
+  };
   return ticks.map((tick) => new Date(1000 * tick).toLocaleString([], told));
 }

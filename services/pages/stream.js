@@ -19,7 +19,9 @@ async function follow(path, signal, taken, longest = 10000) {
   const reader = (await ask(path, signal)).body.pipeThrough(new TextDecoderStream()).getReader();
   for (let text = ""; ;) {
     let timer;
-    const silence = new Promise((_, fail) => { timer = setTimeout(() => fail(new Error("silent")), longest); });
+    const silence = new Promise((_, fail) => {
+      timer = setTimeout(() => fail(new Error("silent")), longest);
+    });
     const { done, value } = await Promise.race([reader.read(), silence]).finally(() => clearTimeout(timer));
     if (done) throw new Error("ended");
     const events = (text + value).split("\n\n");

@@ -2,7 +2,8 @@
 "use strict";
 
 (() => {
-  const NAMES = ["system", "light", "dark"], system = matchMedia("(prefers-color-scheme: dark)");
+  const NAMES = ["system", "light", "dark"],
+    system = matchMedia("(prefers-color-scheme: dark)");
   let chosen = NAMES.includes(localStorage.getItem("theme")) ? localStorage.getItem("theme") : "system";
 
   function show() {

@@ -194,6 +194,11 @@ def test_a_node_is_chosen_and_a_range_is_picked(filled: Shown, page: Page) -> No
     page.value("[...document.querySelectorAll('#chips button')].find(b => b.textContent === '/lossy').click()")
     page.until("held && held.nodes.length === 1")
     assert {one for one in page.value("held.sums.in") if one is not None} == {2000}
+    x, y, width, height = page.value(
+        "(b => [b.x, b.y, b.width, b.height])(document.querySelector('.u-over').getBoundingClientRect())"
+    )
+    page.do("Input.dispatchMouseEvent", type="mouseMoved", x=x + 0.9 * width, y=y + 0.1 * height)
+    page.until("document.querySelector('figcaption output').textContent.includes('/lossy · 3 kB/s')", 20)
     page.value("[...document.querySelectorAll('#chips button')].find(b => b.textContent === '/lossy').click()")
     page.until("held && held.nodes.length === 20")
     x, y, width = page.value(
