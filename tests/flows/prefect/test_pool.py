@@ -1,0 +1,58 @@
+"""Workers of a pool are started and stopped as the bus asks for them, and end with the command."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from tests.conftest import ROOT
+from tests.flows.prefect.conftest import Server, on, processes, wait_for
+
+MARK = "SCAN2SIM_TEST_POOL"
+ASK = """
+import sys, time
+from scan2sim.services.monitoring.bus import Bus
+from scan2sim.services.monitoring.events import WorkersWanted
+from scan2sim.services.monitoring.joined import BusParams
+from scan2sim.services.monitoring.monitor import ros
+ros.init()
+node = ros.Node("asks")
+bus = Bus(node, BusParams())
+end = time.monotonic() + 10
+while time.monotonic() < end:
+    bus.events.send("workers", WorkersWanted(queue="elastic", workers=int(sys.argv[1]), rate=0, waiting=0))
+    ros.spin_once(node, 0.5)
+"""
+
+
+@on("sqlite")
+def test_workers_of_a_pool_come_and_go(server: Server) -> None:
+    pytest.importorskip("cyclonedds", reason="no topics of ROS 2 here")
+    server.api("POST", "/work_pools/", {"name": "elastic", "type": "process"})
+    environment = server.env | {"PYTHONPATH": str(ROOT), "ROS_DOMAIN_ID": "103", MARK: "1"}
+    environment["SCAN2SIM_TRANSPORT"] = "cyclone"
+
+    def online() -> int:
+        found = server.api("POST", "/work_pools/elastic/workers/filter", {})
+        return sum(one["status"] == "ONLINE" for one in found)
+
+    def running() -> int:
+        return len(processes(MARK, "1"))
+
+    def ask(count: int) -> None:
+        asking = {name: value for name, value in environment.items() if name != MARK}
+        subprocess.run([sys.executable, "-c", ASK, str(count)], env=asking, check=True)
+
+    command = [sys.executable, "-m", "scan2sim.flows.cli", "monitor", "pool", "elastic", "--max-workers", "2"]
+    with subprocess.Popen(command, env=environment) as pool:
+        try:
+            wait_for("the least", lambda: online() == 1 and running() == 3, 120)  # the command, a keeper, a worker
+            ask(9)
+            wait_for("no more than the most", lambda: online() == 2 and running() == 5, 120)
+            ask(0)
+            wait_for("no fewer than the least", lambda: running() == 3, 120)
+        finally:
+            pool.kill()
+    wait_for("the end of all", lambda: not processes(MARK, "1"), 60)
