@@ -12,6 +12,7 @@ from scan2sim.flows.commands.app import App
 from scan2sim.flows.commands.display import console
 from scan2sim.flows.commands.options import options
 from scan2sim.pipeline import extras
+from scan2sim.services import transport
 from scan2sim.services.monitoring.joined import AlarmsParams, PoolParams, ScaleParams
 from scan2sim.services.monitoring.shown import PageParams
 from scan2sim.services.monitoring.traffic import TrafficParams
@@ -27,8 +28,12 @@ NODE_OPTIONS = {
     "prometheus_port": "--metrics",
 }
 """Names of `Watched`'s fields on the command line, where they are shorter there."""
-
 BUS_OPTIONS = {"kafka_bootstrap_servers": "--kafka", "log_file": "--log"}
+
+
+@app.callback()
+def _bus() -> None:
+    extras.need("the event bus", "psutil")
 
 
 @app.command("topic")
@@ -140,14 +145,15 @@ def monitor_page(
 
 def _spin(made: Callable[[], Any], finished: Callable[[Any], bool] = lambda _: False) -> None:
     """Run a node until it has finished, or is told to end, by Ctrl-C or SIGTERM."""
-    from scan2sim.services.monitoring.monitor import ros
-
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # what ends services ends them as Ctrl-C does
+    ros = transport.load()
     ros.init()
-    node = made()
     try:
-        while not finished(node):
-            ros.spin_once(node, 0.2)
+        node = made()
+        try:
+            while not finished(node):
+                ros.spin_once(node, 0.2)
+        finally:
+            node.destroy_node()
     finally:
-        node.destroy_node()
         ros.shutdown()
