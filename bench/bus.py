@@ -1,12 +1,14 @@
 """The event bus, measured.
 
-`python -m bench.bus [--parts experiment sizes forecast] [--speed 25] [--out DIR]`
+`python -m bench.bus [--parts experiment sizes forecast overhead broker] [--speed 25] [--out DIR]`
 
 - experiment: D3.2's section 3.2 through real nodes (bench/bus_experiment.py): Monday from 6 to 10 h, of 10, 20 and 50
   cameras at once, so many times as fast, with messages that tell their size; plots go to DIR.
 - sizes: half an hour of its rush, of 50 cameras, with messages as large as the mission's events, at 20 times
   the speed; it begins in the rush, so with four workers.
 - forecast: what forecasts are worth on the curve's Mondays (bench/bus_forecast.py).
+- overhead: a publisher and a subscriber, watched against bare (bench/bus_cost.py); wants a quiet machine.
+- broker: records of ten nodes, and a broker that is away for a minute (bench/bus_broker.py).
 
 Ends with `RESULT {json}`; null where a part was left out.
 """
@@ -20,7 +22,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from bench import bus_experiment, bus_forecast
+from bench import bus_broker, bus_cost, bus_experiment, bus_forecast
 from bench.bus_experiment import LIMIT, Outcome, Replay
 
 RUSH = (7.5, 8.0)
@@ -51,8 +53,14 @@ def forecast(_: argparse.Namespace) -> dict[str, Any]:
 
 
 PARTS: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {
-    "experiment": experiment, "sizes": sizes, "forecast": forecast,
-}  # fmt: skip
+    "experiment": experiment,
+    "sizes": sizes,
+    "forecast": forecast,
+    "overhead": lambda _: bus_cost.overhead(),
+    "broker": lambda _: bus_broker.broker_down(),
+}
+FLAT = ("overhead", "broker")
+"""Parts whose figures stand in the result by their own names."""
 
 
 def _print(replays: Sequence[Replay], outcomes: Sequence[Outcome]) -> None:
@@ -97,7 +105,10 @@ def main() -> None:
     parser.add_argument("--speed", type=float, default=25.0)
     parser.add_argument("--out", type=Path, default=Path(tempfile.gettempdir()) / "scan2sim-bus")
     given = parser.parse_args()
-    result = {name: part(given) if name in given.parts else None for name, part in PARTS.items()}
+    found = {name: part(given) if name in given.parts else None for name, part in PARTS.items()}
+    result = {name: figures for name, figures in found.items() if name not in FLAT}
+    for name in FLAT:
+        result |= found[name] or {}
     print("RESULT " + json.dumps(result))
 
 

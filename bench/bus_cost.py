@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parent.parent
 ROS_PYTHON = ROOT / ".venv-ros" / "bin" / "python"
 LOADS = {"1kb": (1000, 1000.0, 5000), "6mb": (6_220_800, 30.0, 150)}
 """Bytes, messages a second, messages."""
-TURNS = 5
+TURNS = 3
 """Pairs of a bare and a watched run; medians of their ratios count."""
 DOMAIN = "87"
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -38,6 +41,32 @@ def test_messages_of_all_kinds_cross(first: str, second: str, start: Start) -> N
         assert [one["type"] for one in publishers] == ["std_msgs/msg/String"]
         if not (me == "rclpy" and other == "cyclone"):  # there, rclpy finds no name of the node
             assert publishers[0]["node"] == ("node_two" if found is told[0] else "node_one")
+
+
+@pytest.fixture(scope="module")
+def peer(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Another vendor's program, compiled."""
+    program = tmp_path_factory.mktemp("peer") / "peer"
+    if not shutil.which("g++") or not Path("/usr/include/fastdds").is_dir():
+        pytest.skip("Fast DDS isn't installed (tests/services/packages.txt)")
+    source = Path(__file__).with_name("peer.cpp")
+    subprocess.run(["g++", "-std=c++17", "-o", program, source, "-lfastrtps", "-lfastcdr"], check=True)
+    return program
+
+
+@pytest.mark.parametrize("transport", ["cyclone", "rclpy"])
+def test_messages_cross_to_another_vendor_and_back(transport: str, start: Start, peer: Path, domain: str) -> None:
+    node = start(transport, CROSSING, "one", "two", SECONDS)
+    other = subprocess.run(
+        [peer, "two", "one", SECONDS], env=os.environ | {"ROS_DOMAIN_ID": domain}, capture_output=True, timeout=60
+    )
+    theirs = json.loads(other.stdout)
+    out, errors = node.communicate(timeout=60)
+    assert node.returncode == 0, errors
+    mine = json.loads(out.splitlines()[-1])
+    assert theirs["text"] == mine["text"] == "Straße, 画像"
+    assert theirs["count"] > 10 and mine["heard"]["String"]["count"] > 10
+    assert abs(mine["heard"]["String"]["latency"]) < 5  # seconds: it is a time of sending
 
 
 def test_a_transport_that_is_none_is_told() -> None:
