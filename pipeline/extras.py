@@ -30,6 +30,7 @@ EXTRA_OF = {
     "prometheus_client": "bus",
     "fastapi": "bus",
     "uvicorn": "bus",
+    "pyarrow": "bus",
 }
 """A package's import name to the extra of `scan2sim` that installs it."""
 

@@ -22,6 +22,8 @@ from scan2sim.flows.recipes.steps import STEPS
 from scan2sim.pipeline.classes import SURFACES
 from scan2sim.pipeline.io.survey import SurveyFile
 from scan2sim.pipeline.io.tile import TileFile
+from scan2sim.pipeline.step import Params
+from scan2sim.services.monitoring.rules import Rule
 from tests.conftest import ROOT
 
 ROOMS = ("pipeline", "segmentation", "texturing", "slam", "flows", "services", "data_samples")
@@ -111,6 +113,12 @@ def figures() -> set[str]:
     return set(re.findall(r'"([a-z_0-9]+)"', "".join(path.read_text(encoding="utf-8") for path in MODULES)))
 
 
+class RulesFile(Params):
+    """A file of alarms' rules."""
+
+    rules: list[Rule]
+
+
 def refused(model: type[BaseModel], table: dict[str, Any]) -> list[Any]:
     """What a model refuses of a table, part of which may be missing."""
     try:
@@ -120,18 +128,21 @@ def refused(model: type[BaseModel], table: dict[str, Any]) -> list[Any]:
     return []
 
 
+FILES = (Drive, TileFile, SurveyFile, RulesFile)
+
+
 @pytest.mark.parametrize("page", named([page for page in PAGES + MODULES if "```toml" in about(page)]))
 def test_toml_has_the_fields_that_are_read(page: Path) -> None:
     for block in re.findall(r"```toml\n(.*?)```", about(page), re.DOTALL):
         table = tomllib.loads(block)
-        models = [model for model in (Drive, TileFile, SurveyFile) if not refused(model, table)]
+        models = [model for model in FILES if not refused(model, table)]
         settings = [step for step in table if step in PARAMS and not isinstance(table[step], str)]
         if len(settings) == len(table) and not models:
             for step in settings:
                 values = {k: v for k, v in table[step].items() if k not in SURFACES}
                 assert not refused(PARAMS[step], values), f"there is no {step} with {values}"
         else:
-            assert models, f"no file has {[refused(model, table) for model in (Drive, TileFile, SurveyFile)]}"
+            assert models, f"no file has {[refused(model, table) for model in FILES]}"
 
 
 def test_the_page_of_drives_names_all_their_fields_and_no_others() -> None:

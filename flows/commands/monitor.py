@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import signal
+import sys
+import threading
 from collections.abc import Callable
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from scan2sim.flows.commands.app import App
-from scan2sim.flows.commands.display import console
+from scan2sim.flows.commands.display import console, warn
 from scan2sim.flows.commands.options import options
 from scan2sim.pipeline import extras
 from scan2sim.services import transport
 from scan2sim.services.monitoring.joined import AlarmsParams, PoolParams, ScaleParams
+from scan2sim.services.monitoring.kept import ArchiveParams, QueryParams
 from scan2sim.services.monitoring.shown import PageParams
 from scan2sim.services.monitoring.traffic import TrafficParams
 from scan2sim.services.monitoring.watched import DatasetParams, ListenerParams, TalkerParams, TopicParams, WorkParams
@@ -141,6 +145,36 @@ def monitor_page(
     from scan2sim.services.monitoring.page import serve
 
     serve(params, lambda text: console.print(text, highlight=False, markup=False))
+
+
+@app.command("archive")
+@options(ArchiveParams, kafka_bootstrap_servers="--kafka")
+def monitor_archive(params: ArchiveParams) -> None:
+    """Keep records that come by Kafka, as Parquet by hour."""
+    extras.need("the archive", "pyarrow", "confluent_kafka")
+    from scan2sim.services.monitoring.archive import keep
+
+    ended = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: ended.set())
+    keep(params, ended, warn)
+
+
+@app.command("query")
+@options(QueryParams)
+def monitor_query(
+    params: QueryParams,
+    begin: Annotated[str | None, typer.Option("--from", help=QueryParams.model_fields["begin"].description)] = None,
+    end: Annotated[str | None, typer.Option("--until", help=QueryParams.model_fields["end"].description)] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="CSV file; default: print it.")] = None,
+) -> None:
+    """Ask an archive: messages, bandwidth, losses and latency by node, topic and span of time, as CSV."""
+    extras.need("the archive", "pyarrow")
+    from pyarrow import csv
+
+    from scan2sim.services.monitoring.archive import query
+
+    csv.write_csv(query(params), sys.stdout.buffer if out is None else out)
 
 
 def _spin(made: Callable[[], Any], finished: Callable[[Any], bool] = lambda _: False) -> None:

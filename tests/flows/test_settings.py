@@ -21,6 +21,7 @@ from scan2sim.pipeline.steps.import_sweeps import SweepsParams
 from scan2sim.pipeline.steps.split import SPLIT
 from scan2sim.pipeline.steps.trim import TRIM
 from scan2sim.services.monitoring.joined import ScaleParams
+from scan2sim.services.monitoring.kept import QueryParams
 from scan2sim.services.monitoring.shown import PageParams
 from scan2sim.services.monitoring.traffic import TrafficParams
 from scan2sim.services.monitoring.watched import DatasetParams, TalkerParams, TopicParams, WorkParams
@@ -138,7 +139,7 @@ def test_every_number_that_a_command_takes_has_a_range() -> None:
     found = [loaded(name) for name in COMMANDS]
     single = [one for some in found for one in getattr(some, "commands", {"": some}).values()]
     hints = [get_type_hints(one.callback) for one in single]
-    bus = (TopicParams, TalkerParams, DatasetParams, TrafficParams, WorkParams, ScaleParams, PageParams)
+    bus = (QueryParams, TopicParams, TalkerParams, DatasetParams, TrafficParams, WorkParams, ScaleParams, PageParams)
     numbers = {name for of in hints for name, kind in of.items() if {int, float} & {kind, *get_args(kind)}}
     assert len(numbers) > 15 and numbers <= {
         name for model in (Numbers, Filmed, CutParams, SweepsParams, *bus) for name in model.model_fields

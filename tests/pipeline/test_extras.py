@@ -108,6 +108,7 @@ USES = {
     "prometheus_client": ["monitor talker chatter --metrics 0"],
     "fastapi": ["monitor page --kafka localhost:9"],
     "uvicorn": ["monitor page --kafka localhost:9"],
+    "pyarrow": ["monitor archive kept", "monitor query kept"],
 }  # fmt: skip
 """Commands by a package that they can't do without."""
 

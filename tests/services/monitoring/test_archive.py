@@ -1,0 +1,111 @@
+"""Records kept for analysis: Parquet by hour, none twice, and what is asked of them."""
+
+from __future__ import annotations
+
+import csv
+import json
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+from typer.testing import CliRunner
+
+from scan2sim.flows.cli import app
+from scan2sim.pipeline.errors import InputError
+from scan2sim.services import kafka
+from scan2sim.services.monitoring.archive import Archive, keep, query
+from scan2sim.services.monitoring.kept import ArchiveParams, QueryParams
+from scan2sim.services.monitoring.record import Record, TopicFlow
+from scan2sim.services.records import Kept
+from tests.services.conftest import Broker
+
+NOON = 1_700_000_000 // 3600 * 3600
+
+
+def record(number: int, when: float, *, node: str = "camera", lost: int = 0, latency: float = 0.1) -> Record:
+    flow = TopicFlow(
+        topic="/image", direction="incoming", type="sensor_msgs/msg/Image", bandwidth=1000.0, messages=10, size=100.0,
+        sent=10 + lost, lost=lost, latency=round(latency * 1e9), latency_p95=round(2e9 * latency),
+    )  # fmt: skip
+    return Record(
+        id=f"{node}:{number}", time=when, period=1.0, node_name=node, node_namespace="/site", node_id=node,
+        bandwidth=1000.0, messages=10, size=100.0, out_bandwidth=0.0, out_messages=0, out_size=0.0,
+        in_bandwidth=1000.0, in_messages=10, in_size=100.0, latency=None, latency_p95=None, lost=lost, publishers=1,
+        subscribers=1, topics=["/image"], flows=[flow], hostname="here", local_ip="", local_ips=[], endpoints=[],
+        cpu_times={}, cpu_percent=50.0, virtual_memory={"percent": 30.0}, disk_usage=[],
+    )  # fmt: skip
+
+
+def asked(folder: Path, **what: Any) -> list[dict[str, Any]]:
+    return query(QueryParams.of("", {"archive": folder, **what})).to_pylist()
+
+
+def test_what_is_kept_is_told_by_span_node_and_topic(tmp_path: Path) -> None:
+    archive = Archive(tmp_path)
+    for number in range(120):
+        archive.add(record(number, NOON + number, lost=number % 2, latency=0.1 if number < 60 else 0.3))
+        archive.add(record(number, NOON + number, node="lidar"))
+    archive.write()
+    first, second = asked(tmp_path, node="/site/camera")
+    assert (first["messages"], first["lost"], first["published"], first["bandwidth"]) == (600, 30, 630, 1000.0)
+    assert (first["latency"], second["latency"], second["latency_p95"]) == pytest.approx((0.1, 0.3, 0.6))
+    assert first["begins_at"].timestamp() == NOON // 60 * 60 and first["topic"] == "/image"
+    assert len(asked(tmp_path)) == 4
+    assert len(asked(tmp_path, begin=NOON + 60, end=NOON + 90)) == 2
+    assert asked(tmp_path, topic="/other") == []
+    assert len(asked(tmp_path, every=3600)) == 2
+
+
+def test_an_hour_that_is_over_is_one_file_and_nothing_is_there_twice(tmp_path: Path) -> None:
+    for _ in range(2):  # a reader that was killed after it had written is given the same again
+        archive = Archive(tmp_path)
+        for number in range(3600):
+            if number % 60 == 0:
+                archive.add(record(number, NOON + number))
+        archive.write()
+    archive.join(NOON + 3600)  # too soon: records may be late
+    assert not list(tmp_path.glob("*/*.parquet"))
+    archive.join(NOON + 2 * 3600)
+    (whole,) = tmp_path.rglob("*.parquet")
+    assert whole.parent.parent == tmp_path
+    table = pq.read_table(whole)
+    assert table.num_rows == 60
+    assert json.loads(table["record"][0].as_py())["node name"] == "camera"
+    archive.add(record(9999, NOON + 10))  # later than late
+    archive.write()
+    archive.join(NOON + 2 * 3600)
+    assert sum(one["messages"] for one in asked(tmp_path)) == 610
+
+
+def test_an_archive_that_is_none_and_one_that_is_damaged_are_told(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="holds no records"):
+        asked(tmp_path)
+    (tmp_path / "2026-11-22").mkdir()
+    (tmp_path / "2026-11-22" / "15.parquet").write_bytes(b"PAR1 and no more")
+    with pytest.raises(InputError, match=r"15\.parquet"):
+        asked(tmp_path)
+
+
+def test_records_that_come_by_kafka_are_kept_and_can_be_asked_for(tmp_path: Path, broker: Broker) -> None:
+    told = [record(number, NOON + number) for number in range(1, 6)]
+    bodies = [Kept(number, one.id, one.json_line().encode()) for number, one in enumerate(told)]
+    kafka.Topic(broker.servers, "records").send([*bodies, Kept(9, "other:1", b"no record"), *bodies])
+    ended, unread = threading.Event(), list[str]()
+    params = ArchiveParams(archive=tmp_path / "kept", kafka_bootstrap_servers=broker.servers, topic="records")
+    keeping = threading.Thread(target=keep, args=(params, ended, unread.append))
+    keeping.start()
+    until = time.monotonic() + 30
+    while not unread and time.monotonic() < until:
+        time.sleep(0.1)
+    time.sleep(1.0)
+    ended.set()
+    keeping.join(30)
+    assert len(unread) == 1
+    out = tmp_path / "told.csv"
+    arguments = ["monitor", "query", str(tmp_path / "kept"), "--from", "2023-11-14T22:00", "--out", str(out)]
+    assert CliRunner().invoke(app, arguments).exit_code == 0
+    (line,) = csv.DictReader(out.open())
+    assert (line["node"], line["messages"]) == ("/site/camera", "50")
