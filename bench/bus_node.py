@@ -94,7 +94,9 @@ def _node(role: str, kind: str) -> Any:
     if ros.__name__.endswith("rclpy"):
         import rclpy
 
-        return rclpy.create_node(role)
+        node = rclpy.create_node(role)
+        node.own_executor = None  # as `spin_once` wants it
+        return node
     return _Bare()
 
 
