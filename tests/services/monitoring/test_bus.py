@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import subprocess
 
-from tests.services.conftest import Broker, Start
+from bench.bus_broker import Broker
+from tests.services.conftest import Start
 
 PROGRAM = """
 import sys, time

@@ -11,10 +11,11 @@ from typing import Any
 
 import pytest
 
+from bench.bus_broker import Broker
 from scan2sim.services import kafka
 from scan2sim.services.monitoring.record import Record
 from scan2sim.services.records import Spool
-from tests.services.conftest import Broker, Start
+from tests.services.conftest import Start
 
 NODE = """
 import sys, time

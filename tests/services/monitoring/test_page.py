@@ -18,6 +18,7 @@ import pytest
 
 pytest.importorskip("fastapi", reason="the extra bus isn't installed")
 
+from bench.bus_broker import Broker
 from scan2sim.pipeline.errors import SettingError
 from scan2sim.services import serving
 from scan2sim.services.kafka import Topic
@@ -26,7 +27,6 @@ from scan2sim.services.monitoring.page import Reader, application
 from scan2sim.services.monitoring.shown import Limits, PageParams
 from scan2sim.services.records import Kept
 from tests.browser import Page, chromium
-from tests.services.conftest import Broker
 from tests.services.monitoring.telling import record
 
 HOSTILE = "<img src=x onerror=document.title='hacked'>"
