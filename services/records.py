@@ -12,11 +12,12 @@ import sqlite3
 import threading
 import time
 import uuid
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.errors import BusyError, InputError
 
 log = logging.getLogger(__name__)
 
@@ -38,11 +39,13 @@ class Kept:
         number: its place in the order.
         id: unlike any other's.
         body: what it says.
+        share: what it counts for, where room is short.
     """
 
     number: int
     id: str
     body: bytes
+    share: str = ""
 
 
 def new_ids() -> Callable[[], str]:
@@ -57,49 +60,62 @@ def new_ids() -> Callable[[], str]:
     return next_id
 
 
-_TABLE = "CREATE TABLE IF NOT EXISTS records (number INTEGER PRIMARY KEY, id TEXT, body BLOB, sent REAL)"
+_TABLE = "CREATE TABLE IF NOT EXISTS records (number INTEGER PRIMARY KEY, id TEXT, share TEXT, body BLOB, sent REAL)"
 _WAIT = "FROM records WHERE sent IS NULL"
 
 
 class Spool:
-    """Records on disk, first in, first out; may be used from any thread.
+    """Records on disk, first in, first out; may be used from any thread, and by one process at a time.
+
+    Where room is short, the share that takes most of it gives up its oldest record (longest queue drop: Suter et al.,
+    Design considerations for supporting TCP with per-flow queueing, 1998): none crowds out others.
 
     Attributes:
-        dropped: records that were given up unsent, as there was no room.
+        dropped: by share, records that were given up unsent, as there was no room.
     """
 
     def __init__(self, path: Path, most_bytes: int = KEPT_BYTES) -> None:
         """Keep them in a file, which is made if it isn't there; what an earlier life left there is sent first.
 
         Raises:
+            BusyError: another process has it.
             InputError: there is something else in its place.
         """
         self._most, self._lock = most_bytes, threading.Lock()
         path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            self._base = sqlite3.connect(path, check_same_thread=False, isolation_level=None)
-            self._base.execute("PRAGMA journal_mode = WAL")
-            self._base.execute("PRAGMA synchronous = OFF")  # a kill loses nothing, a power cut the last moments
-            self._base.execute(_TABLE)
-            self._bytes = int(self._base.execute("SELECT coalesce(sum(length(body)), 0) FROM records").fetchone()[0])
-        except sqlite3.DatabaseError as error:
-            raise InputError(path, f"holds no records ({error})", "Move it away; a new one is made") from None
-        self.dropped = 0
+        self._base = _connected(path)
+        shares = self._base.execute("SELECT share, sum(length(body)) FROM records GROUP BY share").fetchall()
+        self._bytes = Counter(dict(shares))
+        self.dropped = Counter[str]()
 
-    def append(self, record_id: str, body: bytes) -> None:
-        """Keep a record; the oldest ones are dropped where there is no room."""
+    def append(self, record_id: str, body: bytes, share: str = "") -> None:
+        """Keep a record."""
         with self._lock:
-            self._base.execute("INSERT INTO records (id, body) VALUES (?, ?)", (record_id, body))
-            self._bytes += len(body)
-            while self._bytes > self._most:
-                oldest = self._base.execute("SELECT number, sent IS NULL FROM records ORDER BY number").fetchone()
-                self._forget("number = ?", oldest[0])
-                self.dropped += oldest[1]
+            try:
+                self._base.execute("INSERT INTO records (id, share, body) VALUES (?, ?, ?)", (record_id, share, body))
+            except sqlite3.OperationalError as error:  # the disk is full
+                self.dropped[share] += 1
+                log.warning("a record could not be kept: %s", error)
+                return
+            self._bytes[share] += len(body)
+            while self._bytes.total() > self._most:
+                (largest, _), *_ = self._bytes.most_common(1)
+                oldest = "SELECT number, sent IS NULL FROM records WHERE share = ? ORDER BY number LIMIT 1"
+                number, unsent = self._base.execute(oldest, (largest,)).fetchone()
+                self._forget("number = ?", number)
+                self.dropped[largest] += unsent
+
+    def take_over(self, other: Spool) -> None:
+        """Keep what waits in another, which is empty then."""
+        while waiting := other.first():
+            for record in waiting:
+                self.append(record.id, record.body, record.share)
+            other.done(waiting[-1])
 
     def first(self, count: int = BATCH) -> list[Kept]:
         """The records that wait longest, in order."""
         with self._lock:
-            rows = self._base.execute(f"SELECT number, id, body {_WAIT} ORDER BY number LIMIT ?", (count,))
+            rows = self._base.execute(f"SELECT number, id, body, share {_WAIT} ORDER BY number LIMIT ?", (count,))
             return [Kept(*row) for row in rows]
 
     def done(self, last: Kept) -> None:
@@ -120,14 +136,35 @@ class Spool:
             return int(self._base.execute(f"SELECT count(*) {_WAIT}").fetchone()[0])
 
     def _forget(self, which: str, value: float) -> None:
-        sizes = self._base.execute(f"SELECT sum(length(body)) FROM records WHERE {which}", (value,))
-        self._bytes -= sizes.fetchone()[0] or 0
+        sizes = self._base.execute(
+            f"SELECT share, sum(length(body)) FROM records WHERE {which} GROUP BY share", (value,)
+        )
+        self._bytes.subtract(dict(sizes.fetchall()))
         self._base.execute(f"DELETE FROM records WHERE {which}", (value,))
 
     def close(self) -> None:
         """Release the file."""
         with self._lock:
             self._base.close()
+
+
+def _connected(path: Path) -> sqlite3.Connection:
+    """The file, which is locked until it is closed or the process ends, however that comes."""
+    base = None
+    try:
+        base = sqlite3.connect(path, timeout=0, check_same_thread=False, isolation_level=None)
+        base.execute("PRAGMA locking_mode = EXCLUSIVE")
+        base.execute("PRAGMA journal_mode = WAL")
+        base.execute("PRAGMA synchronous = OFF")  # a kill loses nothing, a power cut the last moments
+        base.execute(_TABLE)
+        base.execute("UPDATE records SET share = share WHERE number IS NULL")  # writes nothing, but takes the lock
+    except sqlite3.DatabaseError as error:
+        if base is not None:
+            base.close()
+        if error.sqlite_errorcode == sqlite3.SQLITE_BUSY:
+            raise BusyError(path, "another process keeps records there", "Give each a --spool of its own") from None
+        raise InputError(path, f"can't hold records ({error})", "Name another file, or move that one away") from None
+    return base
 
 
 class Sender:
@@ -198,8 +235,8 @@ class Once:
 
     def new(self, record_id: str) -> bool:
         """Whether a record, by its id, wasn't taken yet; it counts as taken from now on."""
-        maker, _, told = record_id.rpartition(":")
-        number, last = int(told), self._last.pop(maker, 0)
+        maker, _, numbered = record_id.rpartition(":")
+        number, last = int(numbered), self._last.pop(maker, 0)
         awaited = self._awaited.setdefault(maker, set())
         self._last[maker] = max(last, number)
         if len(self._last) > self.MAKERS:

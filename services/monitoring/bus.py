@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import tempfile
 import threading
-from pathlib import Path
 from typing import Any
 
-from scan2sim.services import kafka
+from scan2sim.services import kafka, spools
 from scan2sim.services.monitoring.events import Event, Events
 from scan2sim.services.monitoring.joined import BusParams
 from scan2sim.services.monitoring.monitor import RECORDS, STRING, ros
@@ -28,7 +26,7 @@ class Bus:
         self._closed = threading.Event()
         self._readers: list[threading.Thread] = []
         if servers := params.kafka_bootstrap_servers:
-            spool = Path(tempfile.gettempdir()) / f"scan2sim-{name}.events"
+            spool = spools.opened(f"{node.get_namespace()}/{name}", params.events_topic)
             self.events.outlets.append(Kafka(servers, params.events_topic, spool))
             for topic in topics:
                 reader = threading.Thread(target=self._read, args=(servers, topic, f"scan2sim-{name}"), daemon=True)

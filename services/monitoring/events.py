@@ -106,6 +106,11 @@ class Event(BaseModel):
     kind: str
     body: dict[str, Any]
 
+    @property
+    def share(self) -> str:
+        """What it counts for in a spool, where room is short: a flood of one kind doesn't crowd out alarms."""
+        return self.kind
+
     def json_line(self) -> str:
         """As one line of JSON."""
         return self.model_dump_json(by_alias=True)

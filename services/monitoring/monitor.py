@@ -107,7 +107,7 @@ class Monitor(ros.Node):  # type: ignore[misc]
         self._next_id, self._ended = new_ids(), threading.Event()
         super().__init__(node_name, namespace=namespace, **named)
         self._companion = _Companion(node_name, namespace, watched.publisher_topic)
-        self._sinks = sinks.opened(watched, node_name)
+        self._sinks = sinks.opened(watched, f"{self.get_namespace()}/{node_name}")
         self._telling = threading.Thread(
             target=self._tell_periodically, args=(watched.period,), name=f"{node_name} monitor", daemon=True
         )
@@ -193,7 +193,7 @@ class Monitor(ros.Node):  # type: ignore[misc]
             ],
             remarks=self._remarks(endpoints),
             clock_synchronised=clock.synchronised(),
-            dropped=sum(sink.dropped for sink in self._sinks),
+            dropped=sum(sum(sink.dropped.values()) for sink in self._sinks),
             **Record.machine(self._machine.read()),
         )
 

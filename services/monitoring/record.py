@@ -1,4 +1,4 @@
-"""A record: what a monitor tells of a node or topic once a period, by the field names of D3.2's code snippet 4.
+"""A record: what a monitor reports of a node or topic once a period, by the field names of D3.2's code snippet 4.
 
 `Record` is the schema, too: `python -m scan2sim.services.monitoring.record` prints it as JSON Schema.
 """
@@ -18,11 +18,11 @@ SCHEMA = "scan2sim-monitor-1"
 """Changes when a field does."""
 
 
-class _Told(BaseModel):
+class _Model(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
 
 
-class Profile(_Told):
+class Profile(_Model):
     """A quality of service; durations in nanoseconds, 9223372036854775807 for never."""
 
     reliability: str
@@ -33,7 +33,7 @@ class Profile(_Told):
     lease: int = Field(alias="liveliness lease duration (nanoseconds)")
 
 
-class EndpointInfo(_Told):
+class EndpointInfo(_Model):
     """A publisher or a subscription; `GID` as numbers from 0 to 255."""
 
     node_name: str = Field(alias="node name")
@@ -44,7 +44,7 @@ class EndpointInfo(_Told):
     qos: Profile = Field(alias="QoS profile")
 
 
-class TopicEndpoints(_Told):
+class TopicEndpoints(_Model):
     """Who is on a topic."""
 
     topic_name: str = Field(alias="topic name")
@@ -52,7 +52,7 @@ class TopicEndpoints(_Told):
     subscriptions: list[EndpointInfo] = Field(alias="subscriptions_info_by_topic")
 
 
-class TopicFlow(_Told):
+class TopicFlow(_Model):
     """One direction of one topic over the period.
 
     Attributes:
@@ -77,7 +77,7 @@ class TopicFlow(_Told):
     clock_uncertainty: int | None = Field(None, alias="clock uncertainty (nanoseconds)")
 
 
-class Record(_Told):
+class Record(_Model):
     """What a node did over a period.
 
     Attributes:
@@ -132,6 +132,11 @@ class Record(_Told):
     def machine(read: Mapping[str, Any]) -> dict[str, Any]:
         """Fields of a machine's reading (`machine.Machine.read`), by their names here."""
         return {name.replace(" ", "_"): value for name, value in read.items()}
+
+    @property
+    def share(self) -> str:
+        """What it counts for in a spool, where room is short."""
+        return "records"
 
     def json_line(self) -> str:
         """As one line of JSON."""
@@ -195,7 +200,7 @@ def sums(reading: Reading, period: float) -> dict[str, Any]:
 
 
 def endpoint_info(endpoint: Endpoint) -> EndpointInfo:
-    """An endpoint as records tell it."""
+    """An endpoint as it stands in records."""
     qos = endpoint.qos
     return EndpointInfo(
         node_name=endpoint.node_name,

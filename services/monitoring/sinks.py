@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import logging
 import logging.handlers
-import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Protocol
 
 from scan2sim.pipeline import extras
+from scan2sim.services import spools
 from scan2sim.services.kafka import Topic
 from scan2sim.services.monitoring.record import Record
 from scan2sim.services.monitoring.watched import Watched
@@ -18,12 +19,16 @@ LOG_BYTES, LOG_FILES = 16 * 2**20, 4
 """Size of a log, and how many older ones are kept beside it."""
 
 
-class Told(Protocol):
-    """What has an id and is told as a line of JSON: a record, an event."""
+class Message(Protocol):
+    """What goes to Kafka: a record, an event."""
 
     @property
     def id(self) -> str:
         """Unlike any other's."""
+
+    @property
+    def share(self) -> str:
+        """What it counts for, where room is short."""
 
     def json_line(self) -> str:
         """As one line of JSON."""
@@ -33,8 +38,8 @@ class Sink(Protocol):
     """Takes records."""
 
     @property
-    def dropped(self) -> int:
-        """Records that were given up, as there was no room for them."""
+    def dropped(self) -> Mapping[str, int]:
+        """Messages that were given up, as there was no room for them, by their share."""
 
     def send(self, record: Record, /) -> None:
         """Take one, at once."""
@@ -43,11 +48,11 @@ class Sink(Protocol):
         """Take no more."""
 
 
-def opened(watched: Watched, node_name: str) -> list[Sink]:
-    """All that were asked for."""
+def opened(watched: Watched, node: str) -> list[Sink]:
+    """All that were asked for, of a node by its full name."""
     found: list[Sink] = []
     if watched.kafka_bootstrap_servers:
-        spool = watched.spool or Path(tempfile.gettempdir()) / f"scan2sim-{node_name}.records"
+        spool = Spool(watched.spool) if watched.spool else spools.opened(node, watched.publisher_topic)
         found.append(Kafka(watched.kafka_bootstrap_servers, watched.publisher_topic, spool))
     if watched.log_file:
         found.append(Lines.file(watched.log_file))
@@ -61,18 +66,18 @@ def opened(watched: Watched, node_name: str) -> list[Sink]:
 class Kafka:
     """A topic of Kafka, by way of the disk: what can't be sent now is sent later, in order."""
 
-    def __init__(self, servers: str, topic: str, spool: Path) -> None:
-        self._spool = Spool(spool)
+    def __init__(self, servers: str, topic: str, spool: Spool) -> None:
+        self._spool = spool
         self._sender = Sender(self._spool, Topic(servers, topic).send)
 
     @property
-    def dropped(self) -> int:
-        """Records that were given up, as there was no room for them on disk."""
+    def dropped(self) -> Mapping[str, int]:
+        """Messages that were given up, as there was no room for them on disk, by their share."""
         return self._spool.dropped
 
-    def send(self, told: Told) -> None:
+    def send(self, message: Message) -> None:
         """Keep it, to be sent."""
-        self._spool.append(told.id, told.json_line().encode())
+        self._spool.append(message.id, message.json_line().encode(), message.share)
         self._sender.wake()
 
     def close(self) -> None:
@@ -84,7 +89,7 @@ class Kafka:
 class Lines:
     """A line of JSON a record: in a file that is changed when it is full, or on the console."""
 
-    dropped = 0
+    dropped: Mapping[str, int] = {}
 
     def __init__(self, handler: logging.Handler) -> None:
         self._handler = handler
@@ -112,7 +117,7 @@ class Lines:
 class Prometheus:
     """The last record's figures at http://HOST:PORT/metrics."""
 
-    dropped = 0
+    dropped: Mapping[str, int] = {}
 
     def __init__(self, port: int, host: str = "127.0.0.1") -> None:
         extras.need("Prometheus", "prometheus_client")

@@ -30,7 +30,7 @@ class Watched(Params):
         int | None, Field(ge=0, le=65535, description="Port where the last figures are shown to Prometheus.")
     ] = None
     spool: Annotated[
-        Path | None, Field(description="File for records that wait for Kafka; default: among temporary files.")
+        Path | None, Field(description="File for records that wait for Kafka; default: in the user's state folder.")
     ] = None
 
     def monitored(self) -> dict[str, Any]:

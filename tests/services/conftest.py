@@ -35,14 +35,20 @@ def pythons() -> dict[str, str]:
 
 
 @pytest.fixture
-def start(domain: str, pythons: dict[str, str]) -> Iterator[Start]:
+def start(domain: str, pythons: dict[str, str], tmp_path: Path) -> Iterator[Start]:
     """Starts a program under a transport: `start("rclpy", "program", "argument")`; all end with the test."""
     running: list[subprocess.Popen[str]] = []
 
     def started(transport: str, *arguments: str | Path, **environment: str) -> subprocess.Popen[str]:
         if transport not in pythons:
             pytest.skip("rclpy isn't installed (.venv-ros, tests/services/ros-requirements.txt)")
-        told = {"SCAN2SIM_TRANSPORT": transport, "ROS_DOMAIN_ID": domain, "PYTHONPATH": str(ROOT), **environment}
+        told = {
+            "SCAN2SIM_TRANSPORT": transport,
+            "ROS_DOMAIN_ID": domain,
+            "PYTHONPATH": str(ROOT),
+            "XDG_STATE_HOME": str(tmp_path / "state"),
+            **environment,
+        }
         process = subprocess.Popen(
             [pythons[transport], *map(str, arguments)],
             env=os.environ | told,

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.errors import BusyError, InputError, SpaceError
+from scan2sim.services import spools
 from scan2sim.services.records import Kept, Once, Sender, Spool, new_ids
 
 APPENDS = """
@@ -78,7 +79,7 @@ def test_a_full_disk_share_drops_the_oldest_and_says_how_many(tmp_path: Path) ->
     for number in range(50):
         spool.append(f"a:{number}", b"x" * 100)
     assert [record.id for record in spool.first()] == [f"a:{number}" for number in range(40, 50)]
-    assert spool.dropped == 40
+    assert spool.dropped == {"": 40}
     spool.close()
     again = Spool(tmp_path / "records", most_bytes=1000)  # bounds hold over lives
     again.append("b:1", b"x" * 100)
@@ -122,3 +123,66 @@ def test_doubles_are_dropped_and_lives_of_a_node_are_told_apart() -> None:
     assert [once.new(one) for one in (first, second, first, second, other, other, ids())] == [
         True, True, False, False, True, False, True,
     ]  # fmt: skip
+
+
+def test_a_flood_drops_its_own_and_crowds_nothing_out(tmp_path: Path) -> None:
+    spool = Spool(tmp_path / "records", most_bytes=10_000)
+    for number in range(5):
+        spool.append(f"alarm:{number}", b"x" * 100, "alarm")
+    for number in range(1000):
+        spool.append(f"count:{number}", b"x" * 100, "count")
+    kept = [record.id for record in spool.first(1000)]
+    assert kept[:5] == [f"alarm:{number}" for number in range(5)] and kept[5:] == [
+        f"count:{number}" for number in range(905, 1000)
+    ]
+    assert spool.dropped == {"count": 905}
+    spool.close()
+
+
+def test_a_file_is_one_process_at_a_time(tmp_path: Path) -> None:
+    first = Spool(tmp_path / "records")
+    with pytest.raises(BusyError, match="--spool"):
+        Spool(tmp_path / "records")
+    first.close()
+    Spool(tmp_path / "records").close()
+
+
+NAMED = """
+import sys, time
+from scan2sim.services import spools
+spool = spools.opened("/talker", "monitor_data")
+spool.append(f"{sys.argv[1]}:1", b"body")
+print(len(spool), flush=True)
+time.sleep(60)
+"""
+
+
+def test_two_of_one_name_keep_apart_and_what_dead_ones_left_is_taken_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    running = [
+        subprocess.Popen([sys.executable, "-c", NAMED, name], stdout=subprocess.PIPE, text=True) for name in ("a", "b")
+    ]
+    assert [process.stdout.readline() for process in running if process.stdout] == ["1\n", "1\n"]
+    folder = tmp_path / "scan2sim" / "spools"
+    assert folder.stat().st_mode & 0o777 == 0o700
+    assert sorted(path.name for path in folder.glob("*.spool")) == [
+        "talker.monitor_data.1.spool", "talker.monitor_data.2.spool",
+    ]  # fmt: skip
+    for process in running:
+        process.kill()
+        process.wait()
+    heir = spools.opened("/talker", "monitor_data")
+    assert sorted(record.id for record in heir.first()) == ["a:1", "b:1"]
+    heir.close()
+    again = spools.opened("/talker", "monitor_data")
+    assert len(again) == 2  # and are there once
+    again.close()
+
+
+def test_a_state_folder_that_cannot_be_is_told_with_a_remedy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
+    with pytest.raises(SpaceError, match="XDG_STATE_HOME"):
+        spools.opened("/talker", "monitor_data")

