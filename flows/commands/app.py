@@ -57,6 +57,10 @@ HoldOut = Annotated[
 ]
 Force = Annotated[bool, typer.Option("--force", help="Run everything again.")]
 From = Annotated[str | None, typer.Option("--from", metavar="STEP", help="Run this step and what follows again.")]
+Bus = Annotated[
+    str | None,
+    typer.Option("--bus", metavar="HOST:PORT,...", help="Tell the event bus of it: Kafka there, `ros2`, or both."),
+]
 Name = Annotated[str | None, typer.Option("--name", help="The tile's name; default: from the folder.")]
 TileOut = Annotated[Path, typer.Option("--out", "-o", help="The tile's folder.")]
 Crs = Annotated[str | None, typer.Option(help='CRS, where the files lack it: "EPSG:32633", or "local".')]

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from scan2sim.flows.commands.app import App, Config, Force, From, HoldOut, OutDir, Sets, TilePath, settings_of
+from scan2sim.flows.commands.app import App, Bus, Config, Force, From, HoldOut, OutDir, Sets, TilePath, settings_of
 from scan2sim.flows.commands.display import console, warn
 from scan2sim.flows.commands.log import Log
 from scan2sim.flows.commands.plan import plan_tile
@@ -17,6 +17,7 @@ from scan2sim.flows.commands.shown import execute_shown, show_findings, show_res
 from scan2sim.flows.engine.execution import Executor
 from scan2sim.flows.engine.lock import locked
 from scan2sim.flows.engine.planning import drop_damaged
+from scan2sim.flows.engine.progress import PublishedRun, published
 from scan2sim.flows.engine.versions import versions
 from scan2sim.flows.recipes.settings import Settings
 from scan2sim.flows.reports.publish import publish, to_read
@@ -36,9 +37,12 @@ def run(
     force: Force = False,
     from_: From = None,
     jobs: Annotated[int, typer.Option(min=0, help="Steps at a time; 0: as the cores allow.")] = 0,
+    bus: Bus = None,
 ) -> None:
     """Make a world of a tile; what an earlier run has finished is kept."""
-    run_tile(tile, out, settings_of(set_, config, hold_out), force=force, start=from_, jobs=jobs)
+    settings = settings_of(set_, config, hold_out)
+    with published(bus, "run", str(tile)) as on_bus:
+        run_tile(tile, out, settings, force=force, start=from_, jobs=jobs, bus=on_bus)
 
 
 def run_tile(
@@ -50,6 +54,7 @@ def run_tile(
     start: str | None = None,
     jobs: int = 0,
     run: Executor | None = None,
+    bus: PublishedRun | None = None,
 ) -> Path:
     """Make the world of the tile at `path` in `out`; returns the report's path.
 
@@ -57,7 +62,7 @@ def run_tile(
     `run.log`, and `steps/` (kept results).
 
     Args:
-        run: runs the steps; by default up to `jobs` processes at a time.
+        run: runs the steps; by default up to `jobs` processes at a time, and `bus` is told.
 
     Raises:
         ScanError: see `pipeline.errors`; earlier results stay.
@@ -72,7 +77,7 @@ def run_tile(
         log.write(f"tile {tile.path}, settings {json.dumps(settings.values)}, versions {json.dumps(versions())}")
         missing = sum(p.reason is not None for p in planned)
         with log.errors(out):
-            outcome = run(planned, store) if run else execute_shown(planned, store, log, jobs)
+            outcome = run(planned, store) if run else execute_shown(planned, store, log, jobs, bus=bus)
             outcome.check()
             done = outcome.of_tile()
             changed = publish(store, planned, done, out, tile, settings)

@@ -9,8 +9,9 @@ from pathlib import Path
 from scan2sim.flows.commands.display import RunDisplay, console, warn
 from scan2sim.flows.commands.log import Log
 from scan2sim.flows.engine.execution import execute
-from scan2sim.flows.engine.frontier import Event, Outcome
+from scan2sim.flows.engine.frontier import Event, Outcome, unwatched
 from scan2sim.flows.engine.planning import Planned, drop_damaged, plan
+from scan2sim.flows.engine.progress import PublishedRun
 from scan2sim.flows.recipes.graph import Node
 from scan2sim.flows.reports import gazebo
 from scan2sim.flows.reports.findings import findings
@@ -27,12 +28,15 @@ def execute_shown(
     jobs: int = 0,
     to_the_end: bool = False,
     memory: float | None = None,
+    bus: PublishedRun | None = None,
 ) -> Outcome:
-    """`execute`, with bars on the screen and lines in the log."""
+    """`execute`, with bars on the screen and lines in the log; the bus is told, too."""
+    told = bus.steps.watching(planned, store) if bus else unwatched
     with RunDisplay(len(planned)) as display:
 
         def watch(node: Node, event: Event, fraction: float, message: str) -> None:
             display.watch(node, event, fraction, message)
+            told(node, event, fraction, message)
             if event != "progress":
                 log.write(f"{node.full_name}: {event}{': ' if message else ''}{message}")
 
@@ -46,7 +50,12 @@ def execute_shown(
 
 
 def run_shown(
-    nodes: list[Node], store: Store, log: Log, checked: Collection[str], digest: Callable[[Path], str] = digest
+    nodes: list[Node],
+    store: Store,
+    log: Log,
+    checked: Collection[str],
+    digest: Callable[[Path], str] = digest,
+    bus: PublishedRun | None = None,
 ) -> tuple[list[Planned], dict[str, Manifest]]:
     """Plan nodes and run them, as `execute_shown`; what is damaged of the results of those `checked` is made again.
 
@@ -56,6 +65,7 @@ def run_shown(
         log: for what runs.
         checked: names of nodes whose results will be read.
         digest: of a source file.
+        bus: that is told of it.
 
     Returns:
         The plan, and results by the nodes' labels.
@@ -66,7 +76,7 @@ def run_shown(
     planned = plan(nodes, store, digest=digest)
     if drop_damaged(planned, store, checked):
         planned = plan(nodes, store, digest=digest)
-    outcome = execute_shown(planned, store, log)
+    outcome = execute_shown(planned, store, log, bus=bus)
     outcome.check()
     return planned, outcome.of_tile()
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any, TypeVar, get_args
 
 import typer
 
-from scan2sim.flows.commands.app import App, Config, Sets, settings_of
+from scan2sim.flows.commands.app import App, Bus, Config, Sets, settings_of
 from scan2sim.flows.commands.display import console, warn
 from scan2sim.flows.commands.log import Log
 from scan2sim.flows.commands.options import options
@@ -18,6 +18,7 @@ from scan2sim.flows.commands.shown import run_shown
 from scan2sim.flows.commands.study import study_compression
 from scan2sim.flows.engine.lock import locked
 from scan2sim.flows.engine.planning import STORE, Planned
+from scan2sim.flows.engine.progress import PublishedRun, published
 from scan2sim.flows.recipes.settings import Settings
 from scan2sim.flows.recipes.video import ALONE, STEPS, Video, recipe
 from scan2sim.pipeline.errors import SettingError
@@ -48,9 +49,12 @@ def slam_a_video(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the trajectory.")],
     set_: Sets = None,
     config: Config = None,
+    bus: Bus = None,
 ) -> None:
     """Poses of a video's frames: TUM, KITTI, CSV, GeoJSON."""
-    done = slam_video(video, out, settings_of(set_, config))
+    settings = settings_of(set_, config)
+    with published(bus, "slam", str(video.video)) as on_bus:
+        done = slam_video(video, out, settings, on_bus)
     figures = _figures(done)
     for text in figures.pop("warnings"):
         warn(text)
@@ -84,15 +88,16 @@ def slam_study(
     backend: Annotated[str | None, typer.Option(help="lm, or adam: the mission's.")] = None,
     set_: Sets = None,
     config: Config = None,
+    bus: Bus = None,
 ) -> None:
     """What resolution, bit rate and frame rate of the video cost: D3.2's tables 4 and 5."""
     study_compression(
         source, out, truth=truth, gps=gps, mask=mask, heights=heights, bitrates=bitrates, rates=rates, jobs=jobs,
-        settings=settings_of([*(set_ or []), *([f"track.backend={backend}"] if backend else [])], config),
+        settings=settings_of([*(set_ or []), *([f"track.backend={backend}"] if backend else [])], config), bus=bus,
     )  # fmt: skip
 
 
-def slam_video(video: Video, out: Path, settings: Settings) -> dict[str, Manifest]:
+def slam_video(video: Video, out: Path, settings: Settings, bus: PublishedRun | None = None) -> dict[str, Manifest]:
     """Write the trajectory of the camera that took a video, in all formats, and `slam.json`; what is finished is kept.
 
     Returns:
@@ -108,7 +113,7 @@ def slam_video(video: Video, out: Path, settings: Settings) -> dict[str, Manifes
         log = Log(out / "run.log")
         log.write(f"slam {video.video}, settings {json.dumps(settings.values)}")
         with log.errors(out):
-            planned, done = run_shown(nodes, store, log, {node.id.name for node in nodes}, digests)
+            planned, done = run_shown(nodes, store, log, {node.id.name for node in nodes}, digests, bus)
             publish_path(planned, done, store, out)
         store.sweep({item.node.id.name: item.key for item in planned})
         digests.save()

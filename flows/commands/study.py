@@ -13,6 +13,7 @@ from scan2sim.flows.commands.shown import execute_shown
 from scan2sim.flows.engine.execution import limit_cores
 from scan2sim.flows.engine.lock import locked
 from scan2sim.flows.engine.planning import STORE, Planned, plan
+from scan2sim.flows.engine.progress import PublishedRun, published
 from scan2sim.flows.recipes.graph import NodeId
 from scan2sim.flows.recipes.settings import Settings
 from scan2sim.flows.recipes.study import Cell, Study, cells, recipe, refused, segment_of
@@ -29,7 +30,7 @@ T = TypeVar("T", int, float)
 
 def study_compression(
     source: Path, out: Path, *, truth: Path | None, gps: Path | None, mask: Path | None, heights: str, bitrates: str,
-    rates: str, jobs: int, settings: Settings,
+    rates: str, jobs: int, settings: Settings, bus: str | None = None,
 ) -> Path:  # fmt: skip
     """Print the table of what compression costs; in a drive's folder, what isn't named is found by its name.
 
@@ -49,13 +50,14 @@ def study_compression(
         "heights": _numbers("--heights", heights, int), "bitrates": _numbers("--bitrates", bitrates, float),
         "rates": _numbers("--rates", rates, float),
     }, remedy="Give others")  # fmt: skip
-    table = study(requested, out, settings, jobs)
+    with published(bus, "slam study", str(source)) as on_bus:
+        table = study(requested, out, settings, jobs, on_bus)
     console.print(table.read_text(encoding="utf-8"), highlight=False, markup=False, soft_wrap=True)
     console.print(f"Table: {table}", highlight=False, soft_wrap=True, markup=False)
     return table
 
 
-def study(requested: Study, out: Path, settings: Settings, jobs: int = 1) -> Path:
+def study(requested: Study, out: Path, settings: Settings, jobs: int = 1, bus: PublishedRun | None = None) -> Path:
     """Run the cells that no earlier run has finished; returns `out/table.md`, which holds them all.
 
     A cell that fails is N/A with its reason; an interrupted study leaves the tables of what is there.
@@ -77,7 +79,7 @@ def study(requested: Study, out: Path, settings: Settings, jobs: int = 1) -> Pat
         limit_cores(max(1, (os.cpu_count() or 1) // jobs))
         try:
             with log.errors(out):
-                failed = execute_shown(planned, store, log, jobs, to_the_end=True).failed
+                failed = execute_shown(planned, store, log, jobs, to_the_end=True, bus=bus).failed
         finally:
             backend, results = settings.params(TRACK).backend, _results(requested, video, planned, store, failed)
             table = write(out, Tables(video, requested.gps is not None, backend, segment, cells(requested), results))

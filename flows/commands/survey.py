@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from scan2sim.flows.commands.app import App, Config, HoldOut, Sets, settings_of
+from scan2sim.flows.commands.app import App, Bus, Config, HoldOut, Sets, settings_of
 from scan2sim.flows.commands.display import console, warn
 from scan2sim.flows.commands.drive import survey_of
 from scan2sim.flows.commands.log import Log
@@ -22,6 +22,7 @@ from scan2sim.flows.engine.frontier import Outcome
 from scan2sim.flows.engine.lock import locked
 from scan2sim.flows.engine.memory import parse
 from scan2sim.flows.engine.planning import STORE, Planned, Reason, drop_damaged, plan
+from scan2sim.flows.engine.progress import published
 from scan2sim.flows.engine.versions import versions
 from scan2sim.flows.recipes.graph import NodeId
 from scan2sim.flows.recipes.settings import Settings
@@ -62,17 +63,19 @@ def survey(
     ] = "processes",
     address: Annotated[str | None, typer.Option(help="Of a Dask scheduler or Ray cluster.")] = None,
     cores: Annotated[int | None, typer.Option(min=1, help="That a step may use; default: all.")] = None,
+    bus: Bus = None,
 ) -> None:
     """Make the worlds of all tiles of a survey, which meet, and one of them all."""
     run_source(
         source, out, settings_of(set_, config, hold_out), length=length, buffer=buffer, jobs=jobs, memory=memory,
-        runner=runner, address=address, cores=cores, prefect=context.obj,
+        runner=runner, address=address, cores=cores, prefect=context.obj, bus=bus,
     )  # fmt: skip
 
 
 def run_source(
     source: str, target: str, settings: Settings, *, length: float | None, buffer: float | None, jobs: int,
     memory: str | None, runner: str, address: str | None, cores: int | None, prefect: Callable[..., object],
+    bus: str | None = None,
 ) -> None:  # fmt: skip
     """`scan2sim survey`: in processes of this machine, or through Prefect on a runner that is named.
 
@@ -86,6 +89,7 @@ def run_source(
         address: of a Dask scheduler or a Ray cluster.
         cores: that a step may use.
         prefect: makes a survey as a flow of Prefect (`flows.cli`).
+        bus: that is told how steps fare (`services.monitoring.outlets`).
 
     Raises:
         StepError: tiles failed; all others are finished.
@@ -95,18 +99,20 @@ def run_source(
     if runner != "processes":
         need(f"--runner {runner}", "prefect")
         workers.check(runner)
-        prefect(source, target, length, buffer, settings.values, runner, jobs, memory, cores, address)
+        prefect(source, target, length, buffer, settings.values, runner, jobs, memory, cores, address, bus)
         return
     limit_cores(cores)
     libraries.check()
     check_here(settings)
     log = Log(likeness(target) / "run.log")
 
-    def run(planned: list[Planned], store: Store) -> Outcome:
-        return execute_shown(planned, store, log, jobs, to_the_end=True, memory=gigabytes)
+    with published(bus, "survey", source) as on_bus:
 
-    path = survey_of(source, target, run, length=length, buffer=buffer, warn=warn)
-    make_survey(path, target, settings, run)
+        def run(planned: list[Planned], store: Store) -> Outcome:
+            return execute_shown(planned, store, log, jobs, to_the_end=True, memory=gigabytes, bus=on_bus)
+
+        path = survey_of(source, target, run, length=length, buffer=buffer, warn=warn)
+        make_survey(path, target, settings, run)
 
 
 def make_survey(place: str | Path, target: str | Path, settings: Settings, run: Executor) -> Path:

@@ -13,6 +13,7 @@ from scan2sim.flows.commands.drive import survey_of
 from scan2sim.flows.commands.survey import changes
 from scan2sim.flows.deployed.survey import survey
 from scan2sim.flows.deployed.tile import by_tasks
+from scan2sim.flows.engine.progress import published
 from scan2sim.flows.recipes.settings import Settings
 from scan2sim.pipeline.errors import BusyError
 
@@ -21,21 +22,22 @@ from scan2sim.pipeline.errors import BusyError
 def reprocess(
     source: str, out: str, length: float | None = None, buffer: float | None = None,
     settings: dict[str, Any] | None = None, runner: str = "threads", workers: int = 2,
-    memory: str | None = None, cores: int | None = None, address: str | None = None,
+    memory: str | None = None, cores: int | None = None, address: str | None = None, bus: str | None = None,
 ) -> State[Any]:  # fmt: skip
     """Redo what depends on new or changed clouds, photos, poses, settings or steps; arguments as `survey`'s.
 
     Does nothing where nothing changed, and where the last run is still going on.
     """
     try:
-        run = by_tasks(runner, workers, address, memory, cores)
-        path = survey_of(source, out, run, length=length, buffer=buffer)
+        with published(bus, "reprocess", source, here=False) as on_bus:
+            run = by_tasks(runner, workers, address, memory, cores, on_bus)
+            path = survey_of(source, out, run, length=length, buffer=buffer)
         found = changes(path, out, Settings(settings))
         for tile, reasons in found.items():
             get_run_logger().info(f"{tile}: {reasons}")
         if not found:
             return Completed(message="Nothing has changed")
-        report = survey(path, out, None, None, settings, runner, workers, memory, cores, address)
+        report = survey(path, out, None, None, settings, runner, workers, memory, cores, address, bus)
     except BusyError as error:
         return Completed(message=f"Skipped: {error}", name="Skipped")
     return Completed(message=f"{len(found)} tiles made anew: {report}", data=report)

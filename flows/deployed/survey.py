@@ -19,6 +19,7 @@ from scan2sim.flows.commands.drive import survey_of
 from scan2sim.flows.commands.survey import make_survey
 from scan2sim.flows.deployed.ephemeral import guard
 from scan2sim.flows.deployed.tile import artifact_key, by_tasks
+from scan2sim.flows.engine.progress import published
 from scan2sim.flows.recipes.settings import Settings
 from scan2sim.flows.reports.survey import overview, rows
 from scan2sim.pipeline.errors import INTERRUPTED, StepError, UnavailableError, exit_code
@@ -66,7 +67,7 @@ def publish(out: Path) -> None:
 def survey(
     source: str, out: str, length: float | None = None, buffer: float | None = None,
     settings: dict[str, Any] | None = None, runner: str = "threads", workers: int = 2,
-    memory: str | None = None, cores: int | None = None, address: str | None = None,
+    memory: str | None = None, cores: int | None = None, address: str | None = None, bus: str | None = None,
 ) -> str:  # fmt: skip
     """Make a survey's worlds, a task per tile and step; what an earlier run has finished is kept.
 
@@ -80,13 +81,15 @@ def survey(
         memory: what steps on one machine may need together, "20GB".
         cores: that a step may use; default: all.
         address: of a Dask scheduler or a Ray cluster; default: started here.
+        bus: that is told how steps fare, by the flow and by its workers (`services.monitoring.outlets`).
     """
-    run = by_tasks(runner, workers, address, memory, cores)
-    path = survey_of(source, out, run, length=length, buffer=buffer)
-    try:
-        report = make_survey(path, out, Settings(settings), run)
-    except StepError:  # tiles failed, the others are there
-        publish(likeness(out))
-        raise
+    with published(bus, "survey", source, here=False) as on_bus:
+        run = by_tasks(runner, workers, address, memory, cores, on_bus)
+        path = survey_of(source, out, run, length=length, buffer=buffer)
+        try:
+            report = make_survey(path, out, Settings(settings), run)
+        except StepError:  # tiles failed, the others are there
+            publish(likeness(out))
+            raise
     publish(likeness(out))
     return str(report)

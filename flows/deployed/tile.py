@@ -15,9 +15,10 @@ from prefect.cache_policies import NO_CACHE
 from scan2sim.flows.commands.run import run_tile
 from scan2sim.flows.engine.dispatch import dispatch
 from scan2sim.flows.engine.execution import Executor, run_on_worker
-from scan2sim.flows.engine.frontier import Outcome
+from scan2sim.flows.engine.frontier import Outcome, unwatched
 from scan2sim.flows.engine.memory import parse
 from scan2sim.flows.engine.planning import Planned, check
+from scan2sim.flows.engine.progress import PublishedRun, published
 from scan2sim.flows.engine.versions import versions
 from scan2sim.flows.engine.workers import workers
 from scan2sim.flows.recipes.settings import Settings
@@ -37,7 +38,7 @@ def run_step(node: str, work: Callable[[], Manifest], manifest: str) -> str:
 
 def by_tasks(
     runner: str = "threads", count: int = 2, address: str | None = None,
-    memory: str | None = None, cores: int | None = None,
+    memory: str | None = None, cores: int | None = None, bus: PublishedRun | None = None,
 ) -> Executor:  # fmt: skip
     """Runs plans as tasks of the flow that it is called in.
 
@@ -45,11 +46,12 @@ def by_tasks(
         runner, count, address: of the workers (`engine.workers`), which are there while there is work.
         memory: what steps on one machine may need together, "20GB".
         cores: that a step may use.
+        bus: that is told how steps fare.
 
     Raises:
         ScanError: there are no such workers.
     """
-    gigabytes, version = parse(memory), versions()
+    gigabytes, version, channel = parse(memory), versions(), bus and bus.channel
     workers(runner, count, address)  # tells early of what there isn't
 
     def run(planned: list[Planned], store: Store) -> Outcome:
@@ -60,12 +62,13 @@ def by_tasks(
 
             def submit(item: Planned) -> Any:
                 manifest = store.folder(item.node.full_name, item.key) / "manifest.json"
-                work = partial(call, run_on_worker, item, store, gigabytes, cores, version)
+                work = partial(call, run_on_worker, item, store, gigabytes, cores, version, channel)
                 return run_step.submit(item.node.full_name, work, str(manifest))
 
             # those of a cluster find their next step waiting
             at_once = count if runner == "threads" else 2 * count
-            return dispatch(planned, store, submit, at_once, _progress())
+            watch = bus.steps.watching(planned, store) if bus else unwatched
+            return dispatch(planned, store, submit, at_once, _progress(), watch)
 
     return run
 
@@ -90,7 +93,10 @@ def artifact_key(*parts: str) -> str:
 
 @flow(name="tile")
 def tile(
-    path: str, out: str, settings: dict[str, Any] | None = None, memory: str | None = None, cores: int | None = None
-) -> str:
+    path: str, out: str, settings: dict[str, Any] | None = None, memory: str | None = None, cores: int | None = None,
+    bus: str | None = None,
+) -> str:  # fmt: skip
     """Make one tile's world, a task a step, in threads of this process; returns the report's path."""
-    return str(run_tile(Path(path), Path(out), Settings(settings), run=by_tasks(memory=memory, cores=cores)))
+    with published(bus, "tile", path, here=False) as on_bus:
+        run = by_tasks(memory=memory, cores=cores, bus=on_bus)
+        return str(run_tile(Path(path), Path(out), Settings(settings), run=run))

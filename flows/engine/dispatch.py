@@ -8,9 +8,9 @@ from functools import partial
 from queue import SimpleQueue
 from typing import Any, Protocol
 
-from scan2sim.flows.engine.frontier import Frontier, Outcome
+from scan2sim.flows.engine.frontier import Event, Frontier, Outcome, Watch, unwatched
 from scan2sim.flows.engine.planning import Planned
-from scan2sim.flows.recipes.graph import NodeId
+from scan2sim.flows.recipes.graph import Node, NodeId
 from scan2sim.pipeline.errors import DamagedError, ScanError, StepError
 from scan2sim.pipeline.store import Store
 
@@ -33,6 +33,7 @@ def dispatch(
     submit: Callable[[Planned], Future],
     at_once: int,
     show: Callable[[str, float], None],
+    watch: Watch = unwatched,
 ) -> Outcome:
     """Submit what a plan says is missing as soon as what it reads is there; an `execute.Executor` but for the rest.
 
@@ -42,9 +43,16 @@ def dispatch(
         submit: has a step run, which leaves its result in the store.
         at_once: steps are submitted and not yet ended at a time.
         show: told a tile's name and how many percent of its steps are done, once a second at most.
+        watch: told what else happens, but for what workers know of a step that runs.
     """
     board = Board(planned, show)
-    front = Frontier(planned, store, lambda node, event, *_: None if event == "again" else board.end(node.id))
+
+    def watching(node: Node, event: Event, fraction: float, message: str) -> None:
+        watch(node, event, fraction, message)
+        if event != "again":
+            board.end(node.id)
+
+    front = Frontier(planned, store, watching)
     running: dict[NodeId, tuple[Planned, Future]] = {}
     ended: SimpleQueue[NodeId] = SimpleQueue()
     while front or running:

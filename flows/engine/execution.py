@@ -11,6 +11,7 @@ from scan2sim.flows.engine import processes
 from scan2sim.flows.engine.frontier import Frontier, Outcome, Watch
 from scan2sim.flows.engine.memory import need, share
 from scan2sim.flows.engine.planning import Planned, check
+from scan2sim.flows.engine.progress import Channel, published_step
 from scan2sim.flows.engine.versions import check_version
 from scan2sim.pipeline import libraries
 from scan2sim.pipeline.errors import DamagedError, ScanError
@@ -109,7 +110,12 @@ def run_apart(item: Planned, store: Store, watch: Watch) -> Manifest:
 
 
 def run_on_worker(
-    item: Planned, store: Store, memory: float | None, cores: int | None, wanted: Mapping[str, str]
+    item: Planned,
+    store: Store,
+    memory: float | None,
+    cores: int | None,
+    wanted: Mapping[str, str],
+    channel: Channel | None = None,
 ) -> Manifest:
     """Run one node as a worker that serves a flow elsewhere.
 
@@ -117,6 +123,7 @@ def run_on_worker(
         memory: GB that steps on one machine may need together (`engine.memory`).
         cores: that the step may use.
         wanted: the flow's `versions()`.
+        channel: where the bus is told of the flow's run; None: nowhere.
 
     Raises:
         UnavailableError: this worker has other versions, or lacks libraries.
@@ -126,5 +133,5 @@ def run_on_worker(
     libraries.check()
     limit_cores(cores)
     os.environ.pop("MALLOC_TRIM_THRESHOLD_", None)  # Dask's, for processes that live on: it slows steps down
-    with share(memory, need(item, store)):
-        return run_apart(item, store, lambda *_: None)
+    with share(memory, need(item, store)), published_step(channel, item, store) as watch:
+        return run_apart(item, store, watch)

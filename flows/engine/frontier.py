@@ -16,6 +16,10 @@ Watch = Callable[[Node, Event, float, str], None]
 """Told what happens: node, event, fraction done, message."""
 
 
+def unwatched(node: Node, event: Event, fraction: float, message: str) -> None:
+    """A `Watch` that tells nobody."""
+
+
 @dataclass(frozen=True)
 class Outcome:
     """What came of a plan.

@@ -19,7 +19,7 @@ class Bus:
         """`records`: whether it wants monitors' records as well as events."""
         name = node.get_name()
         self.events = Events(name)
-        self.events.outlets.append(_Topic(node, params.events_topic))
+        self.events.outlets.append(Topic(node, params.events_topic))
         topics = [params.events_topic, *([params.records_topic] if records else [])]
         for topic in topics:
             node.create_subscription(ros.message_type(STRING), topic, self._take, RECORDS)
@@ -52,13 +52,15 @@ class Bus:
             reader.join(5.0)
 
 
-class _Topic:
-    """Events on a topic of ROS 2."""
+class Topic:
+    """Events on a topic of ROS 2: an `events.Outlet`."""
 
     def __init__(self, node: Any, topic: str) -> None:
+        """By a publisher of the node's."""
         self._publisher = node.create_publisher(ros.message_type(STRING), topic, RECORDS)
 
     def send(self, told: Event) -> None:
+        """Publish one."""
         self._publisher.publish(ros.message(STRING, data=told.json_line()))
 
     def close(self) -> None:

