@@ -22,6 +22,7 @@ from scan2sim.pipeline.extras import EXTRA_OF
 from scan2sim.pipeline.io import clouds, decoders, gps, meshes, models
 from scan2sim.pipeline.types import Camera
 from scan2sim.segmentation import backends as networks
+from scan2sim.services.qos import links
 from scan2sim.slam import features, matchers, solvers, trackers
 from tests.conftest import ROOT
 from tests.pipeline import made_up
@@ -38,6 +39,7 @@ PROTOCOLS: dict[ModuleType, tuple[type, ...]] = {
     decoders: (decoders.Decoder,),
     meshes: (meshes.ModelFormat, meshes.WorldFormat),
     decimation: (decimation.Backend,),
+    links: (links.Backend,),
 }
 """Packages of backends, and what their modules are: one of these."""
 ALL = [(package, name) for package in PROTOCOLS for name in backends.names(package.__name__)]

@@ -1,0 +1,72 @@
+"""What shapes a link: a file each, found by its name (`pipeline.backends`)."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+from scan2sim.pipeline import backends
+from scan2sim.pipeline.errors import UnavailableError
+from scan2sim.services.qos.namespaces import WHAT, Namespace
+from scan2sim.services.qos.shape import Shape
+
+
+class Lacking(NamedTuple):
+    """Why a backend can't run here, and what to do about it."""
+
+    cause: str
+    remedy: str
+
+
+class Wire(Protocol):
+    """A link that is there."""
+
+    def shape(self, there: Shape, back: Shape) -> None:
+        """Do so from now on, to packets from the near side and to it."""
+
+
+class Backend(Protocol):
+    """What a file here has.
+
+    Attributes:
+        RANK: the lower, the better is what it makes.
+    """
+
+    RANK: int
+
+    def lacking(self) -> Lacking | None:
+        """What isn't there; None: it can run here."""
+
+    def connect(self, near: Namespace, far: Namespace, folder: Path) -> Wire:
+        """Make the interface of both, and join them; programs' files go to the folder."""
+
+
+def find(name: str | None = None) -> Backend:
+    """A backend that can run here: of that name, or the best.
+
+    Raises:
+        SettingError: there is none of that name.
+        UnavailableError: it can't run here, or none can.
+    """
+    asked = (name,) if name else backends.names(__name__)
+    ranked: list[tuple[str, Backend]] = sorted(
+        ((one, backends.find(__name__, one, "link")) for one in asked), key=lambda one: one[1].RANK
+    )
+    why = {}
+    for one, backend in ranked:
+        lacking = backend.lacking()
+        if lacking is None:
+            return backend
+        why[one] = lacking
+    causes = "; ".join(f"{one} {lacking.cause}" for one, lacking in why.items())
+    raise UnavailableError(WHAT, causes, " or ".join(lacking.remedy for lacking in why.values()))
+
+
+def programs(**packages: str) -> Lacking | None:
+    """`Backend.lacking` of programs, given with the Debian packages that bring them."""
+    absent = [name for name in packages if shutil.which(name) is None]
+    if not absent:
+        return None
+    wanted = " ".join(sorted({packages[name] for name in absent}))
+    return Lacking(f"needs {', '.join(absent)}, not installed here", f"apt-get install {wanted}")

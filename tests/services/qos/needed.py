@@ -1,0 +1,23 @@
+"""Whether a shaped link can be made here."""
+
+from __future__ import annotations
+
+import os
+import shutil
+
+import pytest
+
+from scan2sim.pipeline.errors import UnavailableError
+from scan2sim.services.qos import links
+
+
+def need_link(backend: str | None = None, *programs: str) -> None:
+    """Skip the test where no shaped link can be made, or a program is missing."""
+    if os.geteuid() != 0:
+        pytest.skip("only root may make network namespaces")
+    try:
+        links.find(backend)
+    except UnavailableError as error:
+        pytest.skip(str(error))
+    if absent := [name for name in programs if not shutil.which(name)]:
+        pytest.skip(f"no {', '.join(absent)} here (tests/services/packages.txt)")
