@@ -80,12 +80,21 @@ def described(field: FieldInfo) -> str:
 def _described(kind: Any, limits: Sequence[Any]) -> str:
     origin, arguments = get_origin(kind), get_args(kind)
     if origin is Annotated:
+        for one in arguments[1:]:
+            if (
+                isinstance(one, FieldInfo)
+                and isinstance(one.json_schema_extra, dict)
+                and "range" in one.json_schema_extra
+            ):
+                return str(one.json_schema_extra["range"])
         inner = [m for a in arguments[1:] for m in (a.metadata if isinstance(a, FieldInfo) else [a])]
         return _described(arguments[0], [*inner, *limits])
     if origin in (Union, types.UnionType):
         return ", or ".join("left out" if a is type(None) else _described(a, limits) for a in arguments)
     if origin is Literal:
         return _either([str(a) for a in arguments])
+    if origin is list:
+        return f"a list of {_described(arguments[0], ())}"
     if origin is tuple:
         each = [_described(a, limits) for a in arguments if a is not Ellipsis]
         return f"{len(each)} numbers, {each[0]}" if Ellipsis not in arguments else f"numbers, {each[0]}"

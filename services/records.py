@@ -103,6 +103,8 @@ class Spool:
                 oldest = "SELECT number, sent IS NULL FROM records WHERE share = ? ORDER BY number LIMIT 1"
                 number, unsent = self._base.execute(oldest, (largest,)).fetchone()
                 self._forget("number = ?", number)
+                if unsent and not self.dropped[largest]:
+                    log.warning("there is no room on disk for all that waits: the oldest %s go", largest or "records")
                 self.dropped[largest] += unsent
 
     def take_over(self, other: Spool) -> None:

@@ -32,6 +32,9 @@ NODE_OPTIONS = {
     "prometheus_port": "--metrics",
 }
 """Names of `Watched`'s fields on the command line, where they are shorter there."""
+Limits = Annotated[
+    list[str] | None, typer.Option("--limit", metavar="KEY=VALUE", help=PageParams.model_fields["limit"].description)
+]
 BUS_OPTIONS = {"kafka_bootstrap_servers": "--kafka", "log_file": "--log"}
 
 
@@ -41,9 +44,9 @@ def _bus() -> None:
 
 
 @app.command("topic")
-@options(TopicParams, **NODE_OPTIONS)
-def monitor_topic(params: TopicParams) -> None:
-    """Watch a topic from outside, whoever publishes on it."""
+@options(TopicParams, topics="TOPIC...", **NODE_OPTIONS)
+def monitor_topic(params: TopicParams, limit: Limits = None) -> None:
+    """Watch topics from outside, whoever publishes on them."""
     from scan2sim.services.monitoring.topic_monitor import TopicMonitor
 
     def made() -> Any:
@@ -57,7 +60,7 @@ def monitor_topic(params: TopicParams) -> None:
 
 @app.command("talker")
 @options(TalkerParams, **NODE_OPTIONS)
-def monitor_talker(params: TalkerParams) -> None:
+def monitor_talker(params: TalkerParams, limit: Limits = None) -> None:
     """Send messages of a size at an interval, to try the bus with."""
     from scan2sim.services.monitoring.nodes.talker import Talker
 
@@ -66,7 +69,7 @@ def monitor_talker(params: TalkerParams) -> None:
 
 @app.command("dataset-talker")
 @options(DatasetParams, **NODE_OPTIONS)
-def monitor_dataset_talker(params: DatasetParams) -> None:
+def monitor_dataset_talker(params: DatasetParams, limit: Limits = None) -> None:
     """Send messages when, and as large as, a file says."""
     from scan2sim.services.monitoring.nodes.dataset_talker import DatasetTalker
 
@@ -75,7 +78,7 @@ def monitor_dataset_talker(params: DatasetParams) -> None:
 
 @app.command("listener")
 @options(ListenerParams, **NODE_OPTIONS)
-def monitor_listener(params: ListenerParams) -> None:
+def monitor_listener(params: ListenerParams, limit: Limits = None) -> None:
     """Hear strings, and say what was heard."""
     from scan2sim.services.monitoring.nodes.listener import Listener
 
@@ -94,7 +97,7 @@ def monitor_traffic(params: TrafficParams) -> None:
 
 @app.command("work")
 @options(WorkParams, command="WORKER", **NODE_OPTIONS)
-def monitor_work(params: WorkParams) -> None:
+def monitor_work(params: WorkParams, limit: Limits = None) -> None:
     """Have a topic's events worked on by local processes, as many as are asked for on the bus."""
     from scan2sim.services.monitoring.work import Work
 
@@ -133,13 +136,7 @@ def monitor_alarms(params: AlarmsParams) -> None:
 
 @app.command("page")
 @options(PageParams, kafka_bootstrap_servers="--kafka")
-def monitor_page(
-    params: PageParams,
-    limit: Annotated[
-        list[str] | None,
-        typer.Option("--limit", metavar="KEY=VALUE", help=PageParams.model_fields["limit"].description),
-    ] = None,
-) -> None:
+def monitor_page(params: PageParams, limit: Limits = None) -> None:
     """Show what nodes tell by Kafka as a page in the browser, live."""
     extras.need("the page", "fastapi", "uvicorn", "prometheus_client", "confluent_kafka")
     from scan2sim.services.monitoring.page import serve

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Mapping
 from typing import Any
 
 from scan2sim.services import kafka, spools
@@ -25,9 +26,11 @@ class Bus:
             node.create_subscription(ros.message_type(STRING), topic, self._take, RECORDS)
         self._closed = threading.Event()
         self._readers: list[threading.Thread] = []
+        self._kafka: Kafka | None = None
         if servers := params.kafka_bootstrap_servers:
             spool = spools.opened(f"{node.get_namespace()}/{name}", params.events_topic)
-            self.events.outlets.append(Kafka(servers, params.events_topic, spool))
+            self._kafka = Kafka(servers, params.events_topic, spool)
+            self.events.outlets.append(self._kafka)
             for topic in topics:
                 reader = threading.Thread(target=self._read, args=(servers, topic, f"scan2sim-{name}"), daemon=True)
                 reader.start()
@@ -42,6 +45,10 @@ class Bus:
                 return
             if body is not None:
                 self.events.take(body)
+
+    def dropped(self) -> Mapping[str, int]:
+        """Events that were given up, as there was no room for them on disk, by kind."""
+        return self._kafka.dropped if self._kafka else {}
 
     def close(self) -> None:
         """Leave the bus."""
@@ -59,9 +66,9 @@ class Topic:
         """By a publisher of the node's."""
         self._publisher = node.create_publisher(ros.message_type(STRING), topic, RECORDS)
 
-    def send(self, told: Event) -> None:
+    def send(self, event: Event) -> None:
         """Publish one."""
-        self._publisher.publish(ros.message(STRING, data=told.json_line()))
+        self._publisher.publish(ros.message(STRING, data=event.json_line()))
 
     def close(self) -> None:
         """The node closes its publishers."""

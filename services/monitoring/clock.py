@@ -91,16 +91,16 @@ class Clock:
             elif self._own and told["to"] == self._own.hex():
                 times = {"sent": int(told["sent"]), "received": received, "answered": time.time_ns()}
                 return {"to": told["from"], "from": self._id, "host": self._host} | times
-        except (KeyError, TypeError, ValueError):
+        except (KeyError, TypeError, ValueError, OverflowError):
             pass  # somebody else's message
         return None
 
-    def offset(self, publisher: bytes) -> tuple[int, int] | None:
+    def offset(self, publisher: bytes | None) -> tuple[int, int] | None:
         """By how many nanoseconds a publisher's clock is ahead of this one, and how far that may be off.
 
         None: unknown, as its process hasn't answered.
         """
-        peer = self._peers.get(publisher[:PREFIX])
+        peer = self._peers.get(publisher[:PREFIX]) if publisher else None
         return peer.best if peer else None
 
     def jump(self) -> float:

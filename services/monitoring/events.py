@@ -178,7 +178,7 @@ class Event(BaseModel):
 class Outlet(Protocol):
     """Takes events to others."""
 
-    def send(self, told: Event, /) -> None:
+    def send(self, event: Event, /) -> None:
         """Take one, at once."""
 
     def close(self) -> None:
@@ -197,13 +197,18 @@ KINDS: dict[str, type[BaseModel]] = {
 
 
 class Events:
-    """Sends events, and does what is attached to them; may be used from any thread, actions are called one by one."""
+    """Sends events, and does what is attached to them; may be used from any thread, actions are called one by one.
+
+    Attributes:
+        malformed: messages that came, and are no events.
+    """
 
     def __init__(self, sender: str) -> None:
         self._sender, self._next_id, self._once = sender, new_ids(), Once()
         self._kinds, self._actions = dict(KINDS), defaultdict[str, list[Action]](list)
         self._lock = threading.RLock()
         self.outlets: list[Outlet] = []
+        self.malformed = 0
 
     def define(self, kind: str, schema: type[BaseModel]) -> None:
         """Say what the body of a kind of events is.
@@ -228,33 +233,35 @@ class Events:
         """
         if not isinstance(body, self._known(kind)):
             raise SettingError(kind, f"is no {type(body).__name__}", f"Send a {self._kinds[kind].__name__}")
-        told = Event(
+        event = Event(
             id=self._next_id(), time=time.time(), sender=self._sender, kind=kind, body=body.model_dump(mode="json")
         )
         for outlet in self.outlets:
-            outlet.send(told)
+            outlet.send(event)
         with self._lock:
-            self._once.new(told.id)
+            self._once.new(event.id)
             self._act(kind, body)
-        return told
+        return event
 
     def take(self, line: str | bytes) -> None:
         """Do what is attached to what came over the bus; twice the same is done once, what none defined is left."""
         try:
-            said = json.loads(line)
-            if said.get("schema") == record.SCHEMA:
-                kind, body, record_id = RECORD, said, said["record id"]
+            fields = json.loads(line)
+            if fields.get("schema") == record.SCHEMA:
+                kind, body, record_id = RECORD, fields, fields["record id"]
             else:
-                told = Event.model_validate(said)
-                if told.kind not in self._kinds:
+                event = Event.model_validate(fields)
+                if event.kind not in self._kinds:
                     return
-                kind, record_id, body = told.kind, told.id, self._kinds[told.kind].model_validate(told.body)
+                kind, record_id, body = event.kind, event.id, self._kinds[event.kind].model_validate(event.body)
             with self._lock:
                 if self._once.new(record_id):
                     self._act(kind, body)
-        except (ValueError, KeyError, AttributeError, TypeError) as error:  # pydantic's, too
-            cause = error.errors()[0]["msg"] if isinstance(error, ValidationError) else error
-            log.warning("an event was left that is none: %s (%.100s)", cause, line)
+        except (ValueError, KeyError, AttributeError, TypeError, RecursionError) as error:  # pydantic's, too
+            self.malformed += 1
+            if str(self.malformed).strip("0") == "1":  # the 1st, 10th, 100th, ...: a flood of them fills no log
+                cause = error.errors()[0]["msg"] if isinstance(error, ValidationError) else error
+                log.warning("message %d that is no event was left: %s (%.100r)", self.malformed, cause, line)
 
     def _known(self, kind: str) -> type[BaseModel]:
         if kind not in self._kinds:

@@ -1,4 +1,4 @@
-"""How programs join the bus: what they are told in their constructors as on the command line."""
+"""How programs join the bus: their settings, in code as on the command line."""
 
 from __future__ import annotations
 
@@ -8,17 +8,19 @@ from typing import Annotated
 from pydantic import Field
 
 from scan2sim.pipeline.step import Params
+from scan2sim.services.kafka import Servers
 from scan2sim.services.monitoring.scaling import MOST, ScalingParams
+from scan2sim.services.transport.names import TopicName
 
 
 class BusParams(Params):
     """Where events and records go and come from."""
 
     kafka_bootstrap_servers: Annotated[
-        str | None, Field(description="Kafka beside ROS 2, as host:port,host:port; it need not be there yet.")
+        Servers | None, Field(description="Kafka beside ROS 2, as host:port,host:port; it need not be there yet.")
     ] = None
-    records_topic: Annotated[str, Field(description="Topic of ROS 2 and of Kafka with records.")] = "monitor_data"
-    events_topic: Annotated[str, Field(description="Topic of ROS 2 and of Kafka with events.")] = "bus_events"
+    records_topic: Annotated[TopicName, Field(description="Topic of ROS 2 and of Kafka with records.")] = "monitor_data"
+    events_topic: Annotated[TopicName, Field(description="Topic of ROS 2 and of Kafka with events.")] = "bus_events"
 
 
 class ScaleParams(BusParams, ScalingParams):

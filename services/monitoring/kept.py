@@ -9,6 +9,7 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, Field
 
 from scan2sim.pipeline.step import Params
+from scan2sim.services.kafka import Servers
 
 
 def _seconds(given: Any) -> Any:
@@ -31,7 +32,7 @@ class ArchiveParams(Params):
 
     archive: Annotated[Path, Field(description="Folder for them; it is made if it isn't there.")]
     kafka_bootstrap_servers: Annotated[
-        str, Field(description="Kafka with the records, as host:port,host:port; it need not be there yet.")
+        Servers, Field(description="Kafka with the records; it need not be there yet.")
     ] = "localhost:9092"
     topic: Annotated[str, Field(description="Kafka's topic of records.")] = "monitor_data"
 

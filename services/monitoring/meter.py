@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from scan2sim.services.transport.types import Arrival
@@ -41,6 +42,7 @@ class Incoming:
         lost: of these, what didn't come; None likewise.
         latencies: nanoseconds, of the last ones (as many as the window holds), with clocks' offsets taken away.
         clock: nanoseconds by which the last sender's clock is ahead, and how far that may be off; None: unknown.
+        unreadable: messages that aren't of the topic's type.
     """
 
     flow: Flow
@@ -48,6 +50,7 @@ class Incoming:
     lost: int | None
     latencies: tuple[int, ...]
     clock: tuple[int, int] | None
+    unreadable: int = 0
 
 
 @dataclass(frozen=True)
@@ -58,7 +61,7 @@ class Reading:
     incoming: dict[str, Incoming]
 
 
-@dataclass
+@dataclass(slots=True)
 class _Numbers:
     """Of one publisher's messages: what was received and what is lost, whatever their order."""
 
@@ -68,7 +71,9 @@ class _Numbers:
     silent: int = 0
 
     def count(self, number: int) -> None:
-        if number > self.highest:
+        if number == self.highest + 1:
+            self.highest = number
+        elif number > self.highest:
             self.missing += number - self.highest - 1
             self.highest = number
         elif self.missing:
@@ -76,20 +81,35 @@ class _Numbers:
 
     def period(self) -> tuple[int, int]:
         """Messages sent and lost since it was last asked."""
-        told = self.highest - self.reported, self.missing
-        self.silent = 0 if told[0] else self.silent + 1
+        sent, lost = self.highest - self.reported, self.missing
+        self.silent = 0 if sent else self.silent + 1
         self.reported, self.missing = self.highest, 0
-        return told
+        return sent, lost
 
 
-@dataclass
+@dataclass(slots=True)
 class _Topic:
-    latencies: deque[int]
+    """What came on a topic since it was last read.
+
+    Attributes:
+        latencies: publishers and nanoseconds, by the two clocks.
+    """
+
+    latencies: deque[tuple[bytes | None, int]]
     messages: int = 0
     size: int = 0
+    unreadable: int = 0
     unnumbered: bool = False
-    clock: tuple[int, int] | None = None
+    last: bytes | None = None
     numbers: dict[bytes, _Numbers] = field(default_factory=dict)
+
+
+Offset = Callable[[bytes | None], tuple[int, int] | None]
+"""A publisher to how far its clock is ahead, as `Incoming.clock`."""
+
+
+def _unknown(_: bytes | None) -> None:
+    return None
 
 
 class Meter:
@@ -109,48 +129,61 @@ class Meter:
             flow[0] += 1
             flow[1] += size
 
-    def received(self, arrival: Arrival, clock: tuple[int, int] | None = None) -> None:
-        """Count a message that came; `clock` as `Incoming`'s."""
+    def received(self, arrival: Arrival) -> None:
+        """Count a message that came."""
+        name, size, received, sent, publisher, number = arrival
         with self._lock:
-            topic = self._incoming.get(arrival.topic)
+            topic = self._incoming.get(name)
             if topic is None:
-                topic = self._incoming[arrival.topic] = _Topic(deque(maxlen=self._window))
+                topic = self._incoming[name] = _Topic(deque(maxlen=self._window))
             topic.messages += 1
-            topic.size += arrival.size
-            topic.clock = clock
-            if arrival.sent is not None:
-                latency = arrival.received - arrival.sent + (clock[0] if clock else 0)
-                if latency > -LATE:
-                    topic.latencies.append(latency)
-            if arrival.publisher is None or arrival.number is None:
+            topic.size += size
+            topic.last = publisher
+            if sent is not None:
+                topic.latencies.append((publisher, received - sent))
+            if publisher is None or number is None:
                 topic.unnumbered = True
                 return
-            numbers = topic.numbers.get(arrival.publisher)
+            numbers = topic.numbers.get(publisher)
             if numbers is None:
-                before = arrival.number - 1
-                numbers = topic.numbers[arrival.publisher] = _Numbers(highest=before, reported=before)
-            numbers.count(arrival.number)
+                numbers = topic.numbers[publisher] = _Numbers(highest=number - 1, reported=number - 1)
+            numbers.count(number)
 
-    def read(self) -> Reading:
-        """What was counted since the last reading, of all topics that ever had a message."""
+    def unreadable(self, topic: str) -> None:
+        """Count a message that came, and wasn't of its topic's type."""
+        with self._lock:
+            self._incoming[topic].unreadable += 1
+
+    def publishers(self) -> set[bytes]:
+        """Those that messages came from."""
+        with self._lock:
+            topics = self._incoming.values()
+            return {one for topic in topics for one in (topic.last, *topic.numbers) if one is not None}
+
+    def read(self, offset: Offset = _unknown) -> Reading:
+        """What was counted since the last reading, of all topics that ever had a message; clocks by `offset`."""
         with self._lock:
             outgoing = {topic: Flow(*counts) for topic, counts in self._outgoing.items()}
             for counts in self._outgoing.values():
                 counts[:] = 0, 0
-            return Reading(outgoing, {name: _period(topic) for name, topic in self._incoming.items()})
+            return Reading(outgoing, {name: _period(topic, offset) for name, topic in self._incoming.items()})
 
 
-def _period(topic: _Topic) -> Incoming:
-    told = [numbers.period() for numbers in topic.numbers.values()]
-    numbered = bool(told) and not topic.unnumbered
+def _period(topic: _Topic, offset: Offset) -> Incoming:
+    clocks = {publisher: offset(publisher) for publisher in {topic.last, *(one for one, _ in topic.latencies)}}
+    ahead = {publisher: clock[0] if clock else 0 for publisher, clock in clocks.items()}
+    latencies = [latency + ahead[publisher] for publisher, latency in topic.latencies]
+    counts = [numbers.period() for numbers in topic.numbers.values()]
+    numbered = bool(counts) and not topic.unnumbered
     found = Incoming(
         flow=Flow(topic.messages, topic.size),
-        sent=sum(sent for sent, _ in told) if numbered else None,
-        lost=sum(lost for _, lost in told) if numbered else None,
-        latencies=tuple(topic.latencies),
-        clock=topic.clock,
+        sent=sum(sent for sent, _ in counts) if numbered else None,
+        lost=sum(lost for _, lost in counts) if numbered else None,
+        latencies=tuple(latency for latency in latencies if latency > -LATE),
+        clock=clocks[topic.last],
+        unreadable=topic.unreadable,
     )
-    topic.messages = topic.size = 0
+    topic.messages = topic.size = topic.unreadable = 0
     topic.latencies.clear()
     topic.numbers = {gid: numbers for gid, numbers in topic.numbers.items() if numbers.silent < FORGOTTEN}
     return found

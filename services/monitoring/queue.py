@@ -8,9 +8,10 @@ from collections import deque
 from dataclasses import dataclass
 
 from scan2sim.services.monitoring.events import QueueState
+from scan2sim.services.monitoring.watched import WhenFull
 
 MOST = 100_000
-"""Events that wait, at most; later ones are refused, and counted."""
+"""Events that wait, at most; what is refused is counted."""
 TRIES = 3
 """Workers that may die or hang over an event, before it counts as refused."""
 
@@ -33,8 +34,9 @@ class Waiting:
 class EventQueue:
     """Hands events to workers; may be used from any thread."""
 
-    def __init__(self, name: str, most: int = MOST) -> None:
-        self.name, self._most = name, most
+    def __init__(self, name: str, most: int = MOST, when_full: WhenFull = "newest") -> None:
+        """Of so many events at most; `when_full` says which one is refused then."""
+        self.name, self._most, self._when_full = name, most, when_full
         self._waiting: deque[Waiting] = deque()
         self._in_work: dict[int, Waiting] = {}
         self._changed = threading.Condition()
@@ -47,7 +49,9 @@ class EventQueue:
             self._arrived += 1
             if len(self._waiting) >= self._most:
                 self._refused += 1
-                return False
+                if self._when_full == "newest":
+                    return False
+                self._waiting.popleft()
             self._waiting.append(Waiting(line, sent))
             self._changed.notify()
             return True

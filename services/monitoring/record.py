@@ -61,6 +61,7 @@ class TopicFlow(_Model):
         latency: nanoseconds, mean of the window, with the clocks' offset taken away; `latency_p95` likewise.
         clock_offset: by which the sender's clock is ahead, nanoseconds; None: unknown, as it isn't watched.
         clock_uncertainty: how far that may be off.
+        unreadable: messages that came, and weren't of the topic's type; unknown to rclpy.
     """
 
     topic: str
@@ -75,6 +76,7 @@ class TopicFlow(_Model):
     latency_p95: int | None = Field(None, alias="latency p95 (nanoseconds)")
     clock_offset: int | None = Field(None, alias="clock offset (nanoseconds)")
     clock_uncertainty: int | None = Field(None, alias="clock uncertainty (nanoseconds)")
+    unreadable: int = Field(0, alias="unreadable messages")
 
 
 class Record(_Model):
@@ -90,7 +92,8 @@ class Record(_Model):
         latency: mean of all that came (of the window); None where no message tells when it was sent.
         clock_synchronised: whether NTP keeps this machine's clock, as its kernel says; None: it says nothing.
         remarks: what is wrong with the topics, in words: profiles that don't fit, nodes of one name.
-        dropped: records that were given up before this one, as the disk's share for them was full.
+        dropped: records and events that were given up before this one, as the disk's share for them was full.
+        dropped_by: likewise, of records and of each kind of events.
     """
 
     schema_name: str = Field(SCHEMA, alias="schema")
@@ -127,6 +130,7 @@ class Record(_Model):
     disk_usage: list[float] = Field(alias="disk usage")
     remarks: list[str] = []
     dropped: int = Field(0, alias="dropped records")
+    dropped_by: dict[str, int] = Field({}, alias="dropped by kind")
 
     @staticmethod
     def machine(read: Mapping[str, Any]) -> dict[str, Any]:
@@ -170,6 +174,7 @@ def flows_of(reading: Reading, types: Mapping[str, str], period: float) -> list[
             latency_p95=p95(found.latencies),
             clock_offset=found.clock[0] if found.clock else None,
             clock_uncertainty=found.clock[1] if found.clock else None,
+            unreadable=found.unreadable,
         )
         for topic, found in reading.incoming.items()
     ]

@@ -1,14 +1,18 @@
-"""How a node is watched: what a monitor is told, in its constructor as on the command line."""
+"""How a node is watched: a monitor's settings, in its constructor as on the command line."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
 from scan2sim.pipeline.step import Params
+from scan2sim.services.kafka import Servers
+from scan2sim.services.monitoring.limits import Limit, Limits
+from scan2sim.services.transport.names import TopicName
 
+WhenFull = Literal["newest", "oldest"]
 LARGEST = 16 * 2**20
 """Bytes of a message of the test nodes, at most."""
 
@@ -21,9 +25,11 @@ class Watched(Params):
         100
     )
     kafka_bootstrap_servers: Annotated[
-        str | None, Field(description="Kafka for the records, as host:port,host:port; it need not be there yet.")
+        Servers | None, Field(description="Kafka for the records, as host:port,host:port; it need not be there yet.")
     ] = None
-    publisher_topic: Annotated[str, Field(description="Topic of ROS 2 and of Kafka for the records.")] = "monitor_data"
+    publisher_topic: Annotated[TopicName, Field(description="Topic of ROS 2 and of Kafka for the records.")] = (
+        "monitor_data"
+    )
     log_file: Annotated[Path | None, Field(description="File for the records, a line each.")] = None
     console: Annotated[bool, Field(description="Write records to standard error, too.")] = False
     prometheus_port: Annotated[
@@ -32,21 +38,28 @@ class Watched(Params):
     spool: Annotated[
         Path | None, Field(description="File for records that wait for Kafka; default: in the user's state folder.")
     ] = None
+    limit: Limit = Limits()
 
     def monitored(self) -> dict[str, Any]:
         """What a monitor's constructor takes of it."""
         return {name: getattr(self, name) for name in Watched.model_fields}
 
 
-Topic = Annotated[str, Field(description="Its name, as /camera/image.")]
+Topic = Annotated[TopicName, Field(description="Its name, as /camera/image.")]
 
 
 class TopicParams(Watched):
-    """Of a node that watches a topic from outside."""
+    """Of a node that watches topics from outside."""
 
-    topic: Topic
-    type: Annotated[str | None, Field(description="Of its messages; default: as publishers say.")] = None
+    topics: Annotated[list[TopicName], Field(min_length=1, description="Their names, as /camera/image.")]
+    type: Annotated[str | None, Field(description="Of their messages; default: as publishers say.")] = None
     timeout: Annotated[float, Field(ge=0.1, le=86_400, description="Seconds to wait for a publisher.")] = 60.0
+    depth: Annotated[
+        int, Field(ge=1, le=100_000, description="Messages of a topic that may wait to be counted; then the oldest go.")
+    ] = 100
+    best_effort: Annotated[
+        bool, Field(description="Ask for no lost message again: watching never slows who publishes.")
+    ] = False
 
 
 class TalkerParams(Watched):
@@ -85,4 +98,8 @@ class WorkParams(Watched):
         float, Field(ge=0.01, le=86_400, description="Seconds for an event; then its worker is killed.")
     ] = 60.0
     with_text: Annotated[bool, Field(description="Tell workers messages' text as well as their size.")] = False
-    events_topic: Annotated[str, Field(description="Topic of ROS 2 and of Kafka with events.")] = "bus_events"
+    queue_length: Annotated[int, Field(ge=1, le=10_000_000, description="Events that wait, at most.")] = 100_000
+    when_full: Annotated[
+        WhenFull, Field(description="Which event is refused when as many wait: the newest, or the oldest.")
+    ] = "newest"
+    events_topic: Annotated[TopicName, Field(description="Topic of ROS 2 and of Kafka with events.")] = "bus_events"

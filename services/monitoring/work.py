@@ -20,16 +20,15 @@ EVENTS = QoS(depth=1000)
 
 
 class Work(Monitor):
-    """Takes strings for events, and tells of its queue as often as of itself.
+    """Takes strings for events, and reports on its queue as often as on itself.
 
     Attributes:
         queue: of the topic's name.
-        told: what became of it, a state a period.
     """
 
     def __init__(self, params: WorkParams, node_name: str = "work") -> None:
         super().__init__(node_name, **params.monitored())
-        self.queue = EventQueue(params.topic)
+        self.queue = EventQueue(params.topic, params.queue_length, params.when_full)
         self._workers = Processes(self.queue, shlex.split(params.command), params.deadline)
         self._most, self._with_text = params.max_workers, params.with_text
         self._sent: float | None = None
@@ -41,11 +40,12 @@ class Work(Monitor):
                 events_topic=params.events_topic,
             ),
         )
+        self.drops.append(self._bus.dropped)
         self._bus.events.on("workers", self._scale)
         self.create_subscription(ros.message_type(STRING), params.topic, self._take, EVENTS)
-        self._told_at = time.monotonic()
+        self._reported = time.monotonic()
         self._workers.scale(1)
-        self.create_timer(params.period, self._tell_queue)
+        self.create_timer(params.period, self._report_queue)
 
     def received(self, arrival: Arrival) -> None:
         """Remember when the message that comes next was sent."""
@@ -61,10 +61,10 @@ class Work(Monitor):
         if wanted.queue == self.queue.name:
             self._workers.scale(min(self._most, wanted.workers))
 
-    def _tell_queue(self) -> None:
+    def _report_queue(self) -> None:
         now = time.monotonic()
-        state: QueueState = self.queue.state(now - self._told_at, self._workers.workers())
-        self._told_at = now
+        state: QueueState = self.queue.state(now - self._reported, self._workers.workers())
+        self._reported = now
         self._bus.events.send("queue", state)
 
     def destroy_node(self) -> Any:

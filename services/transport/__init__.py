@@ -32,7 +32,7 @@ class Publisher(Protocol):
 class Node(Protocol):
     """A node of ROS 2; methods are named as in rclpy, and their arguments mean the same.
 
-    `published` and `received` are called for every message, in the thread that sends it or takes it; a subclass that
+    `published`, `received` and `unreadable` are called in the thread that sends a message or takes it; a subclass that
     overrides them sees all that goes through the node (`services.monitoring.monitor`).
     """
 
@@ -53,6 +53,13 @@ class Node(Protocol):
     ) -> Any:
         """Have each message handed to `callback(message)`; `raw` as bytes of CDR with its encapsulation."""
 
+    def raw_type(self, topic: str, type_name: str) -> Any:
+        """Stands for messages of a topic, to subscribe to it raw.
+
+        Raises:
+            SettingError: the transport needs their definition, and doesn't have it.
+        """
+
     def create_timer(self, timer_period_sec: float, callback: Callable[[], None]) -> Any:
         """Have `callback()` called every so many seconds."""
 
@@ -70,6 +77,9 @@ class Node(Protocol):
 
     def received(self, arrival: Arrival) -> None:
         """Called before a message is handed on."""
+
+    def unreadable(self, topic: str) -> None:
+        """Called instead of handing a message on that isn't of its type, after `received`."""
 
 
 class Transport(Protocol):

@@ -7,7 +7,7 @@ A reader of CDR stops where its type ends, so nodes that know nothing of the env
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
+from typing import NamedTuple
 
 MARK = b"scan2sim"
 BEHIND = struct.Struct("<QQ16sq8s")
@@ -16,9 +16,8 @@ ALIGNED = 4
 """DDS pads messages to as many bytes."""
 
 
-@dataclass(frozen=True, slots=True)
-class Header:
-    """What is known of a message.
+class Header(NamedTuple):
+    """What is known of a message; one is made for each, so it is a tuple, which costs least.
 
     Attributes:
         number: one more than that of the publisher's last message.

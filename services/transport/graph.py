@@ -5,14 +5,16 @@ ROS 2 announces nodes as `rmw_dds_common/msg/ParticipantEntitiesInfo` on `ros_di
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription
-from cyclonedds.core import InstanceState, ReadCondition, SampleState, ViewState
+from cyclonedds.core import DDSException, InstanceState, ReadCondition, SampleState, ViewState
 from cyclonedds.domain import DomainParticipant
+from cyclonedds.dynamic import get_types_for_typeid
 from cyclonedds.pub import DataWriter
 from cyclonedds.qos import Policy, Qos
 from cyclonedds.sub import DataReader
@@ -28,6 +30,8 @@ INFO = "rmw_dds_common/msg/ParticipantEntitiesInfo"
 BARE = "_CREATED_BY_BARE_DDS_APP_"
 """What ROS 2 calls a node whose participant announces none."""
 ALIVE = ViewState.Any | SampleState.Any | InstanceState.Alive
+ANNOUNCED_WITHIN = 2_000_000_000
+"""Nanoseconds that a publisher has to say what its type is."""
 MOST = 10_000
 """Endpoints read at once."""
 
@@ -46,7 +50,7 @@ class Graph:
     """Discovery of one participant; may be asked from any thread."""
 
     def __init__(self, participant: DomainParticipant) -> None:
-        self._gid = participant.guid.bytes
+        self._participant, self._gid = participant, participant.guid.bytes
         self._lock = threading.Lock()
         self._nodes: list[Entities] = []
         topic = Topic(participant, ANNOUNCED, sample_type(INFO))
@@ -90,6 +94,16 @@ class Graph:
                 for found in self._alive(kind)
                 if found.topic_name == wanted
             )
+
+    def announced_type(self, topic: str, type_name: str) -> Any | None:
+        """A type as a publisher of a topic announces it (DDS-XTypes 1.3, section 7.6.3.3); None: none does."""
+        with self._lock:
+            found = [one for one in self._alive("PUBLISHER") if one.topic_name == dds_topic(topic)]
+        for one in found:
+            if one.type_id is not None and ros_type(one.type_name) == type_name:
+                with contextlib.suppress(DDSException):  # it has gone, or says nothing
+                    return get_types_for_typeid(self._participant, one.type_id, ANNOUNCED_WITHIN)[0]
+        return None
 
     def topics(self) -> dict[str, tuple[str, ...]]:
         """ROS 2's topics, and the names of their types."""

@@ -5,6 +5,7 @@ A peer of another vendor takes data only where the type that is announced is its
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -58,9 +59,30 @@ def known(name: str) -> str:
 @cache
 def sample_type(name: str) -> Any:
     """The class of samples of a type, whose `data` are bytes of CDR with their encapsulation."""
-    made = _struct(known(name))
+    return _samples(_struct(known(name)))
 
-    class Sample(made):  # type: ignore[misc, valid-type]
+
+@dataclass(frozen=True)
+class Foreign:
+    """Stands for a type whose definition isn't known here: its messages can be received raw.
+
+    Attributes:
+        __msgtype__: its name.
+        sample: the class of its samples.
+    """
+
+    __msgtype__: str
+    sample: Any
+
+
+def foreign(name: str, announced: Any | None) -> Foreign:
+    """Of a name, and of what its publisher announces it to be; None: it announces nothing, as Fast DDS doesn't."""
+    plain = {"bytes": types.sequence[types.byte]}
+    return Foreign(name, _samples(announced or make_idl_struct("Foreign", dds_type(name).replace("::", "."), plain)))
+
+
+def _samples(made: Any) -> Any:
+    class Sample(made):  # type: ignore[misc]
         """Bytes of CDR."""
 
         __slots__ = ("data", "sample_info")

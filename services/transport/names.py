@@ -6,10 +6,21 @@ Source: design.ros2.org, "Topic and Service name mapping to DDS"; REP 2011 (type
 from __future__ import annotations
 
 import re
+from typing import Annotated
+
+from pydantic import Field
 
 from scan2sim.pipeline.errors import SettingError
 
 TOPIC = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
+TopicName = Annotated[
+    str,
+    Field(
+        pattern=f"^{TOPIC.pattern}$",
+        json_schema_extra={"range": "a name of ROS 2: the letters a to z, digits and _, parts of them parted by /"},
+    ),
+]
+"""Of a topic, as a setting."""
 TYPE = re.compile(r"[a-zA-Z][a-zA-Z0-9_]*/msg/[A-Za-z][A-Za-z0-9_]*")
 
 
@@ -39,9 +50,10 @@ def ros_topic(name: str) -> str | None:
 
 
 def dds_type(name: str) -> str:
-    """What a type is called on DDS: "std_msgs/msg/String" is "std_msgs::msg::dds_::String_"."""
-    package, kind, leaf = name.split("/")
-    return f"{package}::{kind}::dds_::{leaf}_"
+    """What a type is called on DDS: "std_msgs/msg/String" is "std_msgs::msg::dds_::String_"; others stay."""
+    package, _, rest = name.partition("/")
+    kind, _, leaf = rest.partition("/")
+    return f"{package}::{kind}::dds_::{leaf}_" if leaf else name
 
 
 def ros_type(name: str) -> str:

@@ -79,11 +79,26 @@ class Node(rclpy.node.Node):  # type: ignore[misc]
         """Topics and the names of their types."""
         return {name: tuple(kinds) for name, kinds in self.get_topic_names_and_types()}
 
+    def raw_type(self, topic: str, type_name: str) -> Any:
+        """Of a topic; rclpy needs its definition.
+
+        Raises:
+            SettingError: its package isn't installed.
+        """
+        try:
+            return message_type(type_name)
+        except SettingError as error:
+            remedy = f"{error.remedy}, or watch without it: SCAN2SIM_TRANSPORT=cyclone"
+            raise SettingError(error.where, error.cause, remedy) from None
+
     def published(self, topic: str, size: int) -> None:
         """To be overridden: a message was sent."""
 
     def received(self, arrival: Arrival) -> None:
         """To be overridden: a message has come."""
+
+    def unreadable(self, topic: str) -> None:
+        """Never called: rclpy hands what isn't of its type on with its fields empty."""
 
 
 def init(domain: int | None = None) -> None:

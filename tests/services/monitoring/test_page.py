@@ -23,8 +23,9 @@ from scan2sim.pipeline.errors import SettingError
 from scan2sim.services import serving
 from scan2sim.services.kafka import Topic
 from scan2sim.services.monitoring.history import History
+from scan2sim.services.monitoring.limits import Limits
 from scan2sim.services.monitoring.page import Reader, application
-from scan2sim.services.monitoring.shown import Limits, PageParams
+from scan2sim.services.monitoring.shown import PageParams
 from scan2sim.services.records import Kept
 from tests.browser import Page, chromium
 from tests.services.monitoring.telling import record

@@ -1,0 +1,48 @@
+"""A watched node that sends or hears streams: streams.py talk|hear SECONDS LOG TOPIC:BYTES:RATE ..."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import Any
+
+from scan2sim.services.monitoring.monitor import Monitor, ros
+from scan2sim.services.transport import QoS
+
+LARGE = 100_000
+IMAGE, TEXT = "sensor_msgs/msg/Image", "std_msgs/msg/String"
+
+
+def message(size: int) -> Any:
+    if size <= LARGE:
+        return ros.message(TEXT, data="x" * size)
+    if ros.__name__.endswith("rclpy"):
+        import array
+
+        return ros.message(IMAGE, data=array.array("B", bytes(size)))
+    import numpy as np
+
+    return ros.message(IMAGE, data=np.zeros(size, np.uint8))
+
+
+def main() -> None:
+    role, seconds, log, *streams = sys.argv[1:]
+    ros.init()
+    node = Monitor(role, period=0.5, log_file=log)
+    for stream in streams:
+        topic, size, rate = stream.split(":")
+        kind = ros.message_type(IMAGE if int(size) > LARGE else TEXT)
+        if role == "talk":
+            publisher, sent = node.create_publisher(kind, topic, QoS(depth=5)), message(int(size))
+            node.create_timer(1 / float(rate), lambda publisher=publisher, sent=sent: publisher.publish(sent))
+        else:
+            node.create_subscription(kind, topic, lambda _: None, QoS(depth=5))
+    end = time.monotonic() + float(seconds)
+    while time.monotonic() < end:
+        ros.spin_once(node, 0.1)
+    node.destroy_node()
+    ros.shutdown()
+
+
+if __name__ == "__main__":
+    main()
