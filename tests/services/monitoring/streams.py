@@ -31,12 +31,12 @@ def main() -> None:
     node = Monitor(role, period=0.5, log_file=log)
     for stream in streams:
         topic, size, rate = stream.split(":")
-        kind = ros.message_type(IMAGE if int(size) > LARGE else TEXT)
+        kind, qos = (IMAGE, QoS(depth=5)) if int(size) > LARGE else (TEXT, QoS(depth=50))
         if role == "talk":
-            publisher, sent = node.create_publisher(kind, topic, QoS(depth=5)), message(int(size))
+            publisher, sent = node.create_publisher(ros.message_type(kind), topic, qos), message(int(size))
             node.create_timer(1 / float(rate), lambda publisher=publisher, sent=sent: publisher.publish(sent))
         else:
-            node.create_subscription(kind, topic, lambda _: None, QoS(depth=5))
+            node.create_subscription(ros.message_type(kind), topic, lambda _: None, qos)
     end = time.monotonic() + float(seconds)
     while time.monotonic() < end:
         ros.spin_once(node, 0.1)

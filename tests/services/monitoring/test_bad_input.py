@@ -67,6 +67,27 @@ def test_messages_of_ten_megabytes_are_watched_from_inside_and_outside(
         assert max(flow["message size mean"] for flow in flows(path, "/image")) == size
 
 
+@pytest.mark.parametrize(
+    ("transport", "watching"),
+    [("cyclone", (STREAMS, "hear", "11")), ("rclpy", (STREAMS, "hear", "11")), ("cyclone", ("-c", WATCH))],
+    ids=["inside", "inside rclpy", "outside"],
+)
+def test_a_large_topic_crowds_no_small_one_out(
+    transport: str, watching: tuple[str, ...], tmp_path: Path, start: Start
+) -> None:
+    streams = ("image:6220800:30", "small:100:10")
+    topics = streams if "hear" in watching else ("image", "small")
+    watch = start(transport, *watching, tmp_path / "watch", *topics)
+    talk = start(transport, STREAMS, "talk", "9", tmp_path / "talk", *streams)
+    for process in (talk, watch):
+        _, errors = process.communicate(timeout=90)
+        assert process.returncode == 0, errors
+    small = flows(tmp_path / "watch", "/small")
+    assert sum(flow["lost messages"] for flow in small) == 0
+    assert sum(flow["messages"] for flow in small) == sum(flow["published messages"] for flow in small) > 30
+    assert sum(flow["messages"] for flow in flows(tmp_path / "watch", "/image")) > 20
+
+
 JUMPS = """
 import sys, time
 ahead, real, real_ns, began = [0], time.time, time.time_ns, time.monotonic()
