@@ -134,10 +134,10 @@ class Publisher:
             ended = False
             while not ended:
                 ended = self._ended.wait(EVERY)
-                for step in self._changed():
+                changed, now = self._changed(), time.monotonic()
+                for step in changed:
                     events.send("step", self._state_of(step))
-                now = time.monotonic()
-                if self._about and (ended or now - self._told >= AGAIN):
+                if self._about and (ended or changed or now - self._told >= AGAIN):
                     self._told = now
                     events.send("run", self._about(self._count()))
             for outlet in found:

@@ -93,7 +93,7 @@ Count = Annotated[int, Field(ge=0)]
 
 
 class RunState(Body):
-    """How a run of steps fares (`scan2sim run`, a survey): told when it begins, every few seconds, and when it ends.
+    """How a run of steps fares (`scan2sim run`, a survey): published as steps change, and every five seconds.
 
     Attributes:
         run: its id, unlike any other's.

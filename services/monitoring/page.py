@@ -1,4 +1,4 @@
-"""The live page of the event bus: what nodes tell by Kafka, as six plots, in a browser (D3.2, chapter 3)."""
+"""The live page of the event bus, in a browser: nodes as six plots, runs and alarms (D3.2, chapter 3)."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import threading
 import time
 import uuid
 from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 from fastapi import FastAPI, Query
@@ -18,6 +19,7 @@ from prometheus_client import Gauge
 from scan2sim.pipeline.errors import SettingError
 from scan2sim.services import kafka, serving
 from scan2sim.services.monitoring.history import History, grid
+from scan2sim.services.monitoring.noticed import Noticed
 from scan2sim.services.monitoring.shown import PageParams
 
 log = logging.getLogger(__name__)
@@ -26,6 +28,8 @@ TICK = 1.0
 """Seconds between two messages to a live page."""
 TOLD_AGAIN = 15.0
 """Seconds whose buckets a live page is told again: records come late."""
+EVENTS_BACK = 21_600.0
+"""Seconds before its start from which it shows runs and alarms, at least: they last."""
 LONGEST = 31 * 86_400
 """Seconds of a window, at most."""
 
@@ -35,11 +39,12 @@ Names = Annotated[list[str], Query(max_length=1000)]
 
 
 class Reader:
-    """Reads records of a topic of Kafka into a history, in a thread of its own."""
+    """Reads a topic of Kafka, in a thread of its own."""
 
-    def __init__(self, params: PageParams, history: History) -> None:
-        self._params, self._history = params, history
-        self._thread = threading.Thread(target=self._read, name="records of the page", daemon=True)
+    def __init__(self, servers: str, topic: str, back: float, take: Callable[[bytes], None]) -> None:
+        """Have `take` called with what comes, and came in the last `back` seconds."""
+        self._servers, self._topic, self._back, self._take = servers, topic, back, take
+        self._thread = threading.Thread(target=self._read, name=f"{topic} for the page", daemon=True)
         self._ended = threading.Event()
         self._connected = False
 
@@ -61,22 +66,54 @@ class Reader:
         return self._connected
 
     def _read(self) -> None:
-        servers, topic = self._params.kafka_bootstrap_servers, self._params.topic
-        since = time.time() - self._params.back
+        since = time.time() - self._back
         group = f"scan2sim-page-{uuid.uuid4().hex}"  # its own: every page reads all
-        for body in kafka.read(servers, topic, group=group, since=since, connected=self._connect, wait=0.5):
+        read = kafka.read(self._servers, self._topic, group=group, since=since, connected=self._connect, wait=0.5)
+        for body in read:
             if self._ended.is_set():
                 return
             if body is not None:
-                self._history.take(body)
+                self._take(body)
 
     def _connect(self, connected: bool) -> None:
         if connected != self._connected:
-            log.warning("Kafka at %s %s", self._params.kafka_bootstrap_servers, "is there" if connected else "is gone")
+            log.warning("Kafka at %s %s %s", self._servers, "gives" if connected else "no longer gives", self._topic)
         self._connected = connected
 
 
-def application(params: PageParams, history: History, reader: Reader) -> FastAPI:
+@dataclass(frozen=True)
+class Sources:
+    """What the page shows, and who reads it."""
+
+    history: History
+    noticed: Noticed
+    records: Reader
+    events: Reader
+
+    @classmethod
+    def of(cls, params: PageParams) -> Sources:
+        """Empty ones; `start` has them filled."""
+        now, servers = time.time(), params.kafka_bootstrap_servers
+        history, noticed = History(now), Noticed(now)
+        events = Reader(servers, params.events_topic, max(EVENTS_BACK, params.back), noticed.take)
+        return cls(history, noticed, Reader(servers, params.topic, params.back, history.take), events)
+
+    def start(self) -> None:
+        """Begin to read."""
+        self.records.start()
+        self.events.start()
+
+    def close(self) -> None:
+        """Read no more."""
+        self.records.close()
+        self.events.close()
+
+    def is_connected(self) -> bool:
+        """Whether Kafka has given one of the topics; the other comes with the first who sends to it."""
+        return self.records.is_connected() or self.events.is_connected()
+
+
+def application(params: PageParams, sources: Sources) -> FastAPI:
     """The page, and what it asks for.
 
     Raises:
@@ -85,20 +122,24 @@ def application(params: PageParams, history: History, reader: Reader) -> FastAPI
     app = serving.application(
         "The event bus",
         params,
-        alive={"reader": reader.is_alive},
-        ready={"Kafka": reader.is_connected},
+        alive={"records": sources.records.is_alive, "events": sources.events.is_alive},
+        ready={"Kafka": sources.is_connected},
         public=("/",),
     )
-    _tell_counts(app, history)
+    history = sources.history
+    _count(app, sources)
 
     def state() -> dict[str, Any]:
+        now = time.time()
         return {
             "topic": params.topic,
+            "events_topic": params.events_topic,
             "servers": params.kafka_bootstrap_servers,
-            "connected": reader.is_connected(),
+            "connected": sources.is_connected(),
             "limits": params.limit.model_dump(exclude_none=True),
-            "now": time.time(),
+            "now": now,
             **history.state(),
+            **sources.noticed.state(now),
         }
 
     @app.get("/", include_in_schema=False)
@@ -127,25 +168,34 @@ def application(params: PageParams, history: History, reader: Reader) -> FastAPI
 async def _events(
     history: History, state: Callable[[], dict[str, Any]], seconds: float, nodes: list[str]
 ) -> AsyncIterator[str]:
-    """First the whole window; then its last buckets, which replace those that the page has of the same times."""
-    since = 0.0
+    """First all; then the window's last buckets, which replace those of the same times, and runs that have changed."""
+    since, versions = 0.0, dict[str, int]()
     while True:
         now = time.time()
         edges = grid(now - seconds, now)
         step = edges[1] - edges[0]
         window = await asyncio.to_thread(history.window, edges[edges >= since], nodes)
-        yield f"data: {json.dumps({'state': state(), 'begin': edges[0], **window})}\n\n"
+        told = state()
+        for run in told["runs"]:
+            if versions.get(run["run"]) == run["version"]:
+                del run["details"]
+        versions = {run["run"]: run["version"] for run in told["runs"]}
+        yield f"data: {json.dumps({'state': told, 'begin': edges[0], **window})}\n\n"
         since = edges[-1] - max(2 * step, TOLD_AGAIN) - step
         await asyncio.sleep(TICK)
 
 
-def _tell_counts(app: FastAPI, history: History) -> None:
-    registry = app.state.registry
+def _count(app: FastAPI, sources: Sources) -> None:
+    registry, history = app.state.registry, sources.history
     nodes = Gauge("scan2sim_page_nodes", "Nodes that the page shows", registry=registry)
     nodes.set_function(lambda: len(history.state()["nodes"]))
     records = Gauge("scan2sim_page_records", "Records since the page began", ("shown",), registry=registry)
     records.labels("yes").set_function(lambda: history.counts["shown"])
     records.labels("no").set_function(lambda: history.counts.total() - history.counts["shown"])
+    refused = Gauge("scan2sim_page_events_refused", "Events since the page began that were none", registry=registry)
+    refused.set_function(sources.noticed.counts.total)
+    alarms = Gauge("scan2sim_page_alarms", "Alarms that are raised", registry=registry)
+    alarms.set_function(lambda: len(sources.noticed.alarms.state()["raised"]))
 
 
 def serve(params: PageParams, told: Callable[[str], None]) -> None:
@@ -155,17 +205,17 @@ def serve(params: PageParams, told: Callable[[str], None]) -> None:
         SettingError: it can't listen where it is to.
         InputError: token, certificate or key can't be read.
     """
-    history = History(time.time())
-    reader = Reader(params, history)
-    app = application(params, history, reader)
+    sources = Sources.of(params)
+    app = application(params, sources)
 
     def listening(address: str) -> None:
-        told(f"{address} shows {params.topic} of {params.kafka_bootstrap_servers}; Ctrl-C ends it")
+        topics = f"{params.topic} and {params.events_topic}"
+        told(f"{address} shows {topics} of {params.kafka_bootstrap_servers}; Ctrl-C ends it")
         if params.is_open():
             told("whoever reaches this machine can read it: --token FILE asks for one")
 
-    reader.start()
+    sources.start()
     try:
         serving.run(app, params, listening)
     finally:
-        reader.close()
+        sources.close()

@@ -20,6 +20,9 @@ class PageParams(Served):
     topic: Annotated[str, Field(pattern=r"^[A-Za-z0-9._-]{1,249}$", description="Kafka's topic of records.")] = (
         "monitor_data"
     )
+    events_topic: Annotated[
+        str, Field(pattern=r"^[A-Za-z0-9._-]{1,249}$", description="Kafka's topic of events: runs and alarms.")
+    ] = "bus_events"
     back: Annotated[
         float, Field(ge=0, le=604_800, description="Seconds before its start from which the page shows records.")
     ] = 900.0

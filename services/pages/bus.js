@@ -91,12 +91,16 @@ function take(told) {
 
 // ---- what is told beside the plots
 
-function tellState({ topic, servers, connected, limits, nodes, counts, last_refused }) {
-  byId("topic").textContent = `${topic} on ${servers}`;
+function tellState(state) {
+  const { topic, servers, connected, limits, nodes, runs, counts, last_refused, events_topic, events_refused } = state;
+  byId("topic").textContent = `${topic} and ${events_topic} on ${servers}`;
+  tellAlarms(state.alarms, events_topic);
+  tellRuns(runs, state.now);
   if (range.seconds) status(connected ? "live" : "lost", connected ? "live" : "Kafka is gone");
   nodes.sort((a, b) => (a.name < b.name ? -1 : 1));
   const empty = byId("empty");
-  empty.hidden = nodes.length > 0;
+  empty.hidden = nodes.length > 0 || runs.length > 0;
+  byId("plots").hidden = !nodes.length && runs.length > 0;
   empty.textContent = connected
     ? `No node has told anything on ${topic} yet.`
     : `Kafka at ${servers} doesn't answer; the page goes on trying.`;
@@ -109,12 +113,19 @@ function tellState({ topic, servers, connected, limits, nodes, counts, last_refu
   byId("remarks").replaceChildren(
     ...(remarks.length ? [...new Set(remarks)] : ["none"]).map((text) => element("li", text)),
   );
-  const refused = Object.entries(counts)
-    .filter(([why]) => why !== "shown")
-    .map(([why, count]) => `${count} ${why}`);
+  const { shown, ...refused } = counts;
   byId("counts").textContent =
-    `${counts.shown ?? 0} records shown` +
-    (refused.length ? `; not shown: ${refused.join(", ")} (last: ${last_refused})` : "");
+    `${shown ?? 0} records shown` +
+    (Object.keys(refused).length ? `; not shown: ${listed(refused)} (last: ${last_refused})` : "") +
+    (Object.keys(events_refused.counts).length
+      ? `; events left: ${listed(events_refused.counts)} (last: ${events_refused.last})`
+      : "");
+}
+
+function listed(counts) {
+  return Object.entries(counts)
+    .map(([why, count]) => `${count} ${why}`)
+    .join(", ");
 }
 
 function tellChips(nodes) {

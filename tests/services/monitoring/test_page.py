@@ -1,7 +1,8 @@
-"""The live page: six plots fed by Kafka, in a browser, dark and light, on a telephone; names never become HTML."""
+"""The live page: plots, runs and alarms by Kafka, in a browser, dark and light, on a telephone; names stay text."""
 
 from __future__ import annotations
 
+import itertools
 import json
 import threading
 import time
@@ -22,9 +23,10 @@ from bench.bus_broker import Broker
 from scan2sim.pipeline.errors import SettingError
 from scan2sim.services import serving
 from scan2sim.services.kafka import Topic
+from scan2sim.services.monitoring.events import Event
 from scan2sim.services.monitoring.history import History
 from scan2sim.services.monitoring.limits import Limits
-from scan2sim.services.monitoring.page import Reader, application
+from scan2sim.services.monitoring.page import Sources, application
 from scan2sim.services.monitoring.shown import PageParams
 from scan2sim.services.records import Kept
 from tests.browser import Page, chromium
@@ -32,6 +34,7 @@ from tests.services.monitoring.telling import record
 
 HOSTILE = "<img src=x onerror=document.title='hacked'>"
 TOKEN = "0123456789abcdef"
+NUMBERS = itertools.count(1)
 
 
 @dataclass
@@ -39,8 +42,11 @@ class Shown:
     """A page that is served."""
 
     url: str
-    history: History
-    reader: Reader
+    sources: Sources
+
+    @property
+    def history(self) -> History:
+        return self.sources.history
 
     def get(self, path: str, **headers: str) -> Any:
         with urllib.request.urlopen(urllib.request.Request(self.url + path, headers=headers), timeout=60) as answer:
@@ -56,17 +62,16 @@ def until(true: Callable[[], Any], seconds: float = 60) -> None:
 
 @contextmanager
 def shown(params: PageParams, *, reading: bool = True) -> Iterator[Shown]:
-    """A page in a thread, of what comes from Kafka, or of what tests put into its history."""
-    history, told = History(time.time()), list[str]()
-    reader = Reader(params, history)
-    app = application(params, history, reader)
+    """A page in a thread, of what comes from Kafka, or of what tests put into its sources."""
+    sources, told = Sources.of(params), list[str]()
+    app = application(params, sources)
     if reading:
-        reader.start()
+        sources.start()
     threading.Thread(target=serving.run, args=(app, params, told.append), daemon=True).start()
     until(lambda: told)
-    yield Shown(told[0], history, reader)
+    yield Shown(told[0], sources)
     if reading:
-        reader.close()
+        sources.close()
 
 
 def fill(history: History, names: list[str], seconds: int = 60, **changed: Any) -> None:
@@ -98,6 +103,26 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
     with chromium(tmp_path_factory.mktemp("browser"), "--disable-gpu") as opened:
         yield opened
         assert opened.errors == []
+
+
+def event(kind: str, **body: Any) -> bytes:
+    """An event as it comes from Kafka."""
+    told = Event(id=f"0123:{next(NUMBERS)}", time=time.time(), sender="test", kind=kind, body=body)
+    return told.json_line().encode()
+
+
+def a_run(run: str, **changed: Any) -> bytes:
+    fields = {"command": "survey", "source": "drive", "host": "edge", "state": "running", "steps": 100, "running": 1,
+              "done": 40, "kept": 10, "failed": 1, "seconds": 3725.0}  # fmt: skip
+    return event("run", run=run, **fields | changed)
+
+
+def a_step(run: str, step: str, state: str, **more: Any) -> bytes:
+    return event("step", **{"run": run, "tile": "street_1", "step": step, "state": state} | more)
+
+
+def an_alarm(state: str, rule: str, since: float, subject: str = "/camera") -> bytes:
+    return event("alarm", state=state, rule=rule, subject=subject, value=0.31, since=since)
 
 
 def red(picture: np.ndarray, rgb: tuple[int, int, int] = (0xC8, 0x1E, 0x1E)) -> int:
@@ -132,7 +157,7 @@ def test_records_come_from_kafka_to_the_page_once(broker: Broker, page: Page) ->
         assert "150 ms" in page.value("document.querySelector('#nodes tbody').textContent")
         page.until("document.getElementById('counts').textContent.startsWith('70 records')")
         broker.kill()
-        until(lambda: not served.reader.is_connected())
+        until(lambda: not served.sources.is_connected())
         with pytest.raises(urllib.error.HTTPError, match="503"):
             served.get("health/ready")
         assert served.get("health/live") == {"failing": []}
@@ -234,6 +259,80 @@ def test_the_stream_goes_on_where_the_window_ends(filled: Shown) -> None:
     assert len(first["times"]) in (300, 301) and len(second["times"]) < 30
     assert second["times"][0] in first["times"], "the last buckets are told again"
     assert second["times"][-1] > first["times"][-1] and second["step"] == first["step"] == 1
+
+
+def text(page: Page, place: str) -> str:
+    return str(page.value(f"document.querySelector({place!r}).innerText"))
+
+
+def test_runs_and_alarms_come_from_kafka_to_the_page(broker: Broker, page: Page) -> None:
+    params = PageParams(kafka_bootstrap_servers=broker.servers, port=0, events_topic="happenings")
+    topic = Topic(broker.servers, params.events_topic)
+
+    def send(*bodies: bytes) -> None:
+        topic.send([Kept(0, f"test:{next(NUMBERS)}", body) for body in bodies])
+
+    send(a_run("r1"), a_step("r1", "poisson.terrain", "running", progress=0.25, seconds=12.0, host="gpu-1"))
+    with shown(params) as served:
+        page.do("Page.navigate", url=served.url)
+        page.until("document.querySelector('.run')?.open")
+        assert "survey drive" in text(page, ".run summary") and "50 of 100 steps" in text(page, ".run summary")
+        assert "1:02 h on edge" in text(page, ".run summary") and "1 failed" in text(page, ".run summary")
+        assert "street_1/poisson.terrain" in text(page, ".run table") and "gpu-1" in text(page, ".run table")
+        assert page.value("document.querySelector('.run td progress').value") == 0.25
+        assert page.value("document.getElementById('plots').hidden"), "no node has told anything"
+        send(a_step("r1", "poisson.terrain", "done", progress=1.0, seconds=30.0, memory=1_500_000_000),
+             a_step("r1", "texture", "failed", message="ran out of memory"))  # fmt: skip
+        page.until("document.querySelector('.run tr.failed')?.innerText.includes('ran out of memory')")
+        assert "1.5 GB" in text(page, ".run table") and "30 s" in text(page, ".run table")
+        assert page.value("document.getElementById('alarm').hidden") and "None" in text(page, "#calm")
+        send(an_alarm("raised", "images come late", time.time() - 5), b"no event")
+        page.until("!document.getElementById('alarm').hidden")
+        assert "Alarm: images come late, /camera, since" in text(page, "#alarm")
+        page.until("document.getElementById('counts').innerText.includes('1 no event')")
+        send(an_alarm("cleared", "images come late", time.time()),
+             a_run("r1", state="failed", message="1 of 7 tiles failed"))  # fmt: skip
+        page.until("document.getElementById('alarm').hidden")
+        assert "cleared" in text(page, "#alarms")
+        page.until("document.querySelector('.run .failure').innerText === '1 of 7 tiles failed'")
+
+
+def test_runs_and_alarms_stay_text_and_fit_the_telephone(page: Page) -> None:
+    with shown(PageParams(port=0), reading=False) as served:
+        take = served.sources.noticed.take
+        take(a_run(HOSTILE, command=HOSTILE, source=HOSTILE * 4, host=HOSTILE, message=HOSTILE, state="failed"))
+        for number in range(40):
+            take(a_step(HOSTILE, f"{HOSTILE}{number}", "failed", message=HOSTILE * 5, host=HOSTILE, tile=HOSTILE))
+            take(an_alarm("raised", HOSTILE, time.time(), HOSTILE * number))
+        fill(served.history, ["node"])
+        for phone, dark in ((True, True), (False, False)):
+            open_page(page, served.url, phone=phone, dark=dark)
+            page.until("document.querySelectorAll('.run tbody tr').length === 16")
+            assert page.value("document.documentElement.scrollWidth <= innerWidth"), "no sideways scroll"
+            assert "40 alarms" in text(page, "#alarm") and "and 37 more" in text(page, "#alarm")
+            assert "and 24 failed" in text(page, ".run")
+            assert page.value("document.querySelectorAll('img').length") == 0
+            for place in (".run summary", ".run table", ".run .failure", "#alarm", "#alarms"):
+                assert HOSTILE in text(page, place), place
+        page.click(".run summary")
+        page.until("!document.querySelector('.run').open")
+        take(a_step(HOSTILE, "one more", "running"))
+        page.until("details.get(Object.keys(Object.fromEntries(details))[0]).known === 41")
+        assert not page.value("document.querySelector('.run').open"), "it stays folded"
+
+
+def test_runs_that_have_not_changed_are_not_told_again() -> None:
+    with shown(PageParams(port=0), reading=False) as served:
+        served.sources.noticed.take(a_run("r1"))
+        with urllib.request.urlopen(f"{served.url}api/live", timeout=60) as stream:
+            told: list[dict[str, Any]] = []
+            while len(told) < 3:
+                line = stream.readline()
+                if line.startswith(b"data: "):
+                    told.append(json.loads(line[6:])["state"]["runs"][0])
+                    if len(told) == 2:
+                        served.sources.noticed.take(a_run("r1", done=41))
+    assert [run.get("details", {}).get("last", {}).get("done") for run in told] == [40, None, 41]
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,153 @@
+// Runs of steps and alarms on the page of the event bus, as the state of /api/live has them (services/monitoring/noticed.py).
+"use strict";
+
+const details = new Map(); // by run: what the service tells only when it has changed
+const unfolded = new Map(); // by run: whether its steps are shown, where a reader chose
+
+function duration(seconds) {
+  if (seconds === null || seconds === undefined) return "";
+  if (seconds < 60) return `${seconds < 10 ? seconds.toFixed(1) : Math.round(seconds)} s`;
+  const minutes = Math.floor(seconds / 60),
+    two = (n) => String(n).padStart(2, "0");
+  return minutes < 60
+    ? `${minutes}:${two(Math.floor(seconds % 60))} min`
+    : `${Math.floor(minutes / 60)}:${two(minutes % 60)} h`;
+}
+
+// A time of today by its hour, another with its day.
+function moment(seconds) {
+  const at = new Date(1000 * seconds),
+    time = at.toLocaleTimeString([], { hour12: false });
+  return at.toDateString() === new Date().toDateString() ? time : `${at.toLocaleDateString()} ${time}`;
+}
+
+function bar(share, about) {
+  const made = element("progress");
+  made.max = 1;
+  made.value = share;
+  made.setAttribute("aria-label", about);
+  return made;
+}
+
+// ---- runs
+
+function tellRuns(runs, now) {
+  for (const run of runs) if (run.details) details.set(run.run, run.details);
+  for (const name of details.keys()) if (!runs.some(({ run }) => run === name)) details.delete(name);
+  byId("runs").hidden = !runs.length;
+  const place = byId("runs").querySelector("div");
+  const before = new Map([...place.children].map((one) => [one.dataset.run, one]));
+  const shown = runs.map((run) => {
+    const known = before.get(run.run) ?? card(run.run);
+    fillCard(known, run, now);
+    return known;
+  });
+  if (shown.some((one, i) => place.children[i] !== one) || place.children.length !== shown.length)
+    place.replaceChildren(...shown);
+}
+
+function card(name) {
+  const made = element("details", undefined, "run"),
+    summary = element("summary");
+  made.dataset.run = name;
+  summary.addEventListener("click", () => unfolded.set(name, !made.open));
+  made.append(summary, element("p", undefined, "failure"), element("div", undefined, "scroll"), element("p", undefined, "soft"));
+  return made;
+}
+
+function fillCard(made, { run, silent, version, came }, now) {
+  const { last, steps, known, others } = details.get(run),
+    [summary, failure, scroll, rest] = made.children;
+  const state = silent ? "silent" : (last?.state ?? "running");
+  const told = silent
+    ? `silent for ${duration(now - came)}`
+    : { running: "running", done: "done", failed: "failed", stopped: "stopped" }[state];
+  made.open = unfolded.get(run) ?? (state === "running" || state === "failed");
+  const mark = `${version} ${told}`;
+  if (made.dataset.shown === mark) return; // what is about to be clicked or is selected stays
+  made.dataset.shown = mark;
+  const done = steps.filter((step) => step.state === "done").length + (others.done ?? 0) + (others.kept ?? 0);
+  const over = last ? last.done + last.kept : done,
+    all = last ? last.steps : known;
+  const pill = element("output", told, "pill");
+  pill.dataset.state = state;
+  summary.replaceChildren(
+    pill,
+    element("b", last ? `${last.command} ${last.source}` : "a run that hasn't said what it is"),
+    bar(all ? over / all : 0, "Steps done"),
+    element("span", `${over} of ${all} steps${last?.kept ? `, ${last.kept} kept from before` : ""}`, "soft"),
+    element("span", last?.failed ? `${last.failed} failed` : "", "bad"),
+    element("span", last ? `${duration(last.seconds)} on ${last.host}` : "", "soft"),
+  );
+  failure.textContent = last?.message ?? "";
+  failure.hidden = !failure.textContent;
+  scroll.replaceChildren(table(steps, state));
+  scroll.hidden = !steps.length;
+  const counted = ["failed", "done", "kept", "waiting"].filter((one) => others[one]).map((one) => `${others[one]} ${one}`);
+  rest.textContent = counted.length ? `${steps.length ? "and " : ""}${counted.join(", ")}` : "";
+  rest.hidden = !rest.textContent;
+}
+
+function table(steps, state) {
+  const made = element("table"),
+    head = element("tr");
+  for (const [name, kind] of [["step"], ["state"], ["progress"], ["time", "n"], ["peak of memory", "n"], ["machine"], [""]])
+    head.append(element("th", name, kind));
+  made.createTHead().append(head);
+  made.createTBody().append(
+    ...steps.map((step) => {
+      const row = element("tr", undefined, step.state === "failed" ? "failed" : ""),
+        name = element("td"),
+        progress = element("td"),
+        cut = step.state === "running" && state !== "running"; // its run ended, or fell silent
+      name.append(element("span", step.tile ? `${step.tile}/${step.step}` : step.step));
+      if (step.state === "running") progress.append(bar(step.progress, `Progress of ${step.step}`));
+      row.append(
+        name,
+        element("td", cut ? "not finished" : step.state, step.state === "failed" ? "bad" : ""),
+        progress,
+        element("td", duration(step.seconds), "n"),
+        element("td", step.memory === null ? "" : UNITS.bytes(step.memory), "n"),
+        element("td", step.host ?? ""),
+        element("td", step.message, "message"),
+      );
+      return row;
+    }),
+  );
+  return made;
+}
+
+// ---- alarms
+
+const NAMED = 3; // alarms that the strip names
+
+function tellAlarms({ raised, cleared }, events_topic) {
+  const strip = byId("alarm");
+  strip.hidden = !raised.length;
+  const told = raised.length
+    ? `${raised.length === 1 ? "Alarm" : `${raised.length} alarms`}: ` +
+      raised
+        .slice(0, NAMED)
+        .map((one) => `${one.rule}, ${one.subject}, since ${moment(one.since)}`)
+        .join("; ") +
+      (raised.length > NAMED ? `; and ${raised.length - NAMED} more` : "")
+    : "";
+  if (strip.textContent !== told) strip.textContent = told; // a reader's screen says it once
+  const rows = [...raised, ...cleared].map((one) => {
+    const row = element("tr"),
+      rule = element("td");
+    rule.append(element("span", one.rule));
+    row.append(
+      rule,
+      element("td", one.until === undefined ? "raised" : "cleared", one.until === undefined ? "bad" : ""),
+      element("td", one.subject),
+      element("td", +one.value.toPrecision(4), "n"),
+      element("td", one.since === null ? "–" : moment(one.since), "n"),
+      element("td", one.until === undefined ? "" : moment(one.until), "n"),
+    );
+    return row;
+  });
+  byId("alarms").tBodies[0].replaceChildren(...rows);
+  byId("alarms").parentElement.hidden = !rows.length;
+  byId("calm").textContent = rows.length ? "" : `None on ${events_topic}.`;
+}
