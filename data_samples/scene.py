@@ -167,8 +167,8 @@ class Scene:
         self.static = len(still.faces)
         self._moving_at = self.static + len(parked.faces)
         both = join([still, parked])
-        self._street = _caster(both)
-        self._car = _caster(moving)
+        self._street = caster(both)
+        self._car = caster(moving)
         self._pictures = signs.pictures()
         car_sky = np.clip(0.55 + 0.4 * moving.normals[:, 2], 0, 1).astype(np.float32)
         self.surface = join([replace(both, sky=self._openness(both)), replace(moving, sky=car_sky)])
@@ -196,12 +196,12 @@ class Scene:
     def cast(self, origins: F32, directions: F32, car: CarPoses | None = None) -> Hits:
         """First hits of rays (N, 3), (N, 3) unit; `car`: where the moving car is for each ray."""
         rays = np.concatenate([origins, directions], axis=1)
-        answer = _cast(self._street, rays)
+        answer = struck(self._street, rays)
         heading = np.zeros(len(rays), np.float32)
         if car is not None:
             index, own = self._to_car(rays, car)
             if len(index):
-                near = _cast(self._car, own)
+                near = struck(self._car, own)
                 closer = near.distance < answer.distance[index]
                 at = index[closer]
                 answer.distance[at] = near.distance[closer]
@@ -269,16 +269,12 @@ class Scene:
         rays = np.empty((len(lit), 6), np.float32)
         rays[:, :3] = xyz[lit] + 0.012 * np.where(leaf[lit, None], 0, normal[lit]) + 0.012 * sun
         rays[:, 3:] = sun
-        shaded = _occluded(self._street, rays)
+        shaded = occluded(self._street, rays)
         if car is not None:
             index, own = self._to_car(rays, car.take(lit))
-            shaded[index] |= _occluded(self._car, own)
+            shaded[index] |= occluded(self._car, own)
         facing[lit[shaded]] = 0
-        up = normal[:, 2]
-        direct = facing[:, None] * (SUN_COLOUR * np.float32(self.layout.sun_strength))
-        ambient = (sky * (0.68 + 0.32 * up))[:, None] * (SKY_COLOUR * np.float32(self.layout.sky_strength))
-        bounce = (sky * (0.5 - 0.5 * up))[:, None] * (SUN_COLOUR * np.float32(0.14))
-        return (albedo * (direct + ambient + bounce)).astype(np.float32)
+        return illuminated(albedo, normal, sky, facing, self.layout.sun_strength, self.layout.sky_strength)
 
     def _openness(self, part: Part) -> F32:
         """(V,) share of the hemisphere above each vertex that is open for 5 metres, cosine-weighted."""
@@ -293,7 +289,7 @@ class Scene:
             d /= np.linalg.norm(d, axis=2, keepdims=True)
             o = np.broadcast_to((part.vertices[block] + CLEAR * normal)[:, None], d.shape)
             rays = np.concatenate([o, d], axis=2).reshape(-1, 6).astype(np.float32)
-            sky[block] = 1 - _occluded(self._street, rays, 5.0).reshape(-1, len(directions)).mean(axis=1)
+            sky[block] = 1 - occluded(self._street, rays, 5.0).reshape(-1, len(directions)).mean(axis=1)
         return np.clip(0.12 + 0.88 * sky, 0, 1).astype(np.float32)
 
 
@@ -315,7 +311,8 @@ class CarPoses:
         return CarPoses(self.position[index], self.heading[index], self.present[index])
 
 
-def _caster(part: Part) -> Any:
+def caster(part: Part) -> Any:
+    """What rays can be cast at, of a mesh."""
     import open3d as o3d
 
     scene = o3d.t.geometry.RaycastingScene()
@@ -329,17 +326,34 @@ def _tensor(array: npt.NDArray[Any]) -> Any:
     return o3d.core.Tensor.from_numpy(np.ascontiguousarray(array))
 
 
-def _cast(caster: Any, rays: F32) -> Hits:
+def struck(caster: Any, rays: F32) -> Hits:
+    """First hits of rays (N, 6), origins and unit directions."""
     answer = caster.cast_rays(_tensor(rays))
     distance = answer["t_hit"].numpy().copy()
     face = np.where(np.isfinite(distance), answer["primitive_ids"].numpy().astype(np.int64), -1).astype(np.int32)
     return Hits(distance, face, answer["primitive_uvs"].numpy().copy(), np.zeros(len(rays), np.float32))
 
 
-def _occluded(caster: Any, rays: F32, far: float = float("inf")) -> Bools:
+def occluded(caster: Any, rays: F32, far: float = float("inf")) -> Bools:
+    """(N,) whether rays (N, 6) meet anything within `far` metres."""
     if len(rays) == 0:
         return np.zeros(0, bool)
     return caster.test_occlusions(_tensor(rays), 0.0, far).numpy().copy()
+
+
+def illuminated(albedo: F32, normal: F32, sky: F32, facing: F32, sun_strength: float, sky_strength: float) -> F32:
+    """Linear light (N, 3) that leaves matt surfaces under sun and sky.
+
+    Args:
+        albedo, normal: (N, 3).
+        sky: (N,) openness to the sky.
+        facing: (N,) cosine of the angle between normal and sun, 0 in the shade.
+    """
+    up = normal[:, 2]
+    direct = facing[:, None] * (SUN_COLOUR * np.float32(sun_strength))
+    ambient = (sky * (0.68 + 0.32 * up))[:, None] * (SKY_COLOUR * np.float32(sky_strength))
+    bounce = (sky * (0.5 - 0.5 * up))[:, None] * (SUN_COLOUR * np.float32(0.14))
+    return (albedo * (direct + ambient + bounce)).astype(np.float32)
 
 
 def srgb(light: npt.ArrayLike) -> U8:

@@ -157,15 +157,15 @@ def coach(length: float, width: float, height: float, colour: RGB, rng: np.rando
                 if height < 3 and i < panes // 2:
                     continue  # a van has none at its back
                 x0, x1 = -x + 0.2 + i * (length - 0.4) / panes, -x + 0.1 + (i + 1) * (length - 0.4) / panes
-                parts.append(_panel(x0, x1, side * (y + 0.01), z, z + 0.85, side, _glass(rng)))
+                parts.append(panel(x0, x1, side * (y + 0.01), z, z + 0.85, side, glass(rng)))
         for end in (-1, 1):
-            parts.append(_end(end * (x + 0.01), y - 0.15, z, z + 0.9, end, _glass(rng)))
+            parts.append(end_panel(end * (x + 0.01), y - 0.15, z, z + 0.9, end, glass(rng)))
     for side in (-1, 1):
         low = 0.5 if height < 3.5 else 2.1
         for i in range(max(1, int(length / 4.0))):
             picture = Paint(Material.SIGN, (1, 1, 1), paints.VEHICLE, int(rng.integers(len(signs.NAMES))))
             x0 = -x + 0.4 + i * (length - 0.8) / max(1, int(length / 4.0))
-            parts.append(_panel(x0, x0 + 2.1, side * (y + 0.012), low, low + 0.65, side, picture, unit=True))
+            parts.append(panel(x0, x0 + 2.1, side * (y + 0.012), low, low + 0.65, side, picture, unit=True))
     tyre = Paint(Material.WHEEL, (0.02, 0.02, 0.02), paints.VEHICLE)
     angle = np.linspace(0, 2 * np.pi, 21)[:-1]
     disc = 0.45 * np.column_stack([np.cos(angle), np.sin(angle)])
@@ -177,13 +177,12 @@ def coach(length: float, width: float, height: float, colour: RGB, rng: np.rando
     return join(parts)
 
 
-def _glass(rng: np.random.Generator) -> Paint:
+def glass(rng: np.random.Generator) -> Paint:
+    """Of a window of its own."""
     return Paint(Material.WINDOW, (0.03, 0.03, 0.03), paints.VEHICLE, int(rng.integers(1 << 20)))
 
 
-def _panel(
-    x0: float, x1: float, y: float, z0: float, z1: float, side: int, paint: Paint, *, unit: bool = False
-) -> Part:
+def panel(x0: float, x1: float, y: float, z0: float, z1: float, side: int, paint: Paint, *, unit: bool = False) -> Part:
     """A picture on a side (y > 0: the left one) between x0 and x1; `unit`: uv in [0, 1], else metres."""
     a, b = (x0, x1) if side < 0 else (x1, x0)
     w, h = (1.0, 1.0) if unit else (x1 - x0, z1 - z0)
@@ -191,7 +190,7 @@ def _panel(
     return quads(corners, [[(0, 0), (w, 0), (w, h), (0, h)]], paint, size=(w, h))
 
 
-def _end(x: float, half: float, z0: float, z1: float, end: int, paint: Paint) -> Part:
+def end_panel(x: float, half: float, z0: float, z1: float, end: int, paint: Paint) -> Part:
     """A pane in the front (end = 1) or the back."""
     a, b = -half * end, half * end
     corners = [[(x, a, z0), (x, b, z0), (x, b, z1), (x, a, z1)]]

@@ -71,7 +71,7 @@ def train(folder: Path, recipe: Recipe, report: Report = silent) -> Trained:
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     weight = class_weights([file for _, file in learn])
     optimiser = torch.optim.AdamW(network.parameters(), recipe.rate, weight_decay=1e-2)
-    smooth = torch.optim.swa_utils.AveragedModel(network, avg_fn=_averaged, use_buffers=True)
+    smooth = torch.optim.swa_utils.AveragedModel(network, avg_fn=averaged, use_buffers=True)
     network.train()
     start, done = time.monotonic(), 0.0
     step = 0
@@ -79,7 +79,7 @@ def train(folder: Path, recipe: Recipe, report: Report = silent) -> Trained:
         spent = (time.monotonic() - start) / 60
         done = max(step / recipe.steps, spent / recipe.minutes if recipe.minutes else 0.0)
         for group in optimiser.param_groups:
-            group["lr"] = recipe.rate * _one_cycle(done)
+            group["lr"] = recipe.rate * one_cycle(done)
         some = [learn[i] for i in rng.integers(0, len(learn), recipe.batch)]
         views = [_seen(pair, recipe.crop, rng) for pair in some]
         seen = torch.from_numpy(np.stack([image for image, _ in views])).permute(0, 3, 1, 2)
@@ -117,12 +117,12 @@ def _widened(path: Path) -> dict[str, torch.Tensor]:
     return state
 
 
-def _averaged(mean: torch.Tensor, new: torch.Tensor, n: torch.Tensor | int) -> torch.Tensor:
+def averaged(mean: torch.Tensor, new: torch.Tensor, n: torch.Tensor | int) -> torch.Tensor:
     """A running mean of weights over some 500 steps, over fewer at the beginning."""
     return mean + (new - mean) * max(MEMORY, 9 / (10 + int(n)))
 
 
-def _one_cycle(done: float) -> float:
+def one_cycle(done: float) -> float:
     """Share of the highest rate: up over the first twentieth, down along a cosine."""
     return min(1.0, done / 0.05 + 0.02) * 0.5 * (1 + math.cos(math.pi * min(1.0, done)))
 

@@ -1,0 +1,1 @@
+"""ML toolboxes: images in, results out, whatever the model behind."""

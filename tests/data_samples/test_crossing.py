@@ -1,0 +1,108 @@
+"""Films of level crossings: boxes where things are, speeds that are true, the same each time."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from scan2sim.data_samples import crossing
+from scan2sim.data_samples.crossing_traffic import STANDS, STEP
+from scan2sim.data_samples.stage import View as Placed
+from scan2sim.data_samples.stage import turned
+from scan2sim.pipeline.types import Bools
+
+
+@pytest.fixture(scope="module")
+def view() -> crossing.View:
+    return crossing.view(0, 4, 40.0)
+
+
+def test_boxes_lie_where_the_meshes_project(view: crossing.View) -> None:
+    checked = 0
+    for index in range(0, 1000, 90):
+        frame = view.frame(index)
+        placed = Placed(view.backdrop, crossing.SIZE, view.shake(index / crossing.FPS))
+        for seen in frame.seen:
+            places = np.concatenate([p.body.part.vertices @ turned(p.heading).T + p.place for p in seen.actor.pieces])
+            pixels, depth = placed.project(places.astype(np.float64))
+            if (depth < 1).any():
+                continue
+            low, high = pixels.min(axis=0), pixels.max(axis=0) + 1
+            if (low < 0).any() or (high > crossing.SIZE).any():
+                continue  # what is outside may be higher than what is within
+            assert np.abs(np.array(seen.box) - [*low, *high]).max() < 2.5, (index, seen.actor.label)
+            checked += 1
+    assert checked > 10
+
+
+def test_pixels_change_where_things_are_and_in_their_shade_alone(view: crossing.View) -> None:
+    actors = view.traffic.at(500)
+    empty = view.stage.frame(view.backdrop, [], crossing.SIZE).rgb.astype(int)
+    frame = view.stage.frame(view.backdrop, actors, crossing.SIZE)
+    changed = np.abs(frame.rgb - empty).max(axis=2) > 12
+    near: Bools = cv2.dilate((frame.owner >= 0).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    lighter = (frame.rgb - empty).max(axis=2) > 12
+    assert changed[frame.owner >= 0].mean() > 0.7
+    assert not (lighter & ~near).any(), "outside of things there is shade, never light"
+    for k, seen in enumerate(s for s in frame.seen if s.visible == 1):
+        rows, columns = np.nonzero(frame.owner == actors.index(seen.actor))
+        x0, y0, x1, y1 = seen.box
+        assert (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1) == (x0, y0, x1, y1), k
+
+
+def test_the_same_seed_makes_the_same_frames(view: crossing.View) -> None:
+    again = crossing.view(0, 4, 40.0)
+    np.testing.assert_array_equal(view.frame(300).rgb, again.frame(300).rgb)
+    assert crossing.told(view.frame(300)) == crossing.told(again.frame(300))
+    other = crossing.view(1, 4, 40.0)
+    assert (view.frame(300).rgb != other.frame(300).rgb).mean() > 0.5
+
+
+def test_speeds_are_how_far_things_get(view: crossing.View) -> None:
+    kinds = set()
+    for index in range(0, 990, 5):
+        now = {a.track: a for a in view.traffic.at(index)}
+        then = {a.track: a for a in view.traffic.at(index + 1)}
+        for track in now.keys() & then.keys():
+            a, b = now[track], then[track]
+            if len(a.pieces) != len(b.pieces) or not a.pieces:
+                continue  # a train that comes or goes
+            way = np.linalg.norm(b.pieces[0].place - a.pieces[0].place) / STEP
+            assert abs(way - a.speed) < 0.6, (index, a.label)
+            if a.speed == 0 == b.speed:
+                assert way == 0
+            kinds.add((a.label == "train", a.speed >= STANDS))
+    assert len(kinds) == 4, "trains and cars, moving and standing"
+
+
+def test_no_car_stands_where_a_train_passes() -> None:
+    for number in range(4):
+        traffic = crossing.view(2, number, 40.0).traffic
+        for index in range(0, 1000, 5):
+            there = any(t.head[index] > -2 and t.head[index] - t.length < 2 for t in traffic.trains)
+            for cars in traffic._lanes.values():
+                assert not there or not any(s > 0 > s - car.length for car, s, _ in cars[index]), (number, index)
+
+
+def test_films_come_with_a_line_a_frame(tmp_path: Path) -> None:
+    crossing.film(tmp_path, views=2, frames=6, seed=3)
+    lines = [json.loads(line) for line in (tmp_path / "truth.jsonl").read_text().splitlines()]
+    assert [(line["view"], line["frame"]) for line in lines] == [(v, f) for v in (0, 1) for f in range(6)]
+    assert {line["light"] for line in lines} == {"day", "dusk"}
+    bright = []
+    for number in range(2):
+        video = cv2.VideoCapture(str(tmp_path / f"view_{number:02d}.mp4"))
+        frames = []
+        while (read := video.read())[0]:
+            frames.append(read[1])
+        assert len(frames) == 6 and frames[0].shape == (360, 640, 3)
+        bright.append(np.mean(frames))
+    assert bright[1] < 0.8 * bright[0]
+    for thing in (t for line in lines for t in line["things"]):
+        x0, y0, x1, y1 = thing["box"]
+        assert 0 <= x0 < x1 <= 640 and 0 <= y0 < y1 <= 360 and 0 <= thing["visible"] <= 1
+        assert thing["moving"] == (thing["speed"] >= STANDS)
