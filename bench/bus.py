@@ -1,6 +1,6 @@
 """The event bus, measured.
 
-`python -m bench.bus [--parts experiment sizes forecast overhead broker] [--speed 25] [--out DIR]`
+`python -m bench.bus [--parts experiment sizes forecast overhead broker nodes] [--speed 25] [--out DIR]`
 
 - experiment: D3.2's section 3.2 through real nodes (bench/bus_experiment.py): Monday from 6 to 10 h, of 10, 20 and 50
   cameras at once, so many times as fast, with messages that tell their size; plots go to DIR.
@@ -9,8 +9,9 @@
 - forecast: what forecasts are worth on the curve's Mondays (bench/bus_forecast.py).
 - overhead: a publisher and a subscriber, watched against bare (bench/bus_cost.py); wants a quiet machine.
 - broker: records of ten nodes, and a broker that is away for a minute (bench/bus_broker.py).
+- nodes: a hundred nodes on one machine, watched by one page (bench/bus_nodes.py).
 
-Ends with `RESULT {json}`; null where a part was left out.
+Ends with `RESULT {json}`, of the keys of `KEYS` and some more; null where a part was left out.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from bench import bus_broker, bus_cost, bus_experiment, bus_forecast
+from bench import bus_broker, bus_cost, bus_experiment, bus_forecast, bus_nodes
 from bench.bus_experiment import LIMIT, Outcome, Replay
 
 RUSH = (7.5, 8.0)
@@ -58,8 +59,12 @@ PARTS: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {
     "forecast": forecast,
     "overhead": lambda _: bus_cost.overhead(),
     "broker": lambda _: bus_broker.broker_down(),
+    "nodes": lambda _: bus_nodes.nodes_watched(),
 }
-FLAT = ("overhead", "broker")
+KEYS = ("experiment", "overhead_p50_1kb", "overhead_throughput_1kb", "overhead_p50_6mb", "broker_down_lost",
+        "broker_down_doubles", "bandwidth_error", "loss_error", "latency_error", "nodes_watched")  # fmt: skip
+"""What the result always has."""
+FLAT = ("overhead", "broker", "nodes")
 """Parts whose figures stand in the result by their own names."""
 
 
@@ -106,7 +111,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path(tempfile.gettempdir()) / "scan2sim-bus")
     given = parser.parse_args()
     found = {name: part(given) if name in given.parts else None for name, part in PARTS.items()}
-    result = {name: figures for name, figures in found.items() if name not in FLAT}
+    result = dict.fromkeys(KEYS) | {name: figures for name, figures in found.items() if name not in FLAT}
     for name in FLAT:
         result |= found[name] or {}
     print("RESULT " + json.dumps(result))

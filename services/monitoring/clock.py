@@ -139,9 +139,14 @@ class _NtpTime(ctypes.Structure):
     )
 
 
+@cache
+def _libc() -> ctypes.CDLL:
+    return ctypes.CDLL(None)
+
+
 def synchronised() -> bool | None:
     """Whether NTP (or PTP) keeps this machine's clock, as its kernel says; None: it says nothing."""
     try:
-        return ctypes.CDLL(None).ntp_gettime(ctypes.byref(_NtpTime())) not in (-1, 5)  # TIME_ERROR
+        return _libc().ntp_gettime(ctypes.byref(_NtpTime())) not in (-1, 5)  # TIME_ERROR
     except (AttributeError, OSError):
         return None
