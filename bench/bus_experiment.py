@@ -34,7 +34,11 @@ TOPIC = "/vehicles"
 
 @dataclass(frozen=True)
 class Replay:
-    """What is replayed: cameras, hours of Monday, how fast, whether messages are as large as events."""
+    """What is replayed: cameras, hours of Monday, how fast, whether messages are as large as events.
+
+    Attributes:
+        kafka: servers that records and events go to, too, as "host:port".
+    """
 
     cameras: int
     speed: float
@@ -42,6 +46,7 @@ class Replay:
     real_sizes: bool = False
     min_workers: int = 1
     seed: int = 0
+    kafka: str | None = None
 
     @property
     def name(self) -> str:
@@ -127,12 +132,14 @@ class _Run:
                               seed=1000 * told.seed + group)
             )  # fmt: skip
             self._talkers.append(
-                self._start("dataset-talker", TOPIC, data, "--speed", speed, "--subscribers", 1, "--period", 1,
+                self._start("dataset-talker", TOPIC, data, "--name", f"cameras_{group}", "--speed", speed,
+                            "--subscribers", 1, "--period", 1,
                             *([] if told.real_sizes else ["--size-as-field"]))
             )  # fmt: skip
 
     def _start(self, *arguments: Any) -> subprocess.Popen[bytes]:
-        command = [sys.executable, "-m", "scan2sim.flows.cli", "monitor", *map(str, arguments)]
+        kafka = ["--kafka", self._told.kafka] if self._told.kafka else []
+        command = [sys.executable, "-m", "scan2sim.flows.cli", "monitor", *map(str, arguments), *kafka]
         environment = os.environ | {"ROS_DOMAIN_ID": str(self._domain), "PYTHONPATH": str(ROOT)}
         log = (self._folder / f"{arguments[0]}.err").open("ab")
         return subprocess.Popen(command, env=environment, stderr=log)

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import re
 from functools import cache
+
+from pydantic import TypeAdapter, ValidationError
 
 from scan2sim.pipeline import extras
 from scan2sim.pipeline.errors import SettingError
 from scan2sim.services import spools, transport
+from scan2sim.services.kafka import Servers
 from scan2sim.services.monitoring.events import Outlet
 from scan2sim.services.monitoring.sinks import Kafka
 
 ROS = "ros2"
 """Stands among Kafka's servers for a topic of ROS 2."""
 TOPIC = "bus_events"
-SERVER = re.compile(r"[^\s:,]+:\d{1,5}|\[[0-9a-fA-F:.]+\]:\d{1,5}")
 
 
 def check(where: str) -> None:
@@ -27,22 +28,29 @@ def check(where: str) -> None:
         SettingError: it says something else.
         UnavailableError: packages aren't installed.
     """
-    places = where.split(",")
-    for place in places:
-        if place != ROS and not SERVER.fullmatch(place):
-            raise SettingError("--bus", f"must be HOST:PORT,... or {ROS} (got {place!r:.60})", "As localhost:9092")
-    if ROS in places:
+    servers = _servers(where)
+    try:
+        if where != ROS:
+            TypeAdapter(Servers).validate_python(servers)
+    except ValidationError:
+        cause = f"must be HOST:PORT, {ROS}, or several of them parted by commas (got {where!r:.60})"
+        raise SettingError("--bus", cause, "As localhost:9092") from None
+    if ROS in where.split(","):
         transport.load()
-    if set(places) != {ROS}:
+    if servers:
         extras.need("--bus", "confluent_kafka")
 
 
 def opened(where: str) -> list[Outlet]:
     """Outlets to places as of `check`; what no broker takes, and the process leaves, the next one sends to the same."""
-    places = where.split(",")
-    servers = ",".join(place for place in places if place != ROS)
+    servers = _servers(where)
     found: list[Outlet] = [Kafka(servers, TOPIC, spools.opened(f"run.{servers}", TOPIC))] if servers else []
-    return [*found, _ros()] if ROS in places else found
+    return [*found, _ros()] if ROS in where.split(",") else found
+
+
+def _servers(where: str) -> str:
+    """Kafka's among the places; "" where there are none."""
+    return ",".join(place for place in where.split(",") if place != ROS)
 
 
 @cache

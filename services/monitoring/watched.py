@@ -46,6 +46,14 @@ class Watched(Params):
 
 
 Topic = Annotated[TopicName, Field(description="Its name, as /camera/image.")]
+NodeName = Annotated[
+    str,
+    Field(
+        pattern=r"^[A-Za-z_][A-Za-z0-9_]{0,254}$",
+        description="The node's name: each of several has its own.",
+        json_schema_extra={"range": "letters, digits and underscores"},
+    ),
+]
 
 
 class TopicParams(Watched):
@@ -66,6 +74,7 @@ class TalkerParams(Watched):
     """Of a node that sends messages of a size at an interval."""
 
     topic: Topic
+    name: NodeName = "talker"
     size: Annotated[int, Field(ge=0, le=LARGEST, description="Characters of a message.")] = 1000
     interval: Annotated[float, Field(ge=0.0001, le=3600, description="Seconds between messages.")] = 1.0
 
@@ -74,6 +83,7 @@ class DatasetParams(Watched):
     """Of a node that sends messages when, and as large as, a file says."""
 
     topic: Topic
+    name: NodeName = "dataset_talker"
     data: Annotated[Path, Field(description="CSV: seconds from the start, bytes.")]
     speed: Annotated[float, Field(ge=0.001, le=10_000, description="So many times as fast as the file says.")] = 1.0
     subscribers: Annotated[int, Field(ge=0, le=1000, description="Subscriptions to wait for before it begins.")] = 0

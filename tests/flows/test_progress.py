@@ -232,7 +232,7 @@ def test_a_bus_that_breaks_breaks_no_run(
     assert "the bus isn't told of this run any more: OSError: the disk is gone" in caplog.text
 
 
-@pytest.mark.parametrize("where", ["", "localhost", "localhost:9092,", "localhost:9092;other:1", "ros", "http://a:1"])
+@pytest.mark.parametrize("where", ["", "a b", "localhost:9092,", "localhost:9092;other:1", "ros2,", "http://a:1"])
 def test_what_is_no_bus_is_refused_before_anything_runs(where: str) -> None:
     with pytest.raises(SettingError, match="--bus: must be HOST:PORT"), published(where, "run", "toys"):
         raise AssertionError("it ran")

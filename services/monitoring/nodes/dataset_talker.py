@@ -20,9 +20,9 @@ LATE = 0.001
 class DatasetTalker(Monitor):
     """Replays a file."""
 
-    def __init__(self, params: DatasetParams, node_name: str = "dataset_talker") -> None:
+    def __init__(self, params: DatasetParams) -> None:
         self._events = read_events(params.data)
-        super().__init__(node_name, **params.monitored())
+        super().__init__(params.name, **params.monitored())
         self._speed, self._field = params.speed, params.size_as_field
         self._publisher = self.create_publisher(ros.message_type(STRING), params.topic, 100)
         self._subscribers = params.subscribers

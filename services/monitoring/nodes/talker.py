@@ -9,8 +9,8 @@ from scan2sim.services.monitoring.watched import TalkerParams
 class Talker(Monitor):
     """Sends strings."""
 
-    def __init__(self, params: TalkerParams, node_name: str = "talker") -> None:
-        super().__init__(node_name, **params.monitored())
+    def __init__(self, params: TalkerParams) -> None:
+        super().__init__(params.name, **params.monitored())
         self._message = ros.message(STRING, data="x" * params.size)
         self._publisher = self.create_publisher(ros.message_type(STRING), params.topic, 10)
         self.create_timer(params.interval, self._talk)
