@@ -20,6 +20,7 @@ from pydantic import ValidationError
 
 from scan2sim.pipeline.errors import printable
 from scan2sim.services.monitoring.record import SCHEMA, Record
+from scan2sim.services.monitoring.skew import Skew
 
 ROWS = 21_600
 """Records of a node that are kept, at least."""
@@ -29,8 +30,8 @@ GONE = 3.0
 """Periods without a record after which a node counts as gone (issue: three)."""
 HELD = 1.5
 """Periods before its moment for which a record holds, so that a late one leaves no gap."""
-AHEAD = 60.0
-"""Seconds by which a record's time may be ahead of this machine's clock."""
+LATEST = 1e11
+"""A record's time, seconds since the epoch, at most."""
 LARGEST = 4 * 2**20
 """Bytes of a record."""
 REMARKS, REMARK = 32, 400
@@ -62,12 +63,15 @@ class _Node:
     number: int
     last: Record
     came: float
+    skew: Skew = field(default_factory=Skew)
     times: Floats = field(default_factory=lambda: np.empty(256))
     values: NDArray[np.float32] = field(default_factory=lambda: np.empty((256, len(COLUMNS)), np.float32))
     count: int = 0
 
-    def add(self, at: float, row: Sequence[float]) -> None:
-        """Keep a record's figures."""
+    def add(self, came: float, record: Record, row: Sequence[float]) -> None:
+        """Keep a record's figures, which came then; all are moved when its clock turns out to be off."""
+        self.times[: self.count] += self.skew.add(came, record.time, record.period)
+        at = record.time + self.skew.behind
         if self.count == len(self.times):
             self._make_room()
         place = int(np.searchsorted(self.times[: self.count], at, side="right"))
@@ -114,7 +118,7 @@ class History:
             record = parsed(body)
             row = _row(record)
             with self._lock:
-                self._node(record).add(record.time, row)
+                self._node(record).add(time.time(), record, row)
         except Refused as refused:
             why, _, detail = str(refused).partition(": ")
             self.counts[why] += 1
@@ -124,8 +128,8 @@ class History:
 
     def _node(self, record: Record) -> _Node:
         name, now = full_name(record), time.monotonic()
-        came = now - max(0.0, self._began - record.time)
         node = self._nodes.get(name)
+        came = now - max(0.0, self._began - record.time - (node.skew.behind if node else 0.0))
         if node is None:
             if len(self._nodes) >= NODES:
                 self._forget_one(now)
@@ -258,8 +262,8 @@ def parsed(body: bytes) -> Record:
         raise Refused(f"malformed: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
     if not 0 < record.period <= 86_400:
         raise Refused(f"malformed: a period of {record.period} s")
-    if not 0 <= record.time <= time.time() + AHEAD:
-        raise Refused(f"of a clock that is ahead: {full_name(record)}, time {record.time}")
+    if not 0 <= record.time < LATEST:
+        raise Refused(f"malformed: a time of {record.time} s")
     return record
 
 
@@ -291,8 +295,15 @@ def _state(name: str, node: _Node, now: float) -> dict[str, Any]:
         "topics": len(last.topics),
         "dropped": last.dropped,
         "latest": dict(zip(COLUMNS[1:], (_told(value, 6) for value in _row(last)[1:]), strict=True)),
-        "remarks": [printable(text[:REMARK]) for text in last.remarks[:REMARKS]],
+        "remarks": [*_clock(node.skew.behind), *(printable(text[:REMARK]) for text in last.remarks[:REMARKS])],
     }
+
+
+def _clock(behind: float) -> list[str]:
+    if not behind:
+        return []
+    way = "behind" if behind > 0 else "ahead of"
+    return [f"its clock is {abs(behind):.0f} s {way} this machine's: its records are shown where they came"]
 
 
 DIGITS = {"bandwidth": 1, "latency": 6, "lost": 2, "messages": 2, "size": 1}
