@@ -1,6 +1,6 @@
 """The event bus, measured.
 
-`python -m bench.bus [--parts experiment sizes forecast overhead broker nodes] [--speed 25] [--out DIR]`
+`python -m bench.bus [--parts experiment sizes forecast overhead broker nodes link] [--speed 25] [--out DIR]`
 
 - experiment: D3.2's section 3.2 through real nodes (bench/bus_experiment.py): Monday from 6 to 10 h, of 10, 20 and 50
   cameras at once, so many times as fast, with messages that tell their size; plots go to DIR.
@@ -10,6 +10,7 @@
 - overhead: a publisher and a subscriber, watched against bare (bench/bus_cost.py); wants a quiet machine.
 - broker: records of ten nodes, and a broker that is away for a minute (bench/bus_broker.py).
 - nodes: a hundred nodes on one machine, watched by one page (bench/bus_nodes.py).
+- link: bandwidth, losses and latency that monitors tell, held against shaped links (bench/bus_link.py); wants root.
 
 Ends with `RESULT {json}`, of the keys of `KEYS` and some more; null where a part was left out.
 """
@@ -23,7 +24,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from bench import bus_broker, bus_cost, bus_experiment, bus_forecast, bus_nodes
+from bench import bus_broker, bus_cost, bus_experiment, bus_forecast, bus_link, bus_nodes
 from bench.bus_experiment import LIMIT, Outcome, Replay
 
 RUSH = (7.5, 8.0)
@@ -60,11 +61,12 @@ PARTS: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {
     "overhead": lambda _: bus_cost.overhead(),
     "broker": lambda _: bus_broker.broker_down(),
     "nodes": lambda _: bus_nodes.nodes_watched(),
+    "link": lambda _: bus_link.link(),
 }
 KEYS = ("experiment", "overhead_p50_1kb", "overhead_throughput_1kb", "overhead_p50_6mb", "broker_down_lost",
         "broker_down_doubles", "bandwidth_error", "loss_error", "latency_error", "nodes_watched")  # fmt: skip
 """What the result always has."""
-FLAT = ("overhead", "broker", "nodes")
+FLAT = ("overhead", "broker", "nodes", "link")
 """Parts whose figures stand in the result by their own names."""
 
 

@@ -21,8 +21,10 @@ TOPIC = "monitor_clock"
 PREFIX = 12
 """Bytes of a GID that are the process's."""
 ASKED_EVERY = 5.0
-"""Seconds between two exchanges with another machine, and between two tries."""
-TRIES = 5
+"""Seconds between two exchanges with another machine, once `KEPT` of them are known."""
+ASKED_AT_FIRST = 1.0
+"""Seconds until then, and between two tries."""
+TRIES = 10
 """Pings without an answer after which a process counts as one that doesn't answer (it isn't watched)."""
 KEPT = 8
 """Exchanges of which the quickest counts."""
@@ -70,7 +72,7 @@ class Clock:
             peer = self._peers[prefix] = _Peer()
         if peer.host == self._host or (peer.host is None and peer.tries >= TRIES):
             return None
-        if time.monotonic() - peer.asked < ASKED_EVERY:
+        if time.monotonic() - peer.asked < (ASKED_EVERY if len(peer.exchanges) == KEPT else ASKED_AT_FIRST):
             return None
         peer.asked, peer.tries = time.monotonic(), peer.tries + 1
         return {"to": prefix.hex(), "from": self._id, "sent": time.time_ns()}

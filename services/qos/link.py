@@ -2,8 +2,8 @@
 
 ```
 with Link(Shape(rate=8e6, delay=0.02, loss=0.01)) as link:
-    link.far.popen("iperf3", "--server")
-    link.near.run("iperf3", "--client", link.far.address)
+    link.far.popen("iperf3", "-s")
+    link.near.run("iperf3", "-c", link.far.address)
 ```
 """
 

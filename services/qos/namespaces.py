@@ -5,6 +5,7 @@ They are gone with the process that made them, however that ends: a shell waits 
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import os
@@ -12,7 +13,6 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,8 @@ done 2>/dev/null
 rm -rf "$1"
 """
 """A shell's script: ends what runs in two namespaces, and them, when there is input or no more of it."""
+PRIORITY = 10
+"""Of programs that go first, from 1 to 99."""
 _numbers = itertools.count()
 
 
@@ -74,10 +76,16 @@ class Namespace:
         """A command that runs another in here."""
         return ["ip", "netns", "exec", self.name, *map(str, command)]
 
-    def popen(self, *command: object, **named: Any) -> subprocess.Popen[Any]:
-        """Start a program here, as `subprocess.Popen` does; it ends with the namespace."""
+    def popen(self, *command: object, first: bool = False, **named: Any) -> subprocess.Popen[Any]:
+        """Start a program here, as `subprocess.Popen` does; it ends with the namespace.
+
+        `first`: it goes before what else wants a processor, where this process may say so (real-time scheduling).
+        """
         started = subprocess.Popen(self.inside(*command), **named)
         self._started.append(started)
+        if first:
+            with contextlib.suppress(PermissionError):
+                os.sched_setscheduler(started.pid, os.SCHED_FIFO, os.sched_param(PRIORITY))
         return started
 
     def run(self, *command: object, **named: Any) -> subprocess.CompletedProcess[Any]:
@@ -95,7 +103,7 @@ class Namespace:
             process.wait()
 
 
-@contextmanager
+@contextlib.contextmanager
 def pair() -> Iterator[tuple[Namespace, Namespace, Path]]:
     """Two namespaces, yet without their interfaces, and a folder for their programs.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -10,7 +11,7 @@ from typing import Any
 import pytest
 
 from scan2sim.services.monitoring import clock
-from scan2sim.services.monitoring.clock import ASKED_EVERY, TRIES, Clock
+from scan2sim.services.monitoring.clock import ASKED_AT_FIRST, ASKED_EVERY, KEPT, TRIES, Clock
 
 HERE, THERE = b"h" * 16, b"t" * 16
 
@@ -72,6 +73,20 @@ def test_processes_of_one_machine_are_asked_once(times: Times) -> None:
     assert exchange(times, here, there, 0, 10_000, 20_000)
     assert here.offset(THERE) == (0, 0)
     assert exchange(times, here, there, 0, 10_000, 20_000) is None
+
+
+def test_who_is_new_is_asked_often_until_enough_is_known(times: Times) -> None:
+    here, there = Clock("one"), Clock("two")
+    for known, own in ((here, HERE), (there, THERE)):
+        known.heard(known.hello() or {}, own, times.time_ns())
+    asked_at = []
+    for _ in range(200):
+        if ping := here.ping(THERE):
+            asked_at.append(times.monotonic())
+            here.heard(there.heard(ping, HERE, times.time_ns()) or {}, THERE, times.time_ns())
+        times.now += 10**8
+    pauses = [after - before for before, after in itertools.pairwise(asked_at)]
+    assert pauses == pytest.approx([ASKED_AT_FIRST] * (KEPT - 1) + [ASKED_EVERY] * 2, abs=0.11)
 
 
 def test_who_does_not_answer_is_not_asked_for_ever(times: Times) -> None:

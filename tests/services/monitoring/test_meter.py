@@ -39,6 +39,14 @@ def test_losses_are_counted_by_publisher_whatever_the_order() -> None:
     assert (found.sent, found.lost) == (5, 3)  # over the border between two periods: 5, 6 and 7 of b
 
 
+def test_a_publisher_that_starts_anew_loses_nothing_by_it() -> None:
+    meter = Meter(window=10)
+    for publisher, number in ((b"before", 5), (b"before", 6), (b"before", 9), (b"after", 1), (b"after", 2)):
+        meter.received(arrival(number, publisher=publisher))
+    found = meter.read().incoming["/t"]
+    assert (found.flow.messages, found.sent, found.lost) == (5, 7, 2)
+
+
 def test_losses_are_unknown_where_a_publisher_numbers_nothing() -> None:
     meter = Meter(window=10)
     meter.received(arrival(1))
