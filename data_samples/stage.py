@@ -7,7 +7,7 @@ and glass of vehicles mirror the sky a little.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -292,14 +292,15 @@ class View:
 
     def __init__(self, backdrop: Backdrop, size: tuple[int, int], shake: F64) -> None:
         self.shake, self.size = np.asarray(shake, np.float64), size
-        self._back = np.linalg.inv(np.vstack([self.shake, [0, 0, 1]]))
+        whole = np.vstack([self.shake, [0, 0, 1]])
+        self._back = np.linalg.inv(whole)
         self._camera, self._pose = backdrop.camera, backdrop.T_world_cam
         self.origin, self.angle, self.gain = backdrop.T_world_cam[:3, 3], 1 / backdrop.camera.fx, backdrop.gain
-        v, u = np.mgrid[: size[1], : size[0]].astype(np.float32)
-        x, y = (self.shake[k, 0] * u + self.shake[k, 1] * v + self.shake[k, 2] for k in (0, 1))
-        d = np.stack([(x - self._camera.cx) / self._camera.fx, (y - self._camera.cy) / self._camera.fy, 1 + 0 * x], -1)
-        d /= np.sqrt(np.einsum("ijk,ijk->ij", d, d))[..., None]
-        self._rays = (d @ self._pose[:3, :3].T).astype(np.float32)
+        c = self._camera
+        inverse = np.array([[1 / c.fx, 0, -c.cx / c.fx], [0, 1 / c.fy, -c.cy / c.fy], [0, 0, 1]])
+        rays = _pixels(size) @ (self._pose[:3, :3] @ inverse @ whole).T.astype(np.float32)
+        rays /= np.sqrt(np.einsum("ijk,ijk->ij", rays, rays))[..., None]
+        self._rays = rays
 
     def rays(self, rect: tuple[slice, slice]) -> F32:
         """(N, 3) unit rays through the pixels of a part."""
@@ -326,6 +327,13 @@ class View:
             x0, y0, x1, y1 = 0, 0, width, height
         a, b, c, d = (int(np.clip(v, 0, n)) for v, n in ((x0, width), (x1, width), (y0, height), (y1, height)))
         return (slice(c, d), slice(a, b)) if b > a and d > c else None
+
+
+@lru_cache(4)
+def _pixels(size: tuple[int, int]) -> F32:
+    """(H, W, 3) x, y and 1 of each pixel."""
+    v, u = np.mgrid[: size[1], : size[0]].astype(np.float32)
+    return np.stack([u, v, np.ones_like(u)], axis=-1)
 
 
 def middle(backdrop: Backdrop, size: tuple[int, int], turn: float = 0.0, aside: npt.ArrayLike = (0.0, 0.0)) -> F64:
