@@ -98,10 +98,11 @@ def watch(replay: Replay, folder: Path, every: float) -> dict[str, Any]:
     kafka = ("--kafka", replay.kafka)
     seen: list[dict[str, Any]] = []
     with (
+        tempfile.TemporaryDirectory() as browser,
         started(folder, "monitor", "page", *kafka, "--port", PORT, "--limit", "latency=0.2"),
         started(folder, "monitor", "alarms", rules, *kafka),
         started(folder, "run", "data_samples/tile", "--out", folder / "tile", "--jobs", 1, "--bus", replay.kafka),
-        chromium(folder, "--disable-gpu") as page,
+        chromium(Path(browser), "--disable-gpu") as page,
     ):
         running.start()
         _open(page)

@@ -34,8 +34,7 @@ class Raised:
         with self._lock:
             known = self._raised.pop(place, None)
             if alarm.state == "cleared":
-                since = known["since"] if known else None
-                self._cleared.appendleft(_shown(alarm) | {"since": since, "until": at})
+                self._cleared.appendleft((known or _shown(alarm) | {"since": None}) | {"until": at})
             elif len(self._raised) >= RAISED:
                 raise Refused(f"of more than {RAISED} alarms: no room")
             else:
@@ -44,8 +43,8 @@ class Raised:
     def state(self) -> dict[str, list[dict[str, Any]]]:
         """Alarms, JSON-able, the latest first: `raised` and `cleared`.
 
-        Each with `rule`, `subject`, `value`, `since` (null: it was raised before anybody listened) and, if it is
-        cleared, `until`; seconds since the epoch.
+        Each with `rule`, `subject`, `value` as it was raised last, `since` (null: before anybody listened) and, if it
+        is cleared, `until`; seconds since the epoch.
         """
         with self._lock:
             latest_first = sorted(self._raised.values(), key=lambda one: -one["since"])

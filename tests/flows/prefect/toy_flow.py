@@ -13,35 +13,41 @@ from prefect.states import Completed
 
 from scan2sim.flows.deployed.tile import by_tasks
 from scan2sim.flows.engine.lock import locked
+from scan2sim.flows.engine.progress import published
 from scan2sim.flows.engine.versions import versions
 from scan2sim.pipeline.errors import BusyError
 from scan2sim.pipeline.store import Store
 from tests.flows.prefect.toy_steps import STEPS, planned
 
 
-def toy_tiles(folder: str, tiles: int, gate: str | None, runner: str, pretend: str | None) -> int:
+def toy_tiles(
+    folder: str, tiles: int, gate: str | None, runner: str, pretend: str | None, bus: str | None
+) -> int:  # fmt: skip
     """All tiles; returns the sum of what came out."""
     pretended = {**versions(), **({"scan2sim": pretend} if pretend else {})}
-    with patch("scan2sim.flows.deployed.tile.versions", lambda: pretended):
-        run = by_tasks(runner, 2)
-    outcome = run(planned(Path(folder), tiles, Path(gate) if gate else None), Store(Path(folder) / "steps"))
-    outcome.check()
+    with published(bus, "survey", folder, here=False) as on_bus:
+        with patch("scan2sim.flows.deployed.tile.versions", lambda: pretended):
+            run = by_tasks(runner, 2, bus=on_bus)
+        outcome = run(planned(Path(folder), tiles, Path(gate) if gate else None), Store(Path(folder) / "steps"))
+        outcome.check()
     return sum(outcome.of_tile(str(tile))[STEPS[-1]].facts["total"] for tile in range(tiles))
 
 
 @flow(name="toy")
 def toy_survey(
-    folder: str, tiles: int = 1, gate: str | None = None, runner: str = "threads", pretend: str | None = None
+    folder: str, tiles: int = 1, gate: str | None = None, runner: str = "threads", pretend: str | None = None,
+    bus: str | None = None,
 ) -> State:  # fmt: skip
     """One run at a time, as `reprocess`; of a version of the project that it pretends to have."""
     try:
         with locked(Path(folder)):
-            total = toy_tiles(folder, tiles, gate, runner, pretend)
+            total = toy_tiles(folder, tiles, gate, runner, pretend, bus)
     except BusyError as error:
         return Completed(message=f"Skipped: {error}", name="Skipped")
     return Completed(message=f"total {total}", data=total)
 
 
 def main() -> None:
-    """FOLDER RUNNER: six tiles."""
-    print("total", toy_survey(sys.argv[1], tiles=6, runner=sys.argv[2]))
+    """FOLDER RUNNER [BUS]: six tiles."""
+    bus = sys.argv[3] if len(sys.argv) > 3 else None
+    print("total", toy_survey(sys.argv[1], tiles=6, runner=sys.argv[2], bus=bus))

@@ -112,9 +112,9 @@ def test_an_alarm_is_raised_until_it_is_cleared() -> None:
         ("lost", NOW + 8, 1.0),
         ("late", NOW, 3.0),
     ]
-    known.take(alarm("cleared", since=NOW + 30), NOW + 40)
+    known.take(alarm("cleared", since=NOW + 30, value=0.1), NOW + 40)
     (cleared,) = known.state()["cleared"]
-    assert (cleared["since"], cleared["until"]) == (NOW, NOW + 40)
+    assert (cleared["since"], cleared["until"], cleared["value"]) == (NOW, NOW + 40, 3.0)
     assert [one["rule"] for one in known.state()["raised"]] == ["lost"]
     known.take(alarm("cleared", "never heard of"), NOW + 41)
     assert known.state()["cleared"][0]["since"] is None
