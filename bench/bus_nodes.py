@@ -38,11 +38,8 @@ def rate(number: int) -> float:
     return 5.0 + number % 10
 
 
-def nodes_watched(page: str | None = None) -> dict[str, float]:
+def nodes_watched() -> dict[str, float]:
     """How many nodes the page shows at their rates.
-
-    Args:
-        page: PNG of the page to make, in headless Chromium.
 
     Returns:
         nodes_watched: of 100; nodes_page_cpu and nodes_cpu: processors that the page and all nodes keep busy.
@@ -67,8 +64,6 @@ def nodes_watched(page: str | None = None) -> dict[str, float]:
             assert shown.stdout
             address = shown.stdout.readline().split()[0]
             found = _watched(address, shown.pid, [one.pid for one in makers])
-            if page:
-                _picture(address, Path(page))
         finally:
             running: list[subprocess.Popen[Any]] = [shown, *makers]
             for one in running:
@@ -119,14 +114,6 @@ def _cpu(process: int) -> float:
     return float(times.user + times.system)
 
 
-def _picture(address: str, path: Path) -> None:
-    subprocess.run(
-        ["chromium", "--headless", "--no-sandbox", "--window-size=1600,2400", "--virtual-time-budget=8000",
-         f"--screenshot={path}", address],
-        check=True, capture_output=True, timeout=120,
-    )  # fmt: skip
-
-
 def _make(process: int, servers: str) -> None:
     """Nodes of one process."""
     from scan2sim.services.monitoring.monitor import STRING, Monitor, ros
@@ -160,4 +147,4 @@ if __name__ == "__main__":
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         _make(int(sys.argv[1]), sys.argv[2])
     else:
-        print("RESULT " + json.dumps(nodes_watched(*sys.argv[1:])))
+        print("RESULT " + json.dumps(nodes_watched()))

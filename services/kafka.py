@@ -146,8 +146,8 @@ def read(
         group: of readers, who share a topic's records.
         from_start: begin with the oldest record that is kept, if the group is new; else with what comes.
         since: seconds since the epoch: begin with the records that came to Kafka from then on.
-        connected: is told when the broker has given the topic out, and when it is gone.
-        dropped: is told the ids of doubles.
+        connected: is called with whether the broker is there: has given the topic out, or is gone.
+        dropped: is called with the ids of doubles.
         wait: seconds.
     """
     extras.need("Kafka", "confluent_kafka")

@@ -20,9 +20,9 @@ TOPIC = "monitor_clock"
 """Of pings and their answers, as JSON in std_msgs/String."""
 PREFIX = 12
 """Bytes of a GID that are the process's."""
-ASKED_EVERY = 5.0
+PING_EVERY = 5.0
 """Seconds between two exchanges with another machine, once `KEPT` of them are known."""
-ASKED_AT_FIRST = 1.0
+PING_AT_FIRST = 1.0
 """Seconds until then, and between two tries."""
 TRIES = 10
 """Pings without an answer after which a process counts as one that doesn't answer (it isn't watched)."""
@@ -43,7 +43,7 @@ class _Peer:
     """
 
     host: str | None = None
-    asked: float = float("-inf")
+    pinged: float = float("-inf")
     tries: int = 0
     exchanges: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=KEPT))
     best: tuple[int, int] | None = None
@@ -53,7 +53,7 @@ class Clock:
     """Exchanges with other processes; what is to be sent is returned."""
 
     def __init__(self, host: str | None = None) -> None:
-        """`host`: what tells machines apart; None: this one's."""
+        """`host`: what machines differ by; None: this one's."""
         self._host = host or this_host()
         self._id = uuid.uuid4().hex
         self._own: bytes | None = None
@@ -72,27 +72,27 @@ class Clock:
             peer = self._peers[prefix] = _Peer()
         if peer.host == self._host or (peer.host is None and peer.tries >= TRIES):
             return None
-        if time.monotonic() - peer.asked < (ASKED_EVERY if len(peer.exchanges) == KEPT else ASKED_AT_FIRST):
+        if time.monotonic() - peer.pinged < (PING_EVERY if len(peer.exchanges) == KEPT else PING_AT_FIRST):
             return None
-        peer.asked, peer.tries = time.monotonic(), peer.tries + 1
+        peer.pinged, peer.tries = time.monotonic(), peer.tries + 1
         return {"to": prefix.hex(), "from": self._id, "sent": time.time_ns()}
 
-    def heard(self, told: Mapping[str, Any], publisher: bytes, received: int) -> dict[str, Any] | None:
+    def heard(self, message: Mapping[str, Any], publisher: bytes, received: int) -> dict[str, Any] | None:
         """Take a message of `TOPIC`; returns the answer, if one is to be sent.
 
         Args:
-            told: the message; what isn't one is left.
+            message: what isn't one is left.
             publisher: GID of who sent it.
             received: nanoseconds since the epoch.
         """
         try:
-            if told["from"] == self._id:
+            if message["from"] == self._id:
                 self._own = publisher[:PREFIX]
-            elif "host" in told and told["to"] == self._id:
-                self._exchanged(publisher, told, received)
-            elif self._own and told["to"] == self._own.hex():
-                times = {"sent": int(told["sent"]), "received": received, "answered": time.time_ns()}
-                return {"to": told["from"], "from": self._id, "host": self._host} | times
+            elif "host" in message and message["to"] == self._id:
+                self._exchanged(publisher, message, received)
+            elif self._own and message["to"] == self._own.hex():
+                times = {"sent": int(message["sent"]), "received": received, "answered": time.time_ns()}
+                return {"to": message["from"], "from": self._id, "host": self._host} | times
         except (KeyError, TypeError, ValueError, OverflowError):
             pass  # somebody else's message
         return None
@@ -106,7 +106,7 @@ class Clock:
         return peer.best if peer else None
 
     def jump(self) -> float:
-        """Seconds by which this machine's clock was set since this was last asked; what was exchanged is forgotten."""
+        """Seconds by which this machine's clock was set since the last call; what was exchanged is forgotten."""
         ticked = time.time_ns() - time.monotonic_ns()
         jumped, self._ticked = ticked - self._ticked, ticked
         if abs(jumped) < JUMP:
@@ -114,10 +114,10 @@ class Clock:
         self._peers = {}
         return jumped / 1e9
 
-    def _exchanged(self, publisher: bytes, told: Mapping[str, Any], back: int) -> None:
-        sent, there, answered = int(told["sent"]), int(told["received"]), int(told["answered"])
+    def _exchanged(self, publisher: bytes, message: Mapping[str, Any], back: int) -> None:
+        sent, there, answered = int(message["sent"]), int(message["received"]), int(message["answered"])
         peer = self._peers.setdefault(publisher[:PREFIX], _Peer())
-        peer.host, peer.tries = str(told["host"]), 0
+        peer.host, peer.tries = str(message["host"]), 0
         peer.exchanges.append(((back - sent) - (answered - there), ((there - sent) + (answered - back)) // 2))
         delay, ahead = min(peer.exchanges)
         peer.best = (0, 0) if peer.host == self._host else (ahead, delay // 2)
@@ -125,7 +125,7 @@ class Clock:
 
 @cache
 def this_host() -> str:
-    """What tells this machine, in this life of it, from others."""
+    """What this machine, in this life of it, differs from others by."""
     boot = Path("/proc/sys/kernel/random/boot_id")
     return boot.read_text().strip() if boot.exists() else f"{uuid.getnode():x}"
 

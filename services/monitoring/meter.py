@@ -80,7 +80,7 @@ class _Numbers:
             self.missing -= 1  # one that was overtaken
 
     def period(self) -> tuple[int, int]:
-        """Messages sent and lost since it was last asked."""
+        """Messages sent and lost since the last call."""
         sent, lost = self.highest - self.reported, self.missing
         self.silent = 0 if sent else self.silent + 1
         self.reported, self.missing = self.highest, 0

@@ -21,7 +21,7 @@ class Waiting:
     """An event that waits or is worked on.
 
     Attributes:
-        line: what its worker is told.
+        line: that its worker reads.
         sent: seconds since the epoch.
         tries: workers that failed at it.
     """
@@ -94,7 +94,7 @@ class EventQueue:
         """What became of it in the last so many seconds; counting begins anew."""
         with self._changed:
             sent = min((one.sent for one in (*list(self._waiting)[:1], *self._in_work.values())), default=None)
-            told = QueueState(
+            state = QueueState(
                 queue=self.name,
                 seconds=seconds,
                 arrived=self._arrived,
@@ -107,4 +107,4 @@ class EventQueue:
             )
             self._arrived = self._done = self._refused = 0
             self._oldest_done = 0.0
-            return told
+            return state

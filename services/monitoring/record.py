@@ -89,7 +89,7 @@ class Record(_Model):
         node_id: unlike any other's, of this life of the node.
         bandwidth: bytes a second, in and out; likewise `messages`, `size` (bytes).
         lost: None where no publisher numbers its messages.
-        latency: mean of all that came (of the window); None where no message tells when it was sent.
+        latency: mean of all that came (of the window); None where no message says when it was sent.
         clock_synchronised: whether NTP keeps this machine's clock, as its kernel says; None: it says nothing.
         remarks: what is wrong with the topics, in words: profiles that don't fit, nodes of one name.
         dropped: records and events that were given up before this one, as the disk's share for them was full.

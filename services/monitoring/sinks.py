@@ -49,7 +49,7 @@ class Sink(Protocol):
 
 
 def opened(watched: Watched, node: str) -> list[Sink]:
-    """All that were asked for, of a node by its full name."""
+    """All that are set, of a node by its full name."""
     found: list[Sink] = []
     if watched.kafka_bootstrap_servers:
         spool = Spool(watched.spool) if watched.spool else spools.opened(node, watched.publisher_topic)

@@ -97,7 +97,7 @@ function tellState(state) {
   tellAlarms(state.alarms, events_topic);
   tellRuns(runs, state.now);
   if (range.seconds) status(connected ? "live" : "lost", connected ? "live" : "Kafka is gone");
-  nodes.sort((a, b) => (a.name < b.name ? -1 : 1));
+  nodes.sort((a, b) => a.name.localeCompare(b.name, undefined, { numeric: true })); // node_2 before node_10
   const empty = byId("empty");
   empty.hidden = nodes.length > 0 || runs.length > 0;
   byId("plots").hidden = !nodes.length && runs.length > 0;

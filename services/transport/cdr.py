@@ -40,7 +40,7 @@ def _of_message(kind: Any) -> Measure:
 
 
 def _of_fields(kind: Any) -> Measure:
-    fields = [(name, _of_field(told)) for name, told in kind.get_fields_and_field_types().items()]
+    fields = [(name, _of_field(type_name)) for name, type_name in kind.get_fields_and_field_types().items()]
 
     def measure(message: Any, at: int) -> int:
         for name, field in fields:
@@ -50,20 +50,20 @@ def _of_fields(kind: Any) -> Measure:
     return measure
 
 
-def _of_field(told: str) -> Measure:
-    if sequence := SEQUENCE.fullmatch(told):
+def _of_field(type_name: str) -> Measure:
+    if sequence := SEQUENCE.fullmatch(type_name):
         items = _of_items(sequence[1])
         return lambda value, at: items(value, _aligned(at, 4) + 4)
-    if array := ARRAY.fullmatch(told):
+    if array := ARRAY.fullmatch(type_name):
         return _of_items(array[1])
-    return _of_value(told)
+    return _of_value(type_name)
 
 
-def _of_items(told: str) -> Measure:
-    width = SIZES.get(told)
+def _of_items(type_name: str) -> Measure:
+    width = SIZES.get(type_name)
     if width is not None:
         return lambda value, at: _aligned(at, width) + width * len(value)
-    item = _of_value(told)
+    item = _of_value(type_name)
 
     def measure(value: Any, at: int) -> int:
         for one in value:
@@ -73,13 +73,13 @@ def _of_items(told: str) -> Measure:
     return measure
 
 
-def _of_value(told: str) -> Measure:
-    width = SIZES.get(told)
+def _of_value(type_name: str) -> Measure:
+    width = SIZES.get(type_name)
     if width is not None:
         return lambda value, at: _aligned(at, width) + width
-    if told.startswith("wstring"):
+    if type_name.startswith("wstring"):
         return lambda value, at: _aligned(at, 4) + 4 + 2 * len(value)
-    if told.startswith("string"):
+    if type_name.startswith("string"):
         return lambda value, at: _aligned(at, 4) + 5 + (len(value) if value.isascii() else len(value.encode()))
     return lambda value, at: _of_message(type(value))(value, at)
 

@@ -1,6 +1,6 @@
 """The transport over cyclonedds: nodes without ROS 2 that speak its names, types and hashes on DDS.
 
-cyclonedds tells its readers neither the number that a publisher gave a message nor who it is, so both follow behind the
+cyclonedds hands its readers neither the number that a publisher gave a message nor who it is, so both follow behind the
 message's own bytes (`envelope`), with the time of sending; who doesn't know of them reads past them. Messages of fixed
 size have no room for that in Fast DDS's readers: they go without, and their losses can't be counted.
 """
@@ -140,7 +140,7 @@ class Node:
     """A node of ROS 2 without ROS 2 (`services.transport.Node`)."""
 
     def __init__(self, node_name: str, *, namespace: str = "/", hidden: bool = False) -> None:
-        """As `services.transport.Node`'s; hidden or not is told by the name alone."""
+        """As `services.transport.Node`'s; the name alone says whether it is hidden."""
         self._name, self._namespace = node_name, namespace if namespace.startswith("/") else f"/{namespace}"
         self._entities = Entities(self._namespace, node_name)
         self._subscriptions: list[Subscription] = []

@@ -48,7 +48,7 @@ class Entities:
 
 
 class Graph:
-    """Discovery of one participant; may be asked from any thread."""
+    """Discovery of one participant; may be used from any thread."""
 
     def __init__(self, participant: DomainParticipant) -> None:
         self._participant, self._gid = participant, participant.guid.bytes
@@ -123,17 +123,17 @@ class Graph:
             return [gid(_numbers(one)) for one in of]
 
         nodes = [node_info(node.namespace, node.name, gids(node.readers), gids(node.writers)) for node in self._nodes]
-        told = STORE.types[INFO](gid(_numbers(self._gid)), nodes)
-        self._writer.write(sample_type(INFO)(bytes(STORE.serialize_cdr(told, INFO))))
+        info = STORE.types[INFO](gid(_numbers(self._gid)), nodes)
+        self._writer.write(sample_type(INFO)(bytes(STORE.serialize_cdr(info, INFO))))
 
     def _read_names(self) -> dict[bytes, tuple[str, str]]:
         """GIDs of endpoints to the name and namespace of their node."""
         for sample in self._reader.take(MOST):
             if sample.sample_info.valid_data:
-                told: Any = STORE.deserialize_cdr(sample.data, INFO)
-                self._names[bytes(told.gid.data)] = {
+                info: Any = STORE.deserialize_cdr(sample.data, INFO)
+                self._names[bytes(info.gid.data)] = {
                     bytes(one.data): (node.node_name, node.node_namespace)
-                    for node in told.node_entities_info_seq
+                    for node in info.node_entities_info_seq
                     for one in (*node.reader_gid_seq, *node.writer_gid_seq)
                 }
         return {gid: name for of_participant in self._names.values() for gid, name in of_participant.items()}

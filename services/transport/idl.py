@@ -103,7 +103,7 @@ def _samples(made: Any) -> Any:
 
 @cache
 def _struct(name: str) -> Any:
-    fields = {field: _type(*told) for field, told in STORE.get_msgdef(name).fields}
+    fields = {field: _type(*definition) for field, definition in STORE.get_msgdef(name).fields}
     # a struct without fields isn't allowed: what ROS 2 puts there instead
     return make_idl_struct(
         name.rpartition("/")[2] + "_",
@@ -115,26 +115,26 @@ def _struct(name: str) -> Any:
 @cache
 def unbounded(name: str) -> bool:
     """Whether messages of a type can be of any length: a reader keeps room for no more than the longest."""
-    return any(_grows(*told) for _, told in STORE.get_msgdef(name).fields)
+    return any(_grows(*definition) for _, definition in STORE.get_msgdef(name).fields)
 
 
-def _grows(node: Any, told: Any) -> bool:
+def _grows(node: Any, definition: Any) -> bool:
     if node.name == "BASE":
-        return bool(told[0] == "string" and not told[1])
+        return bool(definition[0] == "string" and not definition[1])
     if node.name == "NAME":
-        return unbounded(told)
-    item, count = told
+        return unbounded(definition)
+    item, count = definition
     return _grows(*item) or (node.name == "SEQUENCE" and not count)
 
 
-def _type(node: Any, told: Any) -> Any:
+def _type(node: Any, definition: Any) -> Any:
     """Of a field, as rosbags parses definitions: (kind, name or (item, count))."""
     if node.name == "BASE":
-        base, bound = told
+        base, bound = definition
         return types.bounded_str[bound] if base == "string" and bound else _VALUES[base]
     if node.name == "NAME":
-        return _struct(told)
-    item, count = told
+        return _struct(definition)
+    item, count = definition
     if node.name == "ARRAY":
         return types.array[_type(*item), count]
     return types.sequence[_type(*item), count] if count else types.sequence[_type(*item)]
@@ -142,16 +142,16 @@ def _type(node: Any, told: Any) -> Any:
 
 def default(name: str) -> Any:
     """A message with all fields zero or empty."""
-    made = {field: _default(*told) for field, told in STORE.get_msgdef(name).fields}
+    made = {field: _default(*definition) for field, definition in STORE.get_msgdef(name).fields}
     return STORE.types[name](**made)
 
 
-def _default(node: Any, told: Any) -> Any:
+def _default(node: Any, definition: Any) -> Any:
     if node.name == "BASE":
-        return _ZERO.get(told[0], 0)
+        return _ZERO.get(definition[0], 0)
     if node.name == "NAME":
-        return default(told)
-    (item_node, item), count = told
+        return default(definition)
+    (item_node, item), count = definition
     size = count if node.name == "ARRAY" else 0
     if item_node.name == "BASE" and item[0] != "string":
         return np.zeros(size, {"bool": bool, "byte": "u1", "octet": "u1", "char": "u1"}.get(item[0], item[0]))

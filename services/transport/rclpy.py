@@ -31,18 +31,18 @@ from scan2sim.services.transport.types import INFINITE, Arrival, Endpoint, Kind,
 
 
 class _Publisher(RosPublisher):  # type: ignore[misc]
-    """Tells its node of what it sends."""
+    """Reports to its node what it sends."""
 
     node: Node
 
     def publish(self, msg: Any) -> None:
-        """Send, and tell."""
+        """Send, and report it."""
         super().publish(msg)
         self.node.published(self.topic_name, len(msg) if isinstance(msg, bytes) else size(msg))
 
 
 class Node(rclpy.node.Node):  # type: ignore[misc]
-    """A node of rclpy that tells of every message (`services.transport.Node`)."""
+    """A node of rclpy that reports every message (`services.transport.Node`)."""
 
     def __init__(self, node_name: str, *, namespace: str = "/", hidden: bool = False, **others: Any) -> None:
         if hidden:
@@ -69,10 +69,10 @@ class Node(rclpy.node.Node):  # type: ignore[misc]
         return super().create_subscription(msg_type, topic, taken, _profile(qos_profile), **others)
 
     def endpoints(self, topic: str) -> tuple[Endpoint, ...]:
-        """Publishers and subscriptions of a topic, as rclpy tells them."""
+        """Publishers and subscriptions of a topic, as rclpy lists them."""
         return tuple(
-            [_endpoint(told, "PUBLISHER") for told in self.get_publishers_info_by_topic(topic)]
-            + [_endpoint(told, "SUBSCRIPTION") for told in self.get_subscriptions_info_by_topic(topic)]
+            [_endpoint(info, "PUBLISHER") for info in self.get_publishers_info_by_topic(topic)]
+            + [_endpoint(info, "SUBSCRIPTION") for info in self.get_subscriptions_info_by_topic(topic)]
         )
 
     def topics(self) -> dict[str, tuple[str, ...]]:
@@ -161,14 +161,14 @@ def _arrival(topic: str, message: Any, info: Any) -> Arrival:
     )
 
 
-def _endpoint(told: Any, kind: Kind) -> Endpoint:
+def _endpoint(info: Any, kind: Kind) -> Endpoint:
     return Endpoint(
-        node_name=told.node_name,
-        node_namespace=told.node_namespace,
-        type_name=told.topic_type,
+        node_name=info.node_name,
+        node_namespace=info.node_namespace,
+        type_name=info.topic_type,
         kind=kind,
-        gid=bytes(told.endpoint_gid),
-        qos=_qos(told.qos_profile),
+        gid=bytes(info.endpoint_gid),
+        qos=_qos(info.qos_profile),
     )
 
 
@@ -192,13 +192,13 @@ def _duration(nanoseconds: int) -> Any:
     return Infinite if nanoseconds == INFINITE else Duration(nanoseconds=nanoseconds)
 
 
-def _qos(told: Any) -> QoS:
+def _qos(info: Any) -> QoS:
     return QoS(
-        reliability=told.reliability.name,
-        durability=told.durability.name,
-        depth=told.depth,
-        lifespan=told.lifespan.nanoseconds,
-        deadline=told.deadline.nanoseconds,
-        liveliness=told.liveliness.name,
-        lease=told.liveliness_lease_duration.nanoseconds,
+        reliability=info.reliability.name,
+        durability=info.durability.name,
+        depth=info.depth,
+        lifespan=info.lifespan.nanoseconds,
+        deadline=info.deadline.nanoseconds,
+        liveliness=info.liveliness.name,
+        lease=info.liveliness_lease_duration.nanoseconds,
     )

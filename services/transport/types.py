@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 INFINITE = 2**63 - 1
-"""Nanoseconds that stand for "never", as ROS 2 tells them."""
+"""Nanoseconds that stand for "never", as ROS 2 writes them."""
 
 Reliability = Literal["RELIABLE", "BEST_EFFORT"]
 Durability = Literal["VOLATILE", "TRANSIENT_LOCAL"]

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from scan2sim.services.monitoring import clock
-from scan2sim.services.monitoring.clock import ASKED_AT_FIRST, ASKED_EVERY, KEPT, TRIES, Clock
+from scan2sim.services.monitoring.clock import KEPT, PING_AT_FIRST, PING_EVERY, TRIES, Clock
 
 HERE, THERE = b"h" * 16, b"t" * 16
 
@@ -45,7 +45,7 @@ def exchange(times: Times, here: Clock, there: Clock, ahead: int, out: int, back
     for known, own in ((here, HERE), (there, THERE)):
         if hello := known.hello():
             known.heard(hello, own, times.time_ns())
-    times.now += int(ASKED_EVERY * 1e9)
+    times.now += int(PING_EVERY * 1e9)
     ping = here.ping(THERE)
     if ping is None:
         return None
@@ -86,7 +86,7 @@ def test_who_is_new_is_asked_often_until_enough_is_known(times: Times) -> None:
             here.heard(there.heard(ping, HERE, times.time_ns()) or {}, THERE, times.time_ns())
         times.now += 10**8
     pauses = [after - before for before, after in itertools.pairwise(asked_at)]
-    assert pauses == pytest.approx([ASKED_AT_FIRST] * (KEPT - 1) + [ASKED_EVERY] * 2, abs=0.11)
+    assert pauses == pytest.approx([PING_AT_FIRST] * (KEPT - 1) + [PING_EVERY] * 2, abs=0.11)
 
 
 def test_who_does_not_answer_is_not_asked_for_ever(times: Times) -> None:
@@ -94,7 +94,7 @@ def test_who_does_not_answer_is_not_asked_for_ever(times: Times) -> None:
     asked = 0
     for _ in range(100):
         asked += here.ping(THERE) is not None
-        times.now += int(ASKED_EVERY * 1e9)
+        times.now += int(PING_EVERY * 1e9)
     assert asked == TRIES
     assert here.offset(THERE) is None
 

@@ -7,20 +7,27 @@ import shlex
 import time
 from pathlib import Path
 
+import pytest
+
 from scan2sim.services.monitoring.nodes import worker
 from tests.services.conftest import Start
 
 CLI = ("cyclone", "-m", "scan2sim.flows.cli", "monitor")
 
 
-def test_a_rush_is_given_workers_and_loses_nothing(tmp_path: Path, start: Start) -> None:
+@pytest.mark.parametrize("forecast", [(), ("--forecast", "trend", "--lead", "0.5"), ("--history", "days.csv")])
+def test_a_rush_is_given_workers_and_loses_nothing(forecast: tuple[str, ...], tmp_path: Path, start: Start) -> None:
     # a quiet second, three of 50 events a second, a quiet while: one worker does 20 a second
     times = [0.1, *(1 + number / 50 for number in range(150)), 6.0]
     (tmp_path / "data.csv").write_text("".join(f"{seconds},100000\n" for seconds in times))
     (tmp_path / "rules.toml").write_text("[[rules]]\nname = 'queue'\nmetric = 'queue_length'\nabove = 5\n")
+    days = tmp_path / "days.csv"  # an event every ten seconds of a day
+    days.write_text("".join(f"{seconds},1000\n" for seconds in range(0, 86_400, 10)))
+    options = [days if one == days.name else one for one in forecast]
     serve = shlex.join(worker.command(0.05))
     alarms = start(*CLI, "alarms", tmp_path / "rules.toml")
     scale = start(*CLI, "scale", "--capacity", "20", "--window", "1", "--cool-down", "1", "--max-workers", "3",
+                  *options,
                   "--log", tmp_path / "scale.log")  # fmt: skip
     work = start(*CLI, "work", "/cars", serve, "--period", "0.25")
     talker = start(*CLI, "dataset-talker", "/cars", tmp_path / "data.csv", "--subscribers", "1", "--size-as-field")
