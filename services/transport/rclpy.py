@@ -23,6 +23,7 @@ from rclpy.qos import (
     QoSProfile,
     ReliabilityPolicy,
 )
+from rclpy.signals import SignalHandlerOptions
 
 from scan2sim.pipeline.errors import SettingError
 from scan2sim.services.transport.cdr import size
@@ -91,6 +92,12 @@ class Node(rclpy.node.Node):  # type: ignore[misc]
             remedy = f"{error.remedy}, or watch without it: SCAN2SIM_TRANSPORT=cyclone"
             raise SettingError(error.where, error.cause, remedy) from None
 
+    def destroy_node(self) -> Any:
+        """As rclpy's; what spun it ends with it."""
+        if self.own_executor is not None:
+            self.own_executor.shutdown()
+        return super().destroy_node()
+
     def published(self, topic: str, size: int) -> None:
         """To be overridden: a message was sent."""
 
@@ -102,9 +109,9 @@ class Node(rclpy.node.Node):  # type: ignore[misc]
 
 
 def init(domain: int | None = None) -> None:
-    """Join the network."""
+    """Join the network; signals are left to the program: rclpy's own way would end nodes before their last record."""
     if not rclpy.ok():
-        rclpy.init(domain_id=domain)
+        rclpy.init(domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
 
 
 def message_type(name: str) -> Any:

@@ -45,6 +45,22 @@ while time.monotonic() < end:
 node.destroy_node()
 ros.shutdown()
 """
+ENDED = """
+import signal, sys
+from scan2sim.services.monitoring.monitor import Monitor, ros
+signal.signal(signal.SIGTERM, signal.default_int_handler)
+ros.init()
+node = Monitor("ended", period=600, log_file=sys.argv[1])
+publisher = node.create_publisher(ros.message_type("std_msgs/msg/String"), "ended", 10)
+publisher.publish(ros.message("std_msgs/msg/String", data="x"))
+try:
+    print("ready", flush=True)
+    while True:
+        ros.spin_once(node, 0.2)
+except KeyboardInterrupt:
+    node.destroy_node()
+ros.shutdown()
+"""
 OF_THE_MISSION = {
     "time", "node name", "node id", "bandwidth", "messages", "message size mean", "outgoing bandwidth",
     "outgoing messages", "outgoing message size mean", "incoming bandwidth", "incoming messages",
@@ -88,6 +104,17 @@ def test_a_node_is_watched_without_change(transport: str, tmp_path: Path, start:
     assert said[-1]["outgoing message size mean"] == 1000
     numbers = [int(one["record id"].split(":")[1]) for one in records(hears)]
     assert numbers == list(range(1, len(numbers) + 1))
+
+
+@pytest.mark.parametrize("transport", ["cyclone", "rclpy"])
+def test_a_node_that_is_told_to_end_tells_its_last_record(transport: str, tmp_path: Path, start: Start) -> None:
+    log = tmp_path / "log"
+    process = start(transport, "-c", ENDED, log)
+    assert process.stdout and process.stdout.readline() == "ready\n"
+    process.terminate()
+    _, errors = process.communicate(timeout=60)
+    assert (process.returncode, errors) == (0, "")
+    assert [one["outgoing messages"] for one in records(log)] == [1]
 
 
 def test_records_reach_kafka_once_though_the_broker_dies(tmp_path: Path, start: Start, broker: Broker) -> None:
