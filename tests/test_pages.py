@@ -30,7 +30,7 @@ ROOMS = ("pipeline", "segmentation", "texturing", "slam", "flows", "services", "
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/*.md")), ROOT / "data_samples/README.md"]
 MODULES = sorted(path for room in ROOMS for path in (ROOT / room).rglob("*.py"))
 PARAMS: dict[str, type[BaseModel]] = {step.name: step.params for step in STEPS}
-OTHERS = re.compile(r"\b(prefect|docker|dask|ray|gz|pip|aws)\b")
+OTHERS = re.compile(r"\b(prefect|docker|dask|ray|gz|pip|aws|curl|trtexec|export.py)\b")
 """Other programs, whose options a page may name once it has shown them in a command."""
 SUFFIXES = {"py", "json", "geojson", "csv", "obj", "laz", "png", "npz", "toml", "sdf", "dae", "mtl", "glb", "jpg"}
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import signal
 import sys
 import threading
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,8 +13,8 @@ import typer
 from scan2sim.flows.commands.app import App
 from scan2sim.flows.commands.display import console, warn
 from scan2sim.flows.commands.options import options
+from scan2sim.flows.commands.spinning import spin
 from scan2sim.pipeline import extras
-from scan2sim.services import transport
 from scan2sim.services.monitoring.joined import AlarmsParams, PoolParams, ScaleParams
 from scan2sim.services.monitoring.kept import ArchiveParams, QueryParams
 from scan2sim.services.monitoring.shown import PageParams
@@ -55,7 +54,7 @@ def monitor_topic(params: TopicParams, limit: Limits = None) -> None:
             node.find(params.timeout, lambda text: console.print(text, highlight=False, markup=False))
         return node
 
-    _spin(made)
+    spin(made)
 
 
 @app.command("talker")
@@ -64,7 +63,7 @@ def monitor_talker(params: TalkerParams, limit: Limits = None) -> None:
     """Send messages of a size at an interval, to try the bus with."""
     from scan2sim.services.monitoring.nodes.talker import Talker
 
-    _spin(lambda: Talker(params))
+    spin(lambda: Talker(params))
 
 
 @app.command("dataset-talker")
@@ -73,7 +72,7 @@ def monitor_dataset_talker(params: DatasetParams, limit: Limits = None) -> None:
     """Send messages when, and as large as, a file says."""
     from scan2sim.services.monitoring.nodes.dataset_talker import DatasetTalker
 
-    _spin(lambda: DatasetTalker(params), lambda node: node.finished)
+    spin(lambda: DatasetTalker(params), lambda node: node.finished)
 
 
 @app.command("listener")
@@ -82,7 +81,7 @@ def monitor_listener(params: ListenerParams, limit: Limits = None) -> None:
     """Hear strings, and say what was heard."""
     from scan2sim.services.monitoring.nodes.listener import Listener
 
-    _spin(lambda: Listener(params))
+    spin(lambda: Listener(params))
 
 
 @app.command("traffic")
@@ -101,7 +100,7 @@ def monitor_work(params: WorkParams, limit: Limits = None) -> None:
     """Have a topic's events worked on by local processes, as many as are asked for on the bus."""
     from scan2sim.services.monitoring.work import Work
 
-    _spin(lambda: Work(params))
+    spin(lambda: Work(params))
 
 
 @app.command("scale")
@@ -110,7 +109,7 @@ def monitor_scale(params: ScaleParams) -> None:
     """Ask for as many workers as the queues that are told of on the bus need."""
     from scan2sim.services.monitoring.scaler import ScalerNode
 
-    _spin(lambda: ScalerNode(params))
+    spin(lambda: ScalerNode(params))
 
 
 @app.command("pool")
@@ -119,7 +118,7 @@ def monitor_pool(params: PoolParams) -> None:
     """Start and stop workers of a Prefect pool as the bus asks for them."""
     from scan2sim.services.monitoring.pool import PoolNode
 
-    _spin(lambda: PoolNode(params))
+    spin(lambda: PoolNode(params))
 
 
 @app.command("alarms")
@@ -131,7 +130,7 @@ def monitor_alarms(params: AlarmsParams) -> None:
     def tell(alarm: Any) -> None:
         console.print(f"{alarm.state} {alarm.rule}: {alarm.subject}, {alarm.value:.4g}", highlight=False, markup=False)
 
-    _spin(lambda: AlarmsNode(params, tell))
+    spin(lambda: AlarmsNode(params, tell))
 
 
 @app.command("page")
@@ -172,19 +171,3 @@ def monitor_query(
     from scan2sim.services.monitoring.archive import query
 
     csv.write_csv(query(params), sys.stdout.buffer if out is None else out)
-
-
-def _spin(made: Callable[[], Any], finished: Callable[[Any], bool] = lambda _: False) -> None:
-    """Run a node until it has finished, or is told to end, by Ctrl-C or SIGTERM."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # what ends services ends them as Ctrl-C does
-    ros = transport.load()
-    ros.init()
-    try:
-        node = made()
-        try:
-            while not finished(node):
-                ros.spin_once(node, 0.2)
-        finally:
-            node.destroy_node()
-    finally:
-        ros.shutdown()

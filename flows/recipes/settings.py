@@ -48,7 +48,7 @@ class Settings:
                 table = table.setdefault(part, {})
                 if not isinstance(table, dict):
                     raise SettingError(f"--set {text}", f"`{part}` was given a value before", "Make it a table there")
-            table[parts[-1]] = _value(value.strip())
+            table[parts[-1]] = parsed(value.strip())
         return cls(values)
 
     def check(self, steps: Iterable[Step]) -> None:
@@ -90,7 +90,7 @@ class Settings:
         return step.params.of(step.name, merged)
 
 
-def _value(text: str) -> Any:
+def parsed(text: str) -> Any:
     """A TOML value where it is one, else the text itself."""
     try:
         return toml.parse(f"value = {text}")["value"]

@@ -9,23 +9,18 @@ angular resolution that photos are resampled to (else they are taken as they are
 
 from __future__ import annotations
 
-import hashlib
-import json
-import os
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from scan2sim.pipeline.channels import COUNT
-from scan2sim.pipeline.errors import InputError, SettingError
+from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.types import F32, U8
+from scan2sim.segmentation import sessions
 from scan2sim.segmentation.backends import Facts, given
 from scan2sim.segmentation.backends.segformer import MEAN, STD, numbers
 
 NEEDS = ("onnxruntime",)
-FLOATS = {"tensor(float)": "float32", "tensor(float16)": "float16"}
-CUDA = "CUDAExecutionProvider"
 REMEDY = "Export the network with one input (1, 3, H, W) of floats and one output (1, C, h, w)"
 
 
@@ -49,34 +44,30 @@ class Network:
 
     def __init__(self, path: Path, device: str, backend: str = "onnx") -> None:
         self._path = path
-        self._session = _session(path, device)
+        self._session = sessions.opened(path, device, "label.device")
         inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
         if len(inputs) != 1 or len(outputs) != 1:
             names = ", ".join(value.name for value in [*inputs, *outputs])
             raise InputError(path, f"has {len(inputs)} inputs and {len(outputs)} outputs ({names})", REMEDY)
         (given,), (got,) = inputs, outputs
         meta = self._session.get_modelmeta().custom_metadata_map
-        more = bool(_json(meta.get("channels"), False))
+        more = bool(sessions.value(meta.get("channels"), False))
         wanted, produced = _sizes(given.shape), _sizes(got.shape)
         fits = len(wanted) == 4 and wanted[0] in (1, None) and wanted[1] in (3 + COUNT * more, None)
-        if given.type not in FLOATS or not fits:
+        if given.type not in sessions.FLOATS or not fits:
             raise InputError(path, f"takes {given.type} of {given.shape}", REMEDY)
-        if got.type not in FLOATS or (got.shape and len(produced) != 4):
+        if got.type not in sessions.FLOATS or (got.shape and len(produced) != 4):
             raise InputError(path, f"gives {got.type} of {got.shape}", REMEDY)
-        self._input, self._type, self._size = given.name, FLOATS[given.type], wanted[2:]
-        labels = _labels(path, meta)
+        self._input, self._type, self._size = given.name, sessions.FLOATS[given.type], wanted[2:]
+        labels = sessions.labels(path, meta)
         if got.shape and produced[1] not in (None, len(labels)):
             raise InputError(path, f"gives {produced[1]} channels, but {len(labels)} labels are named", "Name one each")
-        self._mean = numbers(_json(meta.get("mean"), MEAN), 3, path, least=-np.inf)
-        self._std = numbers(_json(meta.get("std"), STD), 3, path)
-        digest = hashlib.sha256(path.read_bytes())
-        beside = path.with_name(path.name + ".data")  # where exporters put large weights
-        if beside.is_file():
-            digest.update(beside.read_bytes())
+        self._mean = numbers(sessions.value(meta.get("mean"), MEAN), 3, path, least=-np.inf)
+        self._std = numbers(sessions.value(meta.get("std"), STD), 3, path)
         licence = meta.get("license") or "not told"
-        density = _json(meta.get("pixels_a_radian"), None)
+        density = sessions.value(meta.get("pixels_a_radian"), None)
         resolution = None if density is None else float(numbers([density], 1, path)[0])
-        self.facts = Facts(f"{backend} ({path.name})", labels, digest.hexdigest(), licence, resolution, more)
+        self.facts = Facts(f"{backend} ({path.name})", labels, sessions.digest(path), licence, resolution, more)
 
     def probabilities(self, seen: U8) -> F32:
         """See `segmentation.backends.Network`.
@@ -95,7 +86,7 @@ class Network:
         try:
             (out,) = self._session.run(None, {self._input: x.transpose(2, 0, 1)[None].astype(self._type)})
         except Exception as error:  # onnxruntime's errors have no kind in common
-            raise _load_error(error, self._path, f"fails on a photo of {width} x {height}", REMEDY) from None
+            raise sessions.failure(error, self._path, f"fails on a photo of {width} x {height}", REMEDY) from None
         if out.ndim != 4 or out.shape[:2] != (1, len(self.facts.labels)):
             cause = f"gives {out.shape} for {len(self.facts.labels)} labels"
             raise InputError(self._path, cause, "Name a label for every channel of a (1, C, h, w) output")
@@ -107,69 +98,6 @@ class Network:
         return np.asarray(powers / powers.sum(axis=0, keepdims=True), np.float32)
 
 
-def _session(path: Path, device: str) -> Any:
-    import onnxruntime
-
-    if not path.is_file():
-        raise InputError(path, "is no file", "Give an ONNX file on this disk; nothing is downloaded")
-    number = {"device_id": device.partition(":")[2] or "0"}
-    providers = [] if device == "cpu" or CUDA not in onnxruntime.get_available_providers() else [(CUDA, number)]
-    options = onnxruntime.SessionOptions()
-    options.log_severity_level = 4  # its errors are raised; no need to print them as well
-    options.intra_op_num_threads = _threads()
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # several nodes share the cores
-    try:
-        session = onnxruntime.InferenceSession(path, options, [*providers, "CPUExecutionProvider"])
-    except Exception as error:  # onnxruntime's errors have no kind in common
-        raise _load_error(
-            error, path, "can't be loaded", "Copy or export it again, with its .data if it has one"
-        ) from None
-    if device.startswith("cuda") and CUDA not in session.get_providers():
-        raise SettingError(
-            "label.device", f"onnxruntime can't use {device!r} here", "Install onnxruntime-gpu, or set cpu"
-        )
-    return session
-
-
-def _threads() -> int:
-    """As many as OpenMP's libraries take; onnxruntime itself doesn't ask."""
-    count = os.environ.get("OMP_NUM_THREADS", "")
-    if count.isdecimal() and int(count):
-        return int(count)
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _load_error(error: Exception, path: Path, cause: str, remedy: str) -> Exception:
-    """MemoryError where onnxruntime lacks memory, else an InputError."""
-    why = str(error).strip().split("\n")[0]
-    full = any(
-        words in str(error).lower() for words in ("out of memory", "allocate memory", "bad_alloc", "alloc_failed")
-    )
-    return MemoryError(why) if full else InputError(path, f"{cause} ({why})", remedy)
-
-
 def _sizes(shape: list[int | str | None]) -> tuple[int | None, ...]:
     """None for what is known only when it runs."""
     return tuple(size if isinstance(size, int) and size > 0 else None for size in shape)
-
-
-def _json(text: str | None, other: object) -> Any:
-    """A value of the metadata, as it stands if it is no JSON; `other` where nothing is."""
-    try:
-        return other if text is None else json.loads(text)
-    except ValueError:
-        return text
-
-
-def _labels(path: Path, meta: dict[str, str]) -> tuple[str, ...]:
-    beside = path.with_suffix(".labels.txt")
-    remedy = f'Name them in order of the channels: metadata "labels" as a JSON list, or {beside.name}, one a line'
-    try:
-        names = _json(meta.get("labels"), None) or [line.strip() for line in beside.read_text("utf-8-sig").split("\n")]
-    except FileNotFoundError:
-        raise InputError(path, "doesn't name its labels", remedy) from None
-    except (OSError, ValueError) as error:
-        raise InputError(beside, f"can't be read ({error})", remedy) from None
-    if not isinstance(names, list) or not any(names) or not all(isinstance(name, str) for name in names):
-        raise InputError(path, "has labels that are no list of names", remedy)
-    return tuple(name for name in names if name)

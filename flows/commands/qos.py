@@ -1,0 +1,104 @@
+"""`scan2sim qos`: quality of service, as required and as measured (services/qos)."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from scan2sim.flows.commands.app import App
+from scan2sim.flows.commands.display import console, progress
+from scan2sim.flows.commands.options import options
+from scan2sim.pipeline import extras
+from scan2sim.services.qos import requirements
+from scan2sim.services.qos.measure import MeasureParams, measure
+from scan2sim.services.qos.requirements import MACHINE, NETWORK, UNITS, Environment, Requirements
+from scan2sim.services.qos.verdict import RATES, Needs, Row, needs, passed, rows
+
+app = App("Quality of service of toolboxes: what is required, and what a network and a machine give.")
+
+
+@app.command("show")
+def qos_show(
+    service: Annotated[
+        str, typer.Argument(help=f"TOML of requirements, or one of: {', '.join(requirements.names())}.")
+    ],
+) -> None:
+    """Show what a service requires, by where it runs."""
+    read = requirements.read(service)
+    table = Table("metric", *Environment, title=f"{read.title} ({read.source})", title_justify="left")
+    for metric in Requirements.model_fields:
+        asked = [getattr(getattr(read, one), metric, None) for one in Environment]
+        if any(asked):
+            unit = UNITS.get(metric, "")
+            table.add_row(metric.replace("_", " "), *(f"{one} {unit}" if one else "-" for one in asked))
+    console.print(table)
+
+
+@app.command("measure")
+@options(MeasureParams)
+def qos_measure(
+    params: MeasureParams,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="JSON file for all that was measured.")] = None,
+) -> None:
+    """Run a toolbox and a robot over a network like the environment's, and hold what is measured against its needs."""
+    extras.need("measuring", "psutil", "fastapi", "uvicorn", "prometheus_client")
+    service = requirements.read(params.requirements or params.toolbox)
+    required = service.of(params.environment)
+    with progress(f"{params.toolbox} {params.environment}") as report:
+        measured = measure(params, service, report)
+    found = rows(required, measured)
+    console.print(_table(f"{service.title}, {params.environment} ({service.source})", found))
+    console.print(_needs_table([needs(measured, rate) for rate in RATES]))
+    answers = measured.answers
+    done = answers.states.get("done", 0)
+    _say(f"{done} of {answers.sent} images were answered, half of them within {_or_dash(answers.response_p50)} ms")
+    if required.slice:
+        _say(f"preferred slice of a 5G network: {required.slice}")
+    for name, metrics in (("service", NETWORK), ("machine", MACHINE)):
+        _say(f"{name}: {'passed' if passed(found, metrics) else 'FAILED'}")
+    if out:
+        told = {
+            "passed": passed(found, NETWORK),
+            "machine_passed": passed(found, MACHINE),
+            "rows": [_json(row) for row in found],
+            "answers": asdict(answers),
+        }
+        out.write_text(json.dumps(told, indent=1))
+
+
+def _json(row: Row) -> dict[str, object]:
+    return asdict(row) | {"required": str(row.required) if row.required else None}
+
+
+def _table(title: str, found: list[Row]) -> Table:
+    table = Table(title=title, title_justify="left")
+    for name in ("metric", "required", "measured", ""):
+        table.add_column(name, justify="right" if name == "measured" else "left")
+    for row in found:
+        unit = UNITS.get(row.metric, "")
+        required = f"{row.required} {unit}" if row.required else "-"
+        verdict = {True: "[green]pass", False: "[red]FAIL", None: ""}[row.passed]
+        table.add_row(row.metric.replace("_", " "), required, f"{_or_dash(row.measured)} {unit}", verdict)
+    return table
+
+
+def _needs_table(found: list[Needs]) -> Table:
+    table = Table(title="What rates need (of this machine's cores)", title_justify="left")
+    for name in ("images a second", "Mbit/s on the network", "cores"):
+        table.add_column(name, justify="right")
+    for one in found:
+        table.add_row(f"{one.rate:g}", _or_dash(one.bandwidth), f"{one.cores:.2f}")
+    return table
+
+
+def _or_dash(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4g}"
+
+
+def _say(text: str) -> None:
+    console.print(text, highlight=False, markup=False, soft_wrap=True)

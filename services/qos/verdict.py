@@ -1,0 +1,63 @@
+"""What was asked against what was measured, and what other rates would need."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from scan2sim.services.qos.measure import Measured
+from scan2sim.services.qos.requirements import MACHINE, NETWORK, Bound, Requirements
+
+RATES = (1.0, 2.0, 5.0, 10.0, 25.0)
+"""Images a second that needs are told for."""
+LOADED = 0.7
+"""Share of a processor's time that may be taken: beyond it, images wait long for each other."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """Of a metric; passed is None where nothing is asked, or there is nothing to measure."""
+
+    metric: str
+    required: Bound | None
+    measured: float | None
+    passed: bool | None
+
+
+def rows(required: Requirements, measured: Measured) -> list[Row]:
+    """Of all metrics that are asked or measured. What is asked of a network that isn't there is met."""
+    values = measured.values()
+    found = []
+    for metric in (*NETWORK, *MACHINE):
+        bound, value = getattr(required, metric), values[metric]
+        if bound is None and value is None:
+            continue
+        idle = value is None and metric.endswith("_usage")  # of a processor that isn't there
+        passed = None if bound is None or idle else value is not None and bound.met(value)
+        found.append(Row(metric, bound, value, passed))
+    return found
+
+
+def passed(found: list[Row], metrics: tuple[str, ...]) -> bool:
+    """Whether all of some metrics are as asked."""
+    return all(row.passed is not False for row in found if row.metric in metrics)
+
+
+@dataclass(frozen=True)
+class Needs:
+    """Of a rate of images.
+
+    Attributes:
+        bandwidth: Mbit/s on the network, both ways; None: there is none.
+        cores: of this machine's kind.
+    """
+
+    rate: float
+    bandwidth: float | None
+    cores: float
+
+
+def needs(measured: Measured, rate: float) -> Needs:
+    """What a rate needs: bytes and work are in proportion to the images."""
+    sent = measured.answers.sent
+    on_wire = measured.wire_bytes / sent * rate * 8e-6 if measured.seen else None
+    return Needs(rate, on_wire, measured.usage.cpu_seconds / sent * rate / LOADED)

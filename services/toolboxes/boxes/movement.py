@@ -1,0 +1,85 @@
+"""Detection of things that move (D3.2, section 5.2): a detector, a tracker, and optical flow of corners.
+
+The camera must stand while it looks: of one that drives, nobody can say whether it or the thing moves. It is stopped
+(standby) and started again by the interface that serves it.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field
+
+from scan2sim.pipeline.types import U8
+from scan2sim.services.toolboxes import drawing, tracking
+from scan2sim.services.toolboxes.boxes import Follow, detect
+from scan2sim.services.toolboxes.frames import Frame
+from scan2sim.services.toolboxes.motion import Flow
+from scan2sim.services.toolboxes.results import Body, Moving
+from scan2sim.services.toolboxes.tracking import Tracker
+
+NEEDS = (*detect.NEEDS, *tracking.NEEDS)
+
+
+class Params(detect.Params):
+    """Of detection with movement."""
+
+    batch: Annotated[int, Field(ge=1, le=256, description="Images that the model is given at once, at most.")] = 4
+    waiting: Annotated[
+        int, Field(ge=1, le=10_000, description="Images of one source that wait; then its oldest are dropped.")
+    ] = 8
+    deadline: Annotated[
+        float, Field(ge=0.01, le=3600, description="Seconds from an image's coming to its result; later ones are none.")
+    ] = 5.0
+    rate: Annotated[float, Field(ge=0.1, le=1000, description="Images a second of a source, about.")] = 25.0
+    lost: Annotated[
+        float, Field(ge=0, le=60, description="Seconds for which a thing that isn't detected keeps its track.")
+    ] = 1.0
+
+
+def check(params: Params) -> None:
+    """See `boxes.Toolbox`."""
+    detect.check(params)
+
+
+def load(params: Params) -> detect.Detector:
+    """The model (`boxes.Toolbox`): the detector's."""
+    return detect.load(params)
+
+
+def follow(params: Params) -> Follow | None:
+    """A tracker and optical flow for each source."""
+    return _Follower(params)
+
+
+def draw(image: U8, body: Body) -> U8:
+    """With the things' boxes, and whether they move."""
+    return drawing.detections(image, body.detections or ())
+
+
+class _Follower:
+    """Tracks one source's things, and says whether they move."""
+
+    def __init__(self, params: Params) -> None:
+        self._tracker, self._flow = Tracker(params.lost, params.rate), Flow()
+
+    def __call__(self, frame: Frame, image: U8, body: Body) -> Body:
+        """Detections that have a track, with it."""
+        found = body.detections or ()
+        tracks = self._tracker.update(found)
+        seconds = frame.received if frame.stamp is None else frame.stamp / 1e9
+        followed = {track: one for track, one in zip(tracks, found, strict=True) if track is not None}
+        motions = self._flow.update(image, seconds, {track: one.box for track, one in followed.items()})
+        return Body(
+            detections=tuple(
+                Moving(
+                    label=one.label,
+                    score=one.score,
+                    box=one.box,
+                    track=track,
+                    moving=motions[track].moving,
+                    speed=motions[track].speed,
+                )
+                for track, one in followed.items()
+            )
+        )

@@ -1,0 +1,60 @@
+"""Detections of a source's images joined to tracks: SORT (Bewley et al., 2016), as the library `trackers` has it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from scan2sim.pipeline import extras
+from scan2sim.services.toolboxes.results import Detection
+
+NEEDS = ("trackers", "supervision")
+PROVEN = 2
+"""Images in a row that a thing must be detected in before it has a track."""
+OVERLAP = 0.2
+"""Intersection over union with where a thing was expected, from which a detection is of that thing."""
+REFERENCE_RATE = 30.0
+"""Images a second that the library counts lost tracks at."""
+
+
+class Tracker:
+    """Follows things through the images of one source."""
+
+    def __init__(self, lost: float, rate: float) -> None:
+        """Begin.
+
+        Args:
+            lost: seconds for which a track is kept that isn't detected.
+            rate: images a second, about.
+        """
+        extras.need("following things", *NEEDS)
+        from trackers import SORTTracker
+
+        self._sort: Any = SORTTracker(
+            lost_track_buffer=math.ceil(lost * REFERENCE_RATE),
+            frame_rate=rate,
+            minimum_consecutive_frames=PROVEN,
+            minimum_iou_threshold=OVERLAP,
+        )
+        self._numbers: dict[int, int] = {}
+
+    def update(self, detections: Sequence[Detection]) -> list[int | None]:
+        """The track's number of each detection of the next image; None: it has none yet."""
+        import supervision
+
+        found = self._sort.update(
+            supervision.Detections(
+                xyxy=np.array([one.box for one in detections], np.float64).reshape(-1, 4),
+                confidence=np.array([one.score for one in detections], np.float64),
+                class_id=np.arange(len(detections)),  # the library drops nothing, but says no order
+            )
+        )
+        ids: list[int | None] = [None] * len(detections)
+        for place, track in zip(found.class_id, found.tracker_id, strict=True):
+            if track >= 0:
+                # the library counts through all sources' tracks
+                ids[int(place)] = self._numbers.setdefault(int(track), len(self._numbers) + 1)
+        return ids

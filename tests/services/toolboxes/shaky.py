@@ -1,0 +1,68 @@
+"""A toolbox for tests: says an image's mean level; dies, hangs or fails at images of certain levels."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Sequence
+
+import numpy as np
+
+from scan2sim.pipeline.errors import StepError
+from scan2sim.pipeline.types import U8
+from scan2sim.services.toolboxes.boxes import Facts, Follow
+from scan2sim.services.toolboxes.results import Body, Class
+from scan2sim.services.toolboxes.settings import ToolboxParams as Params
+
+NEEDS = ()
+DIES, HANGS, FAILS, RAISES, SLOW, SLOWER = 201, 202, 203, 204, 205, 206
+
+__all__ = ["NEEDS", "Params", "check", "draw", "follow", "image", "level_of", "load"]
+
+
+def image(level: int, shape: tuple[int, int] = (8, 8)) -> U8:
+    return np.full((*shape, 3), level, np.uint8)
+
+
+def level_of(body: Body | None) -> int:
+    assert body and body.classes
+    return int(body.classes[0].label)
+
+
+class _Model:
+    facts = Facts("shaky", ("level",), "0" * 64, "none")
+
+    def __call__(self, images: Sequence[U8]) -> list[Body]:
+        return [self._one(one) for one in images]
+
+    def _one(self, seen: U8) -> Body:
+        level = int(seen.mean())
+        if level == DIES:
+            os._exit(3)
+        if level == HANGS:
+            time.sleep(60)
+        if level == FAILS:
+            raise StepError("shaky", "can't", "Don't")
+        if level == RAISES:
+            raise RuntimeError("oh")
+        if level == SLOW:
+            time.sleep(0.1)
+        if level == SLOWER:
+            time.sleep(2)
+        return Body(classes=(Class(label=str(level), score=1),))
+
+
+def check(params: Params) -> None:
+    pass
+
+
+def load(params: Params) -> _Model:
+    return _Model()
+
+
+def follow(params: Params) -> Follow | None:
+    return None
+
+
+def draw(image: U8, body: Body) -> U8:
+    return image

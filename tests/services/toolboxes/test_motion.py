@@ -1,0 +1,116 @@
+"""What moves is told from what stands, under a camera that shakes, and with things before one another."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from scan2sim.pipeline.types import F32, U8
+from scan2sim.services.toolboxes.motion import Box, Flow
+
+RATE, SIZE = 25.0, (240, 400)
+
+
+def texture(seed: int, height: int, width: int) -> F32:
+    import cv2
+
+    noise = np.random.default_rng(seed).normal(size=(height, width, 3)).astype(np.float32)
+    smooth = cv2.GaussianBlur(noise, (0, 0), 2.0)
+    return np.asarray(128 + smooth / smooth.std() * 40, np.float32)
+
+
+def shown(image: F32, shift: tuple[float, float]) -> U8:
+    import cv2
+
+    moved = cv2.warpAffine(
+        image, np.array([[1, 0, shift[0]], [0, 1, shift[1]]]), SIZE[::-1], borderMode=cv2.BORDER_REFLECT
+    )
+    return np.clip(moved, 0, 255).astype(np.uint8)
+
+
+class Scene:
+    """Patches (left, top, width, height, pixels a second, growth a second); later ones are nearer."""
+
+    def __init__(self, *patches: tuple[float, float, int, int, float, float], shake: float = 0.0) -> None:
+        self._patches, self._shake = patches, shake
+        self._background = texture(0, *SIZE)
+        self._rng = np.random.default_rng(1)
+
+    def frame(self, seconds: float) -> tuple[U8, dict[int, Box]]:
+        import cv2
+
+        image, boxes = self._background.copy(), dict[int, Box]()
+        for i, (left, top, width, height, speed, growth) in enumerate(self._patches):
+            scale, at = 1 + growth * seconds, left + speed * seconds
+            patch = texture(10 + i, height, width)
+            place = np.array([[scale, 0, at - width * (scale - 1) / 2], [0, scale, top - height * (scale - 1) / 2]])
+            mask = cv2.warpAffine(np.ones((height, width), np.float32), place, SIZE[::-1])[..., None]
+            image = cv2.warpAffine(patch, place, SIZE[::-1]) * mask + image * (1 - mask)
+            x, y = place[:, 2]
+            boxes[i] = (x, y, x + width * scale, y + height * scale)
+        shift = tuple(self._rng.normal(scale=self._shake, size=2)) if self._shake else (0.0, 0.0)
+        boxes = {i: (a + shift[0], b + shift[1], c + shift[0], d + shift[1]) for i, (a, b, c, d) in boxes.items()}
+        return shown(image, (shift[0], shift[1])), boxes
+
+
+def said(scene: Scene, seconds: float = 1.6) -> list[list[bool | None]]:
+    """By patch, what was said of it over time."""
+    flow, told = Flow(), list[dict[int, bool | None]]()
+    for i in range(int(seconds * RATE)):
+        image, boxes = scene.frame(i / RATE)
+        told.append({track: motion.moving for track, motion in flow.update(image, i / RATE, boxes).items()})
+    return [[one[track] for one in told] for track in told[0]]
+
+
+@pytest.mark.parametrize("shake", [0.0, 1.5])
+def test_what_moves_moves_and_what_stands_stands(shake: float) -> None:
+    moving, standing = said(Scene((40, 60, 80, 60, 40.0, 0.0), (250, 120, 80, 60, 0.0, 0.0), shake=shake))
+    assert all(moving[15:]) and not any(standing[15:])
+    assert moving[0] is None and standing[0] is None
+
+
+def test_what_comes_towards_the_camera_moves() -> None:
+    (growing,) = said(Scene((150, 80, 80, 60, 0.0, 0.3)))
+    assert all(growing[15:])
+
+
+def test_what_stands_behind_something_that_drives_past_stands() -> None:
+    standing, passing = said(Scene((150, 60, 90, 60, 0.0, 0.0), (100, 100, 60, 50, 60.0, 0.0)))
+    assert not any(standing[15:]) and all(passing[15:])
+
+
+def test_what_stops_stands_a_second_later() -> None:
+    flow = Flow()
+    scene, stopped = Scene((40, 60, 80, 60, 60.0, 0.0)), 1.0
+    told = {}
+    for i in range(int(3 * RATE)):
+        image, boxes = scene.frame(min(i / RATE, stopped))
+        told[i / RATE] = flow.update(image, i / RATE, boxes)[0].moving
+    assert told[0.96] and not told[2.08]
+
+
+def test_speed_is_in_pixels_of_the_image_a_second() -> None:
+    import cv2
+
+    scene, flow, speed = Scene((40, 60, 80, 60, 40.0, 0.0)), Flow(), 0.0
+    for i in range(30):
+        image, boxes = scene.frame(i / RATE)
+        large = cv2.resize(image, None, fx=4, fy=4)
+        left, top, right, bottom = (4 * v for v in boxes[0])
+        speed = flow.update(large, i / RATE, {0: (left, top, right, bottom)})[0].speed or 0.0
+    assert speed == pytest.approx(160, rel=0.1)
+
+
+def test_after_a_gap_all_begins_anew() -> None:
+    scene, flow = Scene((40, 60, 80, 60, 40.0, 0.0)), Flow()
+    for seconds in (0.0, 0.04, 0.08, 5.0):
+        image, boxes = scene.frame(seconds)
+        motion = flow.update(image, seconds, boxes)[0]
+    assert motion.moving is None
+
+
+def test_an_image_without_anything_is_no_trouble() -> None:
+    flow = Flow()
+    for i in range(5):
+        assert flow.update(np.zeros((*SIZE, 3), np.uint8), i / RATE, {1: (10, 10, 50, 50)})[1].moving is None
+    assert flow.update(np.zeros((8, 8, 3), np.uint8), 1.0, {}) == {}
