@@ -59,9 +59,7 @@ function fillCard(made, { run, silent, version, came }, now) {
   const { last, steps, known, others } = details.get(run),
     [summary, failure, scroll, rest] = made.children;
   const state = silent ? "silent" : (last?.state ?? "running");
-  const told = silent
-    ? `silent for ${duration(now - came)}`
-    : { running: "running", done: "done", failed: "failed", stopped: "stopped" }[state];
+  const told = silent ? `silent for ${duration(now - came)}` : state;
   made.open = unfolded.get(run) ?? (state === "running" || state === "failed");
   const mark = `${version} ${told}`;
   if (made.dataset.shown === mark) return; // what is about to be clicked or is selected stays
@@ -74,8 +72,8 @@ function fillCard(made, { run, silent, version, came }, now) {
   summary.replaceChildren(
     pill,
     element("b", last ? `${last.command} ${last.source}` : "a run that hasn't said what it is"),
-    bar(all ? over / all : 0, "Steps done"),
-    element("span", `${over} of ${all} steps${last?.kept ? `, ${last.kept} kept from before` : ""}`, "soft"),
+    ...(all ? [bar(over / all, "Steps done")] : []),
+    element("span", !all ? "" : `${over} of ${all} steps${last?.kept ? `, ${last.kept} kept from before` : ""}`, "soft"),
     element("span", last?.failed ? `${last.failed} failed` : "", "bad"),
     element("span", last ? `${duration(last.seconds)} on ${last.host}` : "", "soft"),
   );
