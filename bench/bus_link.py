@@ -51,6 +51,8 @@ AHEAD = {"cyclone": 0.5, "rclpy": 0.0}
 """Seconds by which the other machine's clock is ahead; rclpy's messages are stamped below Python, where none can be."""
 DELAYED = 15.0
 """Seconds that are measured."""
+PRIORITY = 10
+"""Of nodes: it is the link that is to be seen, not who else works here; the link's own is higher."""
 JOINS = 60.0
 """Seconds within which nodes find each other."""
 
@@ -130,8 +132,7 @@ def _started(side: Namespace, transport: str, *arguments: object) -> subprocess.
     told = {"SCAN2SIM_TRANSPORT": transport, "PYTHONPATH": str(ROOT)}
     told |= {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}  # both ends have this machine's memory, and would share it
     command = (PYTHONS[transport], "-m", "bench.bus_link_node", *arguments)
-    # it is the link that is to be seen, not who else works here
-    return side.popen(*command, first=True, env=os.environ | told, cwd=ROOT)
+    return side.popen(*command, priority=PRIORITY, env=os.environ | told, cwd=ROOT)
 
 
 def bandwidth(transport: str, rate: float) -> Row:

@@ -29,8 +29,6 @@ done 2>/dev/null
 rm -rf "$1"
 """
 """A shell's script: ends what runs in two namespaces, and them, when there is input or no more of it."""
-PRIORITY = 10
-"""Of programs that go first, from 1 to 99."""
 _numbers = itertools.count()
 
 
@@ -76,16 +74,17 @@ class Namespace:
         """A command that runs another in here."""
         return ["ip", "netns", "exec", self.name, *map(str, command)]
 
-    def popen(self, *command: object, first: bool = False, **named: Any) -> subprocess.Popen[Any]:
+    def popen(self, *command: object, priority: int = 0, **named: Any) -> subprocess.Popen[Any]:
         """Start a program here, as `subprocess.Popen` does; it ends with the namespace.
 
-        `first`: it goes before what else wants a processor, where this process may say so (real-time scheduling).
+        `priority`: from 1 to 99, it goes before what else wants a processor, where this process may say so (real-time
+        scheduling, in turn); 0: it is as others.
         """
         started = subprocess.Popen(self.inside(*command), **named)
         self._started.append(started)
-        if first:
+        if priority:
             with contextlib.suppress(PermissionError):
-                os.sched_setscheduler(started.pid, os.SCHED_FIFO, os.sched_param(PRIORITY))
+                os.sched_setscheduler(started.pid, os.SCHED_RR, os.sched_param(priority))
         return started
 
     def run(self, *command: object, **named: Any) -> subprocess.CompletedProcess[Any]:

@@ -19,6 +19,8 @@ RANK = 2
 PROMPT = b"VDEwf$ "
 STARTS_WITHIN = 5.0
 """Seconds."""
+PRIORITY = 20
+"""A link keeps time, whatever else the processors have to do."""
 
 
 def lacking() -> Lacking | None:
@@ -36,10 +38,12 @@ def connect(near: Namespace, far: Namespace, folder: Path) -> Wire:
     ends = {"ALTERNATE_STDIN": from_far[0], "ALTERNATE_STDOUT": to_far[1]}
     with log.open("w") as said:
         for side, to, back in ((near, to_near, from_near), (far, to_far, from_far)):
-            side.popen("vde_plug", f"tap://{side.INTERFACE}", stdin=to[0], stdout=back[1], stderr=said, first=True)
+            side.popen(
+                "vde_plug", f"tap://{side.INTERFACE}", stdin=to[0], stdout=back[1], stderr=said, priority=PRIORITY
+            )
         started = near.popen(
             *("wirefilter", "-M", managed),
-            first=True,
+            priority=PRIORITY,
             **{"stdin": from_near[0], "stdout": to_near[1], "stderr": said},
             pass_fds=ends.values(),
             env=os.environ | {name: str(end) for name, end in ends.items()},
