@@ -6,7 +6,7 @@ microscopic simulations", Physical Review E 62, 2000), and stand once they are s
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +15,7 @@ from scan2sim.data_samples.fleet import any_user
 from scan2sim.data_samples.junction import FAR, LANE, RAIL, Junction
 from scan2sim.data_samples.stage import Actor, Body, Piece
 from scan2sim.data_samples.trains import GAP, any_train
-from scan2sim.pipeline.types import F64
+from scan2sim.pipeline.types import F64, Bools
 
 Rng = np.random.Generator
 
@@ -81,16 +81,23 @@ class Walker(NamedTuple):
     speed: float
 
 
-@dataclass
+@dataclass(frozen=True)
 class Busy:
-    """How much goes on: seconds between cars and between trains, whether a light makes cars stop and go."""
+    """How much goes on.
+
+    Attributes:
+        cars, trains: seconds between those of a lane or track, about.
+        light: whether a light makes cars stop and go.
+        people, parked: how many are beside the road.
+        quiet: from and to, seconds in which no car comes.
+    """
 
     cars: float
     trains: float
     light: bool
     people: int
     parked: int
-    quiet: tuple[float, float] = field(default=(0.0, 0.0))
+    quiet: tuple[float, float] = (0.0, 0.0)
 
 
 def any_busy(rng: Rng) -> Busy:
@@ -136,9 +143,7 @@ class Traffic:
                 middles.append((Body(mesh), behind + size / 2))
                 behind += size + GAP
             way, cruise = int(rng.choice([-1, 1])), float(rng.uniform(7, 24))
-            kind = rng.choice(["pass", "stop", "start"], p=[0.5, 0.35, 0.15] if not first else [0.35, 0.3, 0.35])
-            if kind == "start" and not first:
-                kind = "pass"
+            kind = rng.choice(["pass", "stop", "start"], p=[0.35, 0.3, 0.35] if first else [0.65, 0.35, 0.0])
             head, speed = _run(self.times, free, cruise, str(kind), length, rng)
             trains.append(Train(self._track(), y, way, tuple(middles), length, head, speed))
             there = np.flatnonzero(~np.isnan(head))
@@ -148,14 +153,14 @@ class Traffic:
             first = False
         return trains
 
-    def _closings(self) -> dict[int, np.ndarray[tuple[int], np.dtype[np.bool_]]]:
-        """(T,) by way: whether cars have to wait."""
+    def _closings(self) -> Bools:
+        """(T,) whether cars have to wait."""
         closed = np.zeros(len(self.times), bool)
         for train in self.trains:
             ahead = np.maximum(6.0 * train.speed, 4.0)
             with np.errstate(invalid="ignore"):
                 closed |= (train.head + ahead > -12) & (train.head - train.length < 12)
-        return {1: closed, -1: closed}
+        return closed
 
     def _drive(self, way: int) -> list[list[tuple[Car, float, float]]]:
         """By step, the cars of a lane with their s and speed."""
@@ -168,13 +173,13 @@ class Traffic:
                 cars.append(self._car(way, s, 9.0))
             s -= float(rng.uniform(14, 14 + 8 * busy.cars))
         shift, period = float(rng.uniform(0, 20)), float(rng.uniform(16, 24))
-        quiet = busy.quiet
         for i, time in enumerate(self.times):
             if time >= due:
-                if not (quiet[0] <= time < quiet[1]) and (not cars or cars[-1].s - cars[-1].length > -SIGHT + 14):
+                room = not cars or cars[-1].s - cars[-1].length > -SIGHT + 14
+                if room and not busy.quiet[0] <= time < busy.quiet[1]:
                     cars.append(self._car(way, -SIGHT, 9.0))
                 due = time + float(rng.exponential(busy.cars)) + 1.0
-            stops = [-LINE] if self._closed[way][i] else []
+            stops = [-LINE] if self._closed[i] else []
             if busy.light and (time + shift) % period < 0.5 * period:
                 stops.append(-QUEUE)
             _follow(cars, stops)
@@ -282,7 +287,7 @@ def _follow(cars: list[Car], stops: list[float]) -> None:
             gap, closing = ahead.s - ahead.length - car.s, car.speed - ahead.speed
         for stop in stops:
             brakes = car.speed**2 / (2 * 6.0)
-            if car.s + min(brakes, 1e9) < stop + 0.5 and stop - car.s + 1.0 < gap:
+            if car.s + brakes < stop + 0.5 and stop - car.s + 1.0 < gap:
                 gap, closing = stop - car.s + 1.0, car.speed
         gap = max(gap, 0.1)
         if car.standing and gap < 4.0:

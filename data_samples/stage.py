@@ -162,8 +162,8 @@ class Stage:
                 shady += shade
         shape = (camera.height, camera.width)
         gain = _exposed(sunny / np.float32(samples**2), self.light.exposure)
-        lit_, dark = (srgb(x / samples**2 * gain).reshape(*shape, 3) for x in (sunny, shady))
-        return Backdrop(camera, T_world_cam, lit_, dark, hits.distance.reshape(shape), gain)
+        bright, dark = (srgb(x / samples**2 * gain).reshape(*shape, 3) for x in (sunny, shady))
+        return Backdrop(camera, T_world_cam, bright, dark, hits.distance.reshape(shape), gain)
 
     def _rays(
         self, camera: Camera, T_world_cam: F64, step: int, shift: tuple[float, float] = (0.0, 0.0)
