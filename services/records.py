@@ -200,6 +200,10 @@ class Sender:
         self._thread.join(timeout)
 
     def _run(self) -> None:
+        with contextlib.suppress(sqlite3.ProgrammingError):  # the spool was closed, as `close` waits no longer
+            self._empty()
+
+    def _empty(self) -> None:
         pause = 0.0
         while not self._stop.is_set():
             waiting = self._spool.first()
@@ -219,8 +223,7 @@ class Sender:
             if pause:
                 log.warning("records are sent again")
             pause = 0.0
-            with contextlib.suppress(sqlite3.ProgrammingError):  # closed meanwhile
-                self._spool.done(waiting[-1])
+            self._spool.done(waiting[-1])
 
 
 class Once:

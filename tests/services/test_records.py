@@ -110,6 +110,25 @@ def test_what_was_taken_by_one_who_went_away_is_sent_again(tmp_path: Path) -> No
     assert taker.taken == ["a:1", "a:2", "a:3", "a:4"]
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_spool_that_is_closed_while_its_sender_waits_for_an_answer_ends_it(tmp_path: Path) -> None:
+    sending, answered, spool = threading.Event(), threading.Event(), Spool(tmp_path / "records")
+
+    def send(_: Sequence[Kept]) -> None:
+        sending.set()
+        answered.wait(20)
+        raise ConnectionError("nobody is there")
+
+    sender = Sender(spool, send)
+    spool.append("maker:1", b"x")
+    sender.wake()
+    assert sending.wait(20)
+    sender.close(0.05)
+    spool.close()
+    answered.set()
+    wait(lambda: not any(thread.name == "records" for thread in threading.enumerate()))
+
+
 def test_records_that_come_after_later_ones_are_no_doubles() -> None:
     once = Once()
     assert [once.new(f"a:{number}") for number in (1, 2, 5, 3, 3, 4, 5, 6)] == [
