@@ -74,7 +74,9 @@ def test_no_more_passes_than_the_rate(backend: str) -> None:
     rate = 4e6
     with Link(Shape(rate=rate, queue=0.05), backend=backend) as link:
         flood = link.near.popen(sys.executable, "-c", FLOOD, link.far.address, 1000, 1e6, 0.002)
-        time.sleep(0.5)  # Python starts
+        while link.far.counts().received_bytes < rate / 8 * 0.1:  # Python starts
+            assert flood.poll() is None
+            time.sleep(0.05)
         before, began = link.far.counts(), time.monotonic()
         time.sleep(1.5)
         after, ended = link.far.counts(), time.monotonic()
