@@ -81,7 +81,7 @@ def kitti(detector: Detector, size: int, threshold: float) -> tuple[dict[str, An
     folder, count = DATA / "kitti_raw0009_f00-24", {bounds: [0, 0] for bounds in HEIGHTS}
     wanted, right, shown = 0, 0, []
     found, truth = [], []
-    for rgb, true in _kitti(folder):
+    for rgb, true in kitti_pictures(folder):
         got = detector.find(rgb, size, 0.01)
         own = np.isin(got.labels, [detector.names.index(name) for name in VEHICLES if name in detector.names])
         vehicles = Found(got.corners[own], got.scores[own], np.zeros(int(own.sum()), np.int32))
@@ -105,7 +105,7 @@ def kitti(detector: Detector, size: int, threshold: float) -> tuple[dict[str, An
     return {"kitti_recall": recall, "kitti_precision": precision, "kitti_ap50": ap}, shown
 
 
-def _kitti(folder: Path) -> Iterator[tuple[U8, Truth]]:
+def kitti_pictures(folder: Path) -> Iterator[tuple[U8, Truth]]:
     """Pictures, and their vehicles; what is hidden, cut off or nobody's care is spared."""
     rows = [line.split() for line in (folder / "tracking_gt_0001_frames_0-24.txt").read_text().splitlines()]
     for number, image in enumerate(sorted(folder.rglob("image_02/data/*.*"))):
