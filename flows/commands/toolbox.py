@@ -10,7 +10,7 @@ import typer
 
 from scan2sim.flows.commands.app import App
 from scan2sim.flows.commands.display import console, progress, warn
-from scan2sim.flows.commands.monitor import NODE_OPTIONS
+from scan2sim.flows.commands.monitor import NODE_OPTIONS, Limits
 from scan2sim.flows.commands.options import options
 from scan2sim.flows.commands.spinning import spin
 from scan2sim.flows.recipes.settings import parsed
@@ -20,7 +20,7 @@ from scan2sim.services.toolboxes import boxes, offline
 from scan2sim.services.toolboxes.boxes import classify, detect, movement, segment
 from scan2sim.services.toolboxes.engine import Engine
 from scan2sim.services.toolboxes.results import State
-from scan2sim.services.toolboxes.settings import NodeParams, ServeParams, ToolboxParams
+from scan2sim.services.toolboxes.settings import CameraParams, NodeParams, ServeParams, ToolboxParams
 
 app = App("ML toolboxes: objects, movement, classes, segments of images, from files or as a service.")
 
@@ -104,6 +104,16 @@ def toolbox_node(
 
     with closing(Engine(box, _params(box, set_))) as engine:
         spin(lambda: ToolboxNode(engine, params))
+
+
+@app.command("camera")
+@options(CameraParams, **NODE_OPTIONS)
+def toolbox_camera(params: CameraParams, limit: Limits = None) -> None:
+    """Run a camera as a node of ROS 2: images of a folder, a video or a camera on a topic."""
+    extras.need("a camera as a node", "psutil")
+    from scan2sim.services.toolboxes.camera import CameraNode
+
+    spin(lambda: CameraNode(params), lambda node: node.finished)
 
 
 def _over_files(box: str, params: ToolboxParams, images: Path, out: Path, draw: bool) -> None:

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from scan2sim.pipeline.ranges import Device, File
 from scan2sim.pipeline.step import Params
-from scan2sim.services.monitoring.watched import Topic, Watched
+from scan2sim.services.monitoring.watched import NodeName, Topic, Watched
 from scan2sim.services.served import Served
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
@@ -47,6 +47,24 @@ class NodeParams(Watched):
     results: Annotated[str, Field(description="Topic for results, std_msgs/String with JSON.")] = "results"
     compressed: Annotated[bool, Field(description=f"Images are {COMPRESSED}, not {IMAGE}.")] = False
     events_topic: Annotated[str, Field(description="Topic of ROS 2 and of Kafka with events.")] = "bus_events"
+
+
+class CameraParams(Watched):
+    """Of a camera as a node."""
+
+    images: Annotated[
+        str,
+        Field(min_length=1, max_length=2000, description="Folder, picture or video; or rtsp://..., a device's number."),
+    ]
+    topic: Topic
+    name: NodeName = "camera"
+    rate: Annotated[
+        float | None, Field(ge=0.01, le=1000, description="Images a second; default: the video's, 10 of others.")
+    ] = None
+    loop: Annotated[bool, Field(description="Begin anew at the end of a folder or video.")] = False
+    compressed: Annotated[bool, Field(description=f"Send {COMPRESSED} (JPEG), not {IMAGE}.")] = False
+    quality: Annotated[int, Field(ge=5, le=100, description="Quality of the JPEGs.")] = 80
+    subscribers: Annotated[int, Field(ge=0, le=1000, description="Subscriptions to wait for before it begins.")] = 0
 
 
 class ServeParams(Served):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,6 +38,11 @@ class Shot:
     name: str
     stamp: int | None
     image: bytes | U8
+
+
+def is_camera(address: str) -> bool:
+    """Whether it is a camera's, no file's: rtsp://..., http://..., or a device's number."""
+    return "://" in address or address.isdecimal()
 
 
 def rate_of(path: Path) -> float | None:
@@ -131,29 +136,38 @@ class Cameras:
         return {one.address: {"there": one.is_there(), "images": one.count} for one in self._readers}
 
 
-class _Camera:
-    def __init__(self, engine: Engine, address: str) -> None:
-        self._engine, self.address = engine, address
-        self.last: Result | None = None
+class Reader:
+    """Reads a camera in a thread of its own; one that is gone is looked for again.
+
+    Attributes:
+        count: images that came.
+    """
+
+    def __init__(self, address: str, take: Callable[[U8], None]) -> None:
+        """Of an address as OpenCV takes it; `take` is given each image, (H, W, 3) RGB, in that thread."""
+        self._address, self._take = address, take
         self.count, self._seen = 0, 0.0
         self._stopped, self._thread = threading.Event(), threading.Thread()
 
     def start(self) -> None:
+        """Read from now on."""
         if not self.running():
             self._stopped = threading.Event()
-            self._thread = threading.Thread(target=self._run, args=(self._stopped,), name=self.address, daemon=True)
+            self._thread = threading.Thread(target=self._run, args=(self._stopped,), name=self._address, daemon=True)
             self._thread.start()
 
     def stop(self) -> None:
+        """Read nothing."""
         self._stopped.set()
         if self._thread.ident:
             self._thread.join(SILENT)
-        self.last = None
 
     def running(self) -> bool:
+        """Whether it is read, or looked for."""
         return self._thread.is_alive() and not self._stopped.is_set()
 
     def is_there(self) -> bool:
+        """Whether it sends images."""
         return self.running() and time.monotonic() - self._seen < SILENT
 
     def _run(self, stopped: threading.Event) -> None:
@@ -161,18 +175,31 @@ class _Camera:
 
         pause = 0.0
         while not stopped.wait(pause):
-            video = cv2.VideoCapture(int(self.address) if self.address.isdecimal() else self.address)
+            video = cv2.VideoCapture(int(self._address) if self._address.isdecimal() else self._address)
             while not stopped.is_set() and (image := _read(video)) is not None:
                 pause = 0.0
-                self._submit(image)
+                self.count += 1
+                self._seen = time.monotonic()
+                self._take(image)
             video.release()
             pause = min(LONGEST_PAUSE, 2 * pause or 0.2)
 
-    def _submit(self, image: U8) -> None:
-        self.count += 1
-        self._seen = time.monotonic()
-        self._engine.submit(Frame(f"{self.count}", self.address, time.time_ns(), image, self._take))
 
-    def _take(self, result: Result) -> None:
+class _Camera(Reader):
+    """Whose images an engine works on."""
+
+    def __init__(self, engine: Engine, address: str) -> None:
+        super().__init__(address, self._submit)
+        self._engine, self.address = engine, address
+        self.last: Result | None = None
+
+    def stop(self) -> None:
+        super().stop()
+        self.last = None
+
+    def _submit(self, image: U8) -> None:
+        self._engine.submit(Frame(f"{self.count}", self.address, time.time_ns(), image, self._keep))
+
+    def _keep(self, result: Result) -> None:
         if result.body is not None:
             self.last = result

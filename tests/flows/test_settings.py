@@ -27,7 +27,7 @@ from scan2sim.services.monitoring.traffic import TrafficParams
 from scan2sim.services.monitoring.watched import DatasetParams, TalkerParams, TopicParams, WorkParams
 from scan2sim.services.qos.measure import MeasureParams
 from scan2sim.services.toolboxes.boxes import classify, detect, movement, segment
-from scan2sim.services.toolboxes.settings import NodeParams, ServeParams
+from scan2sim.services.toolboxes.settings import CameraParams, NodeParams, ServeParams
 from scan2sim.slam.steps.track import Filmed
 from scan2sim.texturing.unwrap import UnwrapParams, check_size
 from tests.conftest import ROOT
@@ -142,11 +142,13 @@ def test_every_number_that_a_command_takes_has_a_range() -> None:
     found = [loaded(name) for name in COMMANDS]
     single = [one for some in found for one in getattr(some, "commands", {"": some}).values()]
     hints = [get_type_hints(one.callback) for one in single]
-    boxes = (detect.Params, movement.Params, classify.Params, segment.Params, ServeParams, NodeParams, MeasureParams)
+    boxes = (detect.Params, movement.Params, classify.Params, segment.Params, ServeParams, NodeParams, CameraParams)
     bus = (QueryParams, TopicParams, TalkerParams, DatasetParams, TrafficParams, WorkParams, ScaleParams, PageParams)
     numbers = {name for of in hints for name, kind in of.items() if {int, float} & {kind, *get_args(kind)}}
     assert len(numbers) > 15 and numbers <= {
-        name for model in (Numbers, Filmed, CutParams, SweepsParams, *bus, *boxes) for name in model.model_fields
+        name
+        for model in (Numbers, Filmed, CutParams, SweepsParams, MeasureParams, *bus, *boxes)
+        for name in model.model_fields
     }
 
 

@@ -1,0 +1,87 @@
+"""A camera as a node of ROS 2 that the bus watches: a folder, a video or a camera in, images on a topic out."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scan2sim.pipeline.types import U8
+from scan2sim.services.monitoring.monitor import Monitor, ros
+from scan2sim.services.qos.encoding import jpeg
+from scan2sim.services.toolboxes import frames, sources
+from scan2sim.services.toolboxes.frames import Frame
+from scan2sim.services.toolboxes.settings import COMPRESSED, IMAGE, CameraParams
+from scan2sim.services.transport import QoS
+
+HEADER, TIME = "std_msgs/msg/Header", "builtin_interfaces/msg/Time"
+RATE = 10.0
+"""Images a second, where neither a video nor the user says."""
+IMAGES = QoS(depth=5)
+"""Fits all subscriptions: those that want every image, and those that take what comes."""
+
+
+class CameraNode(Monitor):
+    """Publishes images at a rate, each stamped with the time when it is sent.
+
+    Attributes:
+        finished: whether all images of a file are sent.
+    """
+
+    def __init__(self, params: CameraParams) -> None:
+        live = sources.is_camera(params.images)
+        rate = params.rate or (None if live else sources.rate_of(Path(params.images))) or RATE
+        super().__init__(params.name, **params.monitored())
+        self._params, self._begun, self.finished = params, False, False
+        kind = COMPRESSED if params.compressed else IMAGE
+        self._publisher = self.create_publisher(ros.message_type(kind), params.topic, IMAGES)
+        self._newest: U8 | None = None
+        self._reader = sources.Reader(params.images, self._keep) if live else None
+        self._shown = iter(()) if live else _images(Path(params.images), params.loop)
+        if self._reader:
+            self._reader.start()
+        self.create_timer(1 / rate, self._send_next)
+
+    def _keep(self, image: U8) -> None:
+        self._newest = image
+
+    def _send_next(self) -> None:
+        """Send a file's next image, or a camera's newest, once those who are waited for are there."""
+        self._begun = self._begun or self._publisher.get_subscription_count() >= self._params.subscribers
+        if not self._begun:
+            return
+        if self._reader:
+            image, self._newest = self._newest, None
+        else:
+            image = next(self._shown, None)
+            self.finished = image is None
+        if image is not None:
+            self._publisher.publish(self._message(image))
+
+    def _message(self, image: U8) -> Any:
+        seconds, rest = divmod(time.time_ns(), 10**9)
+        stamp = ros.message(TIME, sec=seconds, nanosec=rest)
+        header = ros.message(HEADER, stamp=stamp, frame_id=self._params.name)
+        if self._params.compressed:
+            data = np.frombuffer(jpeg(image, self._params.quality), np.uint8)
+            return ros.message(COMPRESSED, header=header, format="jpeg", data=data)
+        height, width, _ = image.shape
+        size: dict[str, Any] = {"height": height, "width": width, "step": 3 * width}
+        return ros.message(IMAGE, header=header, encoding="rgb8", **size, data=image.reshape(-1))
+
+    def destroy_node(self) -> Any:
+        """Read no more, and end."""
+        if self._reader:
+            self._reader.stop()
+        return super().destroy_node()
+
+
+def _images(path: Path, loop: bool) -> Iterator[U8]:
+    """(H, W, 3) RGB of a folder, a picture or a video, once or for ever."""
+    for _ in itertools.count() if loop else range(1):
+        for shot in sources.shots(path):
+            yield frames.rgb(Frame(shot.name, str(path), shot.stamp, shot.image, lambda _: None))

@@ -1,0 +1,80 @@
+"""A camera's node: images of files and cameras on a topic, in order, at a rate, stamped; and what comes of it."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+pytest.importorskip("cyclonedds", reason="the extra bus isn't installed")
+
+from scan2sim.services.toolboxes.settings import IMAGE
+from tests.services.conftest import Start
+from tests.services.toolboxes import hearing, shaky
+from tests.services.toolboxes.test_sources import film
+
+COMMAND = ("-m", "scan2sim.flows.cli", "toolbox")
+LEVELS = [10, 40, 70, 100, 130]
+STRING = "std_msgs/msg/String"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A picture a level, by name."""
+    made = tmp_path / "pictures"
+    made.mkdir()
+    for number, level in enumerate(LEVELS):
+        Image.fromarray(shaky.image(level, (12, 16))).save(made / f"{number}.png")
+    return made
+
+
+def lines(process: Any) -> list[dict[str, Any]]:
+    """What a subscriber has heard."""
+    heard, errors = process.communicate(timeout=60)
+    assert process.returncode == 0, errors
+    return [json.loads(line) for line in heard.splitlines()]
+
+
+def test_a_folders_images_come_in_order_stamped_at_the_rate(start: Start, folder: Path) -> None:
+    began = time.time()
+    listener = start("cyclone", Path(hearing.__file__), "/front", IMAGE, "5")
+    camera = start("cyclone", *COMMAND, "camera", folder, "/front", "--rate", "5", "--subscribers", "1")
+    heard = lines(listener)
+    assert [one["level"] for one in heard] == LEVELS
+    assert {(one["width"], one["height"], one["step"], one["encoding"]) for one in heard} == {(16, 12, 48, "rgb8")}
+    stamps = np.array([one["stamp"] for one in heard])
+    assert began < stamps[0] and stamps[-1] < time.time()
+    assert np.median(np.diff(stamps)) == pytest.approx(0.2, abs=0.05)
+    assert camera.wait(20) == 0, "it ends with the folder"
+
+
+def test_a_film_goes_round(start: Start, tmp_path: Path) -> None:
+    listener = start("cyclone", Path(hearing.__file__), "/front", IMAGE, "8")
+    start(
+        "cyclone", *COMMAND, "camera", film(tmp_path / "f.avi", [20, 90, 160]), "/front", "--loop", "--subscribers", "1"
+    )
+    levels = [one["level"] for one in lines(listener)]
+    assert np.allclose(levels, [20, 90, 160, 20, 90, 160, 20, 90], atol=6)
+
+
+def test_a_cameras_images_become_results(start: Start, folder: Path) -> None:
+    listener = start("cyclone", Path(hearing.__file__), "/seen", STRING, "6")
+    node = ("node", shaky.__name__, "--images", "/front", "--results", "/seen", "--compressed")
+    start("cyclone", *COMMAND, *node)
+    start("cyclone", *COMMAND, "camera", folder, "/front", "--compressed", "--loop", "--rate", "5")
+    began = time.time()
+    for one in lines(listener):
+        level = int(one["body"]["classes"][0]["label"])
+        assert one["source"] == "/front" and min(abs(level - known) for known in LEVELS) <= 2
+        assert abs(one["stamp"] * 1e-9 - began) < 60
+
+
+def test_a_folder_that_isnt_there_is_refused_at_once(start: Start, tmp_path: Path) -> None:
+    camera = start("cyclone", *COMMAND, "camera", tmp_path / "none", "/front")
+    _, errors = camera.communicate(timeout=20)
+    assert camera.returncode and "is not there" in errors
