@@ -1,12 +1,14 @@
 """Whether followed things move: corners in them, followed by optical flow, against those of the background.
 
-Corners (Shi and Tomasi, 1994) are followed from image to image (Lucas and Kanade; pyramidal: Bouguet, 2000). A thing's
-step is what its corners do beyond what the background's do, so that a mast in the wind makes nothing move; steps are
-summed over a second, in which shaking comes back to where it was and driving doesn't.
+Corners (Shi and Tomasi, 1994) are followed from image to image (Lucas and Kanade; pyramidal: Bouguet, 2000). A corner's
+step is what it does beyond what the background does, so that a mast in the wind makes nothing move; steps are summed
+over a second, in which shaking comes back to where it was and driving doesn't. A thing moves if enough of its corners
+do: others in its box may be of what lies behind it.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -20,21 +22,29 @@ WIDTH = 640
 WINDOW = 1.0
 """Seconds over which it is decided."""
 SOONEST = 0.25
-"""Seconds of a thing's steps before anything is said of it."""
-STILL = 3.0
-"""Pixels of such an image by which a standing thing's corners may drift in a second."""
+"""Seconds that a corner was followed for before it counts."""
+STILL = 1.5
+"""Pixels of such an image by which a standing corner may drift in a second."""
 LEAST = 1.0
-"""Pixels that a thing must have gone, however short its history is."""
-CORNERS, BACKGROUND = 60, 200
-"""Corners of a thing, and of the background, at most; there are new ones once half of them are lost."""
+"""Pixels that a corner must have gone, however short its history is."""
+ENOUGH = 0.3
+"""Share of a thing's corners that move, if it does."""
+CORNERS, BACKGROUND = 80, 200
+"""Corners of a thing, and of the background, about: they are as far apart as that."""
+NEAREST = 2.0
+"""Pixels between two corners, at least."""
 FEWEST, FEWEST_BACKGROUND = 4, 8
 """Corners that say anything together."""
+DRIFT = 8.0
+"""Pixels a second that the middle of a standing thing's boxes may go, where it has too few corners."""
 BACK = 0.5
 """Pixels that a corner may be off when it is followed there and back."""
-REACH = (21, 21)
+REACH = (15, 15)
 """Pixels around a corner that are compared."""
-QUALITY, APART = 0.01, 5.0
-"""Of corners: least strength as a share of the strongest, and pixels between two."""
+EDGE = max(REACH) // 2
+"""Pixels around a nearer thing in which it would draw corners along."""
+QUALITY = 0.02
+"""Of corners: least strength as a share of the strongest."""
 
 Box = tuple[float, float, float, float]
 
@@ -53,12 +63,63 @@ class Motion:
 
 
 @dataclass
-class _Thing:
-    """Its corners (N, 2), and its steps: (seconds, seconds since the one before, pixels across, down, outwards)."""
+class _Corners:
+    """Corners that are followed, and their steps: (N, 2) pixels, (N, T, 2) pixels, (T,) seconds that each step took.
 
-    corners: F32 = field(default_factory=lambda: np.empty((0, 2), np.float32))
-    steps: deque[tuple[float, float, F64]] = field(default_factory=deque)
+    Steps before a corner was found are NaN. Of their thing: `seen`, when it was last detected, and `path`, (seconds,
+    pixels across and down) of its boxes' middles over the last second.
+    """
+
+    at: F32 = field(default_factory=lambda: np.empty((0, 2), np.float32))
+    steps: F32 = field(default_factory=lambda: np.empty((0, 0, 2), np.float32))
+    took: F64 = field(default_factory=lambda: np.empty(0))
     seen: float = 0.0
+    path: deque[tuple[float, float, float]] = field(default_factory=deque)
+
+    def keep(self, which: Bools) -> None:
+        """Forget others."""
+        self.at, self.steps = self.at[which], self.steps[which]
+
+    def step(self, at: F32, beyond: F32, seconds: float) -> None:
+        """All go to where they are now; what is older than the window is forgotten."""
+        self.at = at
+        self.steps = np.concatenate([self.steps, beyond[:, None]], axis=1)
+        self.took = np.append(self.took, seconds)
+        recent = np.cumsum(self.took[::-1])[::-1] <= WINDOW + seconds / 2
+        self.steps, self.took = self.steps[:, recent], self.took[recent]
+
+    def place(self, seconds: float, box: F64) -> None:
+        """Their thing was detected in a box."""
+        self.seen = seconds
+        self.path.append((seconds, (box[0] + box[2]) / 2, (box[1] + box[3]) / 2))
+        while seconds - self.path[0][0] > WINDOW:
+            self.path.popleft()
+
+    def add(self, found: F32) -> None:
+        """Follow others, too."""
+        never = np.full((len(found), len(self.took), 2), np.nan, np.float32)
+        self.at, self.steps = np.concatenate([self.at, found]), np.concatenate([self.steps, never])
+
+    def motion(self, scale: float) -> Motion:
+        """Of their thing; `scale`: pixels followed by pixels of the image."""
+        known = np.isfinite(self.steps[..., 0])
+        durations = known @ self.took if len(self.took) else np.zeros(len(self.at))
+        counts = durations >= SOONEST
+        if counts.sum() < FEWEST:
+            return self._drift(scale)
+        ways = np.linalg.norm(np.nansum(self.steps[counts], axis=1), axis=1)
+        speeds = ways / durations[counts]
+        moves = ways > np.maximum(LEAST, STILL * durations[counts])
+        moving = bool(moves.mean() >= ENOUGH)
+        return Motion(moving, round(float(np.median(speeds[moves] if moving else speeds)) / scale, 2))
+
+    def _drift(self, scale: float) -> Motion:
+        """By the boxes alone: a line through their middles."""
+        seconds, *middle = np.array(self.path).T
+        if seconds[-1] - seconds[0] < SOONEST:
+            return Motion()
+        speed = float(np.linalg.norm([np.polyfit(seconds - seconds[0], one, 1)[0] for one in middle]))
+        return Motion(speed > DRIFT, round(speed / scale, 2))
 
 
 class Flow:
@@ -67,8 +128,8 @@ class Flow:
     def __init__(self) -> None:
         self._last: U8 | None = None
         self._time = 0.0
-        self._things: dict[int, _Thing] = {}
-        self._background = np.empty((0, 2), np.float32)
+        self._things: dict[int, _Corners] = {}
+        self._background = _Corners()
 
     def update(self, image: U8, seconds: float, boxes: Mapping[int, Box]) -> dict[int, Motion]:
         """How things move, by their track.
@@ -82,51 +143,37 @@ class Flow:
         if self._last is not None and self._last.shape == grey.shape and 0 < seconds - self._time < WINDOW:
             self._step(self._last, grey, seconds)
         else:
-            self._things, self._background = {}, np.empty((0, 2), np.float32)
+            self._things, self._background = {}, _Corners()
         self._last, self._time = grey, seconds
         self._renew(grey, seconds, {track: np.array(box) * scale for track, box in boxes.items()})
-        return {track: self._motion(self._things[track], scale) for track in boxes}
+        return {track: self._things[track].motion(scale) for track in boxes}
 
     def _step(self, last: U8, grey: U8, seconds: float) -> None:
-        """Follow all corners, and note how things went against the background."""
-        kept = {track: thing for track, thing in self._things.items() if seconds - thing.seen < WINDOW}
-        corners = [self._background, *(thing.corners for thing in kept.values())]
-        ends = np.cumsum([len(one) for one in corners])[:-1]
-        now, found = _followed(last, grey, np.concatenate(corners))
-        parts = zip(corners, np.split(now, ends), np.split(found, ends), strict=True)
-        before, after, good = next(parts)
-        shake = _similarity(before[good], after[good])
-        self._background = after[good]
-        for thing, (before, after, good) in zip(kept.values(), parts, strict=True):
-            thing.corners = after[good]
-            if good.sum() >= FEWEST:
-                went = _went(before[good] @ shake[:, :2].T + shake[:, 2], after[good])
-                thing.steps.append((seconds, seconds - self._time, went))
-            while thing.steps and seconds - thing.steps[0][0] > WINDOW:
-                thing.steps.popleft()
-        self._things = kept
+        """Follow all corners, and note how they went against the background."""
+        self._things = {track: one for track, one in self._things.items() if seconds - one.seen < WINDOW}
+        groups = [self._background, *self._things.values()]
+        now, sure = _followed(last, grey, np.concatenate([one.at for one in groups]))
+        ends = np.cumsum([len(one.at) for one in groups])[:-1]
+        shake = np.eye(2, 3)
+        for i, (one, after, good) in enumerate(zip(groups, np.split(now, ends), np.split(sure, ends), strict=True)):
+            one.keep(good)
+            if i == 0:
+                shake = _similarity(one.at, after[good])
+            expected = one.at @ shake[:, :2].T + shake[:, 2]
+            one.step(after[good], np.asarray(after[good] - expected, np.float32), seconds - self._time)
 
     def _renew(self, grey: U8, seconds: float, boxes: Mapping[int, F64]) -> None:
-        """Keep corners that are in their thing's box and in no nearer one's; find others for those that are lost."""
+        """Keep corners that are in their thing's box and in no nearer one's; find others where there are none."""
         height, width = grey.shape
         free = np.full(grey.shape, 255, np.uint8)
         for track, box in sorted(boxes.items(), key=lambda one: -one[1][3]):  # the nearest, lowest in the image, first
-            thing = self._things.setdefault(track, _Thing())
-            thing.seen = seconds
+            thing = self._things.setdefault(track, _Corners())
+            thing.place(seconds, box)
             left, top, right, bottom = np.clip(box.round().astype(int), 0, (width, height, width, height))
-            own = np.zeros_like(free)
-            own[top:bottom, left:right] = free[top:bottom, left:right]
-            thing.corners = _corners(grey, own, thing.corners, CORNERS)
-            free[top:bottom, left:right] = 0
-        self._background = _corners(grey, free, self._background, BACKGROUND)
-
-    @staticmethod
-    def _motion(thing: _Thing, scale: float) -> Motion:
-        duration = sum(took for _, took, _ in thing.steps)
-        if duration < SOONEST:
-            return Motion()
-        way = float(np.linalg.norm(np.sum([went for _, _, went in thing.steps], axis=0)))
-        return Motion(moving=way > max(LEAST, STILL * duration), speed=round(way / duration / scale, 2))
+            place = np.s_[top:bottom, left:right]
+            _find(grey, free, place, thing, CORNERS)
+            free[max(0, top - EDGE) : bottom + EDGE, max(0, left - EDGE) : right + EDGE] = 0
+        _find(grey, free, np.s_[:, :], self._background, BACKGROUND)
 
 
 def _grey(image: U8) -> tuple[U8, float]:
@@ -163,28 +210,22 @@ def _similarity(before: F32, after: F32) -> F64:
     return np.eye(2, 3)
 
 
-def _went(expected: F64, after: F32) -> F64:
-    """(3,) pixels that most of a thing's corners went beyond what was expected: across, down, and outwards.
-
-    What drives towards the camera goes outwards alone.
-    """
-    beyond = after - expected
-    middle = np.median(beyond, axis=0)
-    spokes = expected - np.median(expected, axis=0)
-    lengths = np.linalg.norm(spokes, axis=1)
-    outwards = ((beyond - middle) * spokes).sum(axis=1) / np.maximum(lengths, 1e-6)
-    return np.array([*middle, np.median(outwards)])
-
-
-def _corners(grey: U8, where: U8, known: F32, most: int) -> F32:
-    """(N, 2) corners in the part of an image where a mask isn't 0: known ones, and others if there are too few."""
+def _find(grey: U8, free: U8, place: tuple[slice, slice], corners: _Corners, most: int) -> None:
+    """Drop corners out of a place of an image, or where it isn't free (0), and find others, apart from these."""
     import cv2
 
-    at = known.round().astype(int)
-    inside = (at >= 0).all(axis=1) & (at[:, 0] < where.shape[1]) & (at[:, 1] < where.shape[0])
-    kept = known[inside]
-    kept = kept[where[at[inside, 1], at[inside, 0]] > 0]
-    if len(kept) > most // 2:
-        return kept
-    found = cv2.goodFeaturesToTrack(grey, most - len(kept), QUALITY, APART, mask=where)
-    return kept if found is None else np.concatenate([kept, found.reshape(-1, 2)])
+    top, left = place[0].start or 0, place[1].start or 0
+    mask = free[place].copy()
+    if not mask.size:
+        corners.keep(np.zeros(len(corners.at), bool))
+        return
+    at = corners.at.round().astype(int) - (left, top)
+    inside = (at >= 0).all(axis=1) & (at[:, 0] < mask.shape[1]) & (at[:, 1] < mask.shape[0])
+    inside[inside] = mask[at[inside, 1], at[inside, 0]] > 0
+    corners.keep(inside)
+    apart = max(NEAREST, math.sqrt(mask.size / most))
+    for x, y in at[inside]:
+        cv2.circle(mask, (int(x), int(y)), math.ceil(apart), 0, cv2.FILLED)
+    found = cv2.goodFeaturesToTrack(grey[place], most, QUALITY, apart, mask=mask)
+    if found is not None:
+        corners.add(np.asarray(found.reshape(-1, 2) + (left, top), np.float32))
