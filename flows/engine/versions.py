@@ -15,8 +15,8 @@ from scan2sim.flows.engine.planning import Planned
 from scan2sim.flows.recipes.steps import STEPS
 from scan2sim.pipeline.errors import UnavailableError
 
-APART = ("flows", "ray", "s3", "bus", "dev")
-"""Extras that hand work out, bring files, watch or try the project: no result depends on their packages."""
+APART = ("flows", "ray", "s3", "bus", "toolboxes", "dev")
+"""Extras that hand work out, bring files, watch, serve or try the project: no step depends on their packages."""
 
 
 @cache
