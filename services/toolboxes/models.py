@@ -12,6 +12,8 @@ FOLDER = Path(__file__).parent / "weights"
 """Of models that come along."""
 SAFE = (".onnx", ".safetensors")
 """Ends of files that can't hold code."""
+IMAGENET = FOLDER / "imagenet.labels.txt"
+"""Names of ImageNet's thousand classes (of WordNet's synsets), in the usual order."""
 
 
 def chosen(params: ToolboxParams, own: Path | None) -> Path:
@@ -42,6 +44,11 @@ def sha256(path: Path) -> str:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
         raise InputError(path, f"can't be read ({error.strerror})", "Give a file on this disk") from None
+
+
+def imagenet() -> tuple[str, ...]:
+    """Names of ImageNet's classes."""
+    return tuple(IMAGENET.read_text("utf-8").split("\n")[:-1])
 
 
 def _check_kind(path: Path) -> None:

