@@ -83,12 +83,14 @@ writes. Who passes on an environment (an image, an appliance, an installer) pass
 {attention}
 
 Nothing that is GPL without an exception comes with the core. To ship without any GPL, leave out the extra `meshlab`,
-one of four libraries that decimate, and the extra `slam`: what it does needs PyAV to read and write videos (built
-against an FFmpeg without x264 and x265 it still reads them), and pycolmap for `slam --adjust` alone.
+one of four libraries that decimate, and the extras `slam` and `toolboxes`: what they do needs PyAV to read and write
+videos (built against an FFmpeg without x264 and x265 it still reads them), and pycolmap for `slam --adjust` alone. Of
+the toolboxes' containers, that of `movement` alone holds PyAV ([toolboxes.md](toolboxes.md#containers)).
 """
 
 ATTENTION = (
-    ("x264, x265, and with them PyAV's whole FFmpeg", "GPL-2.0-or-later (GPL-3.0 in this combination)", "`slam`: av",
+    ("x264, x265, and with them PyAV's whole FFmpeg", "GPL-2.0-or-later (GPL-3.0 in this combination)",
+     "`slam`, `toolboxes` (by supervision): av",
      "source code of these libraries beside the binaries, and the GPL for what is linked with them; H.264 and H.265 "
      "may also need patent licences"),
     ("SuiteSparse in pycolmap's binary", "GPL-2.0-or-later", "`slam`: pycolmap",
@@ -102,7 +104,7 @@ ATTENTION = (
      "the licence's text and the source; a shared library"),
     ("libgfortran, libgomp", "GPL-3.0 with the GCC Runtime Library Exception", "core: numpy, scipy",
      "nothing: the exception allows any use in compiled programs"),
-    ("mp3lame, GnuTLS, nettle, GMP, libunistring, ALSA", "LGPL", "`slam`: av",
+    ("mp3lame, GnuTLS, nettle, GMP, libunistring, ALSA", "LGPL", "`slam`, `toolboxes`: av",
      "the licence's text and the source; shared libraries"),
     ("GEOS", "LGPL-2.1-or-later", "`rasters`: rasterio", "likewise"),
     ("Intel MKL, IPP", "Intel Simplified Software License", "core: open3d, opencv-python-headless",
@@ -116,6 +118,8 @@ ATTENTION = (
 )  # fmt: skip
 
 
+UNTOLD = "UNKNOWN"
+"""What setuptools wrote as the licence where there was none."""
 NOT_HERE = ("dev", "meshlab")
 """Extras that the page has no table of: its environment has none of MeshLab, which wants libraries of a desktop."""
 
@@ -161,8 +165,15 @@ def licence(package: Distribution) -> str:
     """What a package says that it is under."""
     about = package.metadata.json
     classified = [line.split(" :: ")[-1] for line in about.get("classifier", ()) if line.startswith("License ::")]
-    licence = about.get("license_expression") or ", ".join(classified) or about.get("license", "not told")
-    return str(licence).split("\n")[0]
+    told = about.get("license_expression") or ", ".join(classified) or about.get("license", UNTOLD)
+    return titled(package) if told == UNTOLD else str(told).split("\n")[0]
+
+
+def titled(package: Distribution) -> str:
+    """The first line of a package's file LICENSE, for one whose metadata tells nothing."""
+    file = next((path for path in package.files or () if path.name.startswith("LICENSE")), None)
+    lines = file.read_text().splitlines() if file else []
+    return next((line.strip() for line in lines if line.strip()), "not told")
 
 
 def brought(package: Distribution) -> list[str]:
