@@ -7,8 +7,8 @@ beside it `monitor alarms` with a rule on the queue's age, a `run` of the sample
 Headless Chromium looks at the page every so many seconds: DIR/page-001.png and so on, in the middle also dark and as a
 telephone shows it (DIR/page-dark.png, DIR/page-phone.png). Wants chromium, and some minutes of a quiet machine.
 
-Ends with `RESULT {json}`: pictures, nodes, runs and alarms that were to be seen at once, at most; events, and how many
-were lost. What watching and the run of the tile cost makes events older than in the experiment itself.
+Ends with `RESULT {json}`: pictures, nodes, runs, queues and alarms that were to be seen at once, at most; events, and
+how many were lost. What watching and the run of the tile cost makes events older than in the experiment itself.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def picture(page: Page, path: Path, size: tuple[int, int] = WIDE, *, dark: bool 
     time.sleep(1.5)  # drawn anew
     Image.fromarray(page.picture(whole=True)).save(path, optimize=True)
     counts = "document.querySelectorAll('{}').length"
-    seen = {"nodes": "#nodes tbody tr", "runs": ".run", "alarms": "#alarms tbody tr"}
+    seen = {"nodes": "#nodes tbody tr", "runs": ".run", "queues": "#queues tbody tr", "alarms": "#alarms tbody tr"}
     return {name: page.value(counts.format(place)) for name, place in seen.items()}
 
 
@@ -105,7 +105,7 @@ def watch(replay: Replay, folder: Path, every: float) -> dict[str, Any]:
         chromium(Path(browser), "--disable-gpu") as page,
     ):
         running.start()
-        _open(page)
+        opened(page)
         while running.is_alive():
             running.join(every)
             seen.append(picture(page, folder / f"page-{len(seen) + 1:03d}.png"))
@@ -117,7 +117,8 @@ def watch(replay: Replay, folder: Path, every: float) -> dict[str, Any]:
     return {"pictures": len(seen), **most, "events": outcomes[0].sent, "lost": outcomes[0].sent - outcomes[0].done}
 
 
-def _open(page: Page) -> None:
+def opened(page: Page) -> None:
+    """Have a browser show it, once it answers."""
     end = time.monotonic() + 60
     with socket.socket() as probe:
         while probe.connect_ex(("127.0.0.1", PORT)):

@@ -1,4 +1,4 @@
-"""What a page shows of the bus's events: runs and alarms; others are left, and what is no event is counted."""
+"""What a page shows of the bus's events: runs, queues and alarms; others are left, and what is no event is counted."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from typing import Any
 from pydantic import ValidationError
 
 from scan2sim.pipeline.errors import printable
-from scan2sim.services.monitoring.events import KINDS, Alarm, Event, RunState, StepState
+from scan2sim.services.monitoring.events import KINDS, Alarm, Event, QueueState, RunState, StepState
 from scan2sim.services.monitoring.history import LARGEST, REMARK, Refused
+from scan2sim.services.monitoring.queues import Queues
 from scan2sim.services.monitoring.raised import Raised
 from scan2sim.services.monitoring.runs import Runs
 
@@ -19,7 +20,7 @@ class Noticed:
     """Takes events as they come.
 
     Attributes:
-        runs, alarms: what they say.
+        runs, queues, alarms: what they say.
         counts: of events that were refused, by why.
         last_refused: why the last one was.
     """
@@ -27,7 +28,7 @@ class Noticed:
     def __init__(self, began: float) -> None:
         """Events from before `began`, seconds since the epoch, are from back then; later ones from when they come."""
         self._began = began
-        self.runs, self.alarms = Runs(), Raised()
+        self.runs, self.queues, self.alarms = Runs(), Queues(), Raised()
         self.counts: Counter[str] = Counter()
         self.last_refused = ""
 
@@ -38,6 +39,8 @@ class Noticed:
             at = event.time if event.time < self._began else time.time()
             if isinstance(said, (RunState, StepState)):
                 self.runs.take(said, at)
+            elif isinstance(said, QueueState):
+                self.queues.take(said, at)
             elif isinstance(said, Alarm):
                 self.alarms.take(said, at)
         except Refused as refused:
@@ -48,7 +51,12 @@ class Noticed:
     def state(self, now: float) -> dict[str, Any]:
         """All of it, JSON-able; `now` in seconds since the epoch."""
         refused = {"counts": dict(self.counts), "last": self.last_refused}
-        return {"runs": self.runs.state(now), "alarms": self.alarms.state(), "events_refused": refused}
+        return {
+            "runs": self.runs.state(now),
+            "queues": self.queues.state(now),
+            "alarms": self.alarms.state(),
+            "events_refused": refused,
+        }
 
 
 def _parsed(body: bytes) -> tuple[Event, Any]:

@@ -96,6 +96,7 @@ function tellState(state) {
   byId("topic").textContent = `${topic} and ${events_topic} on ${servers}`;
   tellAlarms(state.alarms, events_topic);
   tellRuns(runs, state.now);
+  tellQueues(state.queues);
   if (range.seconds) status(connected ? "live" : "lost", connected ? "live" : "Kafka is gone");
   nodes.sort((a, b) => a.name.localeCompare(b.name, undefined, { numeric: true })); // node_2 before node_10
   const empty = byId("empty");
@@ -191,6 +192,28 @@ function row(node, limits) {
     element("td", node.dropped, node.dropped ? "n bad" : "n"),
   );
   return made;
+}
+
+function tellQueues(queues) {
+  const each = (value) => `${+value.toPrecision(2)}/s`;
+  const rows = queues.map((one) => {
+    const made = element("tr"),
+      name = element("td");
+    name.append(element("span", one.queue));
+    made.append(
+      name,
+      element("td", one.silent ? "silent" : "live", one.silent ? "bad" : ""),
+      element("td", each(one.arrived), "n"),
+      element("td", each(one.done), "n"),
+      element("td", each(one.refused), one.refused ? "n bad" : "n"),
+      element("td", one.waiting, "n"),
+      element("td", one.done ? UNITS.seconds(one.oldest_done) : "–", "n"),
+      element("td", one.workers, "n"),
+    );
+    return made;
+  });
+  byId("queues").querySelector("tbody").replaceChildren(...rows);
+  byId("queues").hidden = !rows.length;
 }
 
 function status(state, text) {

@@ -65,7 +65,7 @@ class ToolboxNode(Monitor):
             seconds=now - self._began,
             arrived=since["received"],
             done=since[State.DONE],
-            refused=since["received"] - since[State.DONE] if since["received"] > since[State.DONE] else 0,
+            refused=sum(since[state] for state in State if state != State.DONE),
             waiting=waiting,
             oldest=oldest,
             oldest_done=self._engine.typical(),

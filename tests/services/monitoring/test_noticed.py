@@ -8,10 +8,11 @@ from typing import Any
 
 import pytest
 
-from scan2sim.services.monitoring import raised, runs
-from scan2sim.services.monitoring.events import Alarm, Event, RunState, StepState
+from scan2sim.services.monitoring import queues, raised, runs
+from scan2sim.services.monitoring.events import Alarm, Event, QueueState, RunState, StepState
 from scan2sim.services.monitoring.history import Refused
 from scan2sim.services.monitoring.noticed import Noticed
+from scan2sim.services.monitoring.queues import Queues
 from scan2sim.services.monitoring.raised import Raised
 from scan2sim.services.monitoring.runs import Runs
 
@@ -46,6 +47,32 @@ def test_a_run_that_falls_silent_is_shown_as_such_and_one_that_ended_is_not() ->
     assert not shown(known, NOW + runs.SILENT)["silent"] and shown(known, NOW + runs.SILENT + 1)["silent"]
     known.take(run("r", "done"), NOW + 5)
     assert not shown(known, NOW + 1000)["silent"]
+
+
+def queue(name: str, seconds: float = 2.0) -> QueueState:
+    return QueueState(
+        queue=name, seconds=seconds, arrived=10, done=6, refused=3, waiting=4, oldest=0, oldest_done=0.2, workers=1
+    )
+
+
+def test_a_queue_is_told_a_second_and_one_that_falls_silent_is_shown_as_such() -> None:
+    known = Queues()
+    known.take(queue("detect"), NOW)
+    (one,) = known.state(NOW + 3)
+    assert (one["arrived"], one["done"], one["refused"], one["waiting"]) == (5, 3, 1.5, 4) and not one["silent"]
+    assert known.state(NOW + queues.SILENT + 3)[0]["silent"]
+
+
+def test_queues_have_bounds_and_silent_ones_make_room() -> None:
+    known = Queues()
+    for number in range(queues.QUEUES):
+        known.take(queue(f"q{number}"), NOW + number)
+    with pytest.raises(Refused, match="queues"):
+        known.take(queue("new"), NOW + 20)
+    known.take(queue("q0"), NOW + 20)
+    known.take(queue("new"), NOW + 100)
+    names = {one["queue"] for one in known.state(NOW)}
+    assert len(names) == queues.QUEUES and {"new", "q0"} <= names and "q1" not in names
 
 
 def test_what_runs_and_what_failed_comes_first_and_the_rest_is_counted() -> None:

@@ -125,6 +125,11 @@ def an_alarm(state: str, rule: str, since: float, subject: str = "/camera") -> b
     return event("alarm", state=state, rule=rule, subject=subject, value=0.31, since=since)
 
 
+def a_queue(name: str) -> bytes:
+    counts = {"arrived": 10, "done": 6, "refused": 3, "waiting": 4, "workers": 1}
+    return event("queue", queue=name, seconds=2.0, oldest=0.1, oldest_done=0.2, **counts)
+
+
 def red(picture: np.ndarray, rgb: tuple[int, int, int] = (0xC8, 0x1E, 0x1E)) -> int:
     return int((np.abs(picture.astype(int) - rgb).max(axis=2) < 12).sum())
 
@@ -290,6 +295,10 @@ def test_runs_and_alarms_come_from_kafka_to_the_page(broker: Broker, page: Page)
         page.until("!document.getElementById('alarm').hidden")
         assert "Alarm: images come late, /camera, since" in text(page, "#alarm")
         page.until("document.getElementById('counts').innerText.includes('1 no event')")
+        assert page.value("document.getElementById('queues').hidden")
+        send(a_queue("detect"))
+        page.until("!document.getElementById('queues').hidden")
+        assert text(page, "#queues tbody").split() == ["detect", "live", "5/s", "3/s", "1.5/s", "4", "200", "ms", "1"]
         send(an_alarm("cleared", "images come late", time.time()),
              a_run("r1", state="failed", message="1 of 7 tiles failed"))  # fmt: skip
         page.until("document.getElementById('alarm').hidden")
@@ -304,6 +313,7 @@ def test_runs_and_alarms_stay_text_and_fit_the_telephone(page: Page) -> None:
         for number in range(40):
             take(a_step(HOSTILE, f"{HOSTILE}{number}", "failed", message=HOSTILE * 5, host=HOSTILE, tile=HOSTILE))
             take(an_alarm("raised", HOSTILE, time.time(), HOSTILE * number))
+        take(a_queue(HOSTILE))
         fill(served.history, ["node"])
         for phone, dark in ((True, True), (False, False)):
             open_page(page, served.url, phone=phone, dark=dark)
@@ -312,7 +322,7 @@ def test_runs_and_alarms_stay_text_and_fit_the_telephone(page: Page) -> None:
             assert "40 alarms" in text(page, "#alarm") and "and 37 more" in text(page, "#alarm")
             assert "and 24 failed" in text(page, ".run")
             assert page.value("document.querySelectorAll('img').length") == 0
-            for place in (".run summary", ".run table", ".run .failure", "#alarm", "#alarms"):
+            for place in (".run summary", ".run table", ".run .failure", "#queues", "#alarm", "#alarms"):
                 assert HOSTILE in text(page, place), place
         page.click(".run summary")
         page.until("!document.querySelector('.run').open")
