@@ -57,6 +57,9 @@ def qos_measure(
     answers = measured.answers
     done = answers.states.get("done", 0)
     _say(f"{done} of {answers.sent} images were answered, half of them within {_or_dash(answers.response_p50)} ms")
+    encoding = measured.encoding
+    size = "" if encoding.scale == 1 else f" of {encoding.scale:g} times the size"
+    _say(f"images were sent as JPEGs{size} of quality {encoding.quality}, at most {encoding.megabits:.3g} Mbit/s")
     if required.slice:
         _say(f"preferred slice of a 5G network: {required.slice}")
     for name, metrics in (("service", NETWORK), ("machine", MACHINE)):
@@ -67,6 +70,7 @@ def qos_measure(
             "machine_passed": passed(found, MACHINE),
             "rows": [_json(row) for row in found],
             "answers": asdict(answers),
+            "encoding": asdict(measured.encoding),
         }
         out.write_text(json.dumps(told, indent=1))
 

@@ -6,6 +6,7 @@ accuracy `bench/toolbox_quality.py` measures.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -78,15 +79,25 @@ def choose_jpeg(images: Sequence[U8], rate: float, budget: float) -> Jpeg:
     Raises:
         InputError: even the smallest take more.
     """
-    least = float("inf")
+    least = math.inf
     for scale in SCALES:
         smaller = [scaled(image, scale) for image in images]
         for quality in QUALITIES:
-            megabits = 8e-6 * rate * max(by_http(len(jpeg(image, quality))) for image in smaller)
-            if megabits <= budget:
-                return Jpeg(quality, scale, megabits)
-            least = min(least, megabits)
+            made = Jpeg(quality, scale, _megabits(smaller, rate, quality))
+            if made.megabits <= budget:
+                return made
+            least = min(least, made.megabits)
     raise InputError(f"{budget:g} Mbit/s", f"are too few for {rate:g} images a second: {least:.2g} are needed", FEWER)
+
+
+def as_jpeg(images: Sequence[U8], rate: float, quality: int) -> Jpeg:
+    """What JPEGs of a quality take, at so many images a second."""
+    return Jpeg(quality, 1.0, _megabits(images, rate, quality))
+
+
+def _megabits(images: Sequence[U8], rate: float, quality: int) -> float:
+    """Mbit/s, were all as large as the largest."""
+    return 8e-6 * rate * max(by_http(len(jpeg(image, quality))) for image in images)
 
 
 def choose_h264(images: Sequence[U8], rate: float, budget: float) -> H264:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,12 +23,13 @@ from scan2sim.pipeline.errors import InputError, StepError
 from scan2sim.pipeline.ranges import File
 from scan2sim.pipeline.step import Params, Report
 from scan2sim.pipeline.types import U8
-from scan2sim.services.qos import places, robot
-from scan2sim.services.qos.environments import network
+from scan2sim.services.qos import encoding, places, robot
+from scan2sim.services.qos.encoding import Jpeg
+from scan2sim.services.qos.environments import Network, network
 from scan2sim.services.qos.machine import Machine, Usage, machine
 from scan2sim.services.qos.places import Places
 from scan2sim.services.qos.probe import Seen
-from scan2sim.services.qos.requirements import Environment, Service
+from scan2sim.services.qos.requirements import Environment, Requirements, Service
 from scan2sim.services.qos.robot import Answers
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -40,6 +42,8 @@ WARM = 3.0
 """Seconds that the robot asks before anything is measured: what comes first is slow."""
 PICTURES = 16
 """That are sent in turn, at most."""
+FREE = 0.8
+"""Share of a network's rate that images may take: beyond it they wait for each other."""
 
 
 class MeasureParams(Params):
@@ -52,7 +56,13 @@ class MeasureParams(Params):
     images: Annotated[
         File | None, Field(description="Folder of pictures that are sent; default: photos of the synthetic street.")
     ] = None
-    quality: Annotated[int, Field(ge=5, le=100, description="Quality of the JPEGs that are sent.")] = 80
+    quality: Annotated[
+        int | None, Field(ge=5, le=100, description="Quality of the JPEGs that are sent; default: the best that fits.")
+    ] = None
+    budget: Annotated[
+        float | None,
+        Field(ge=0.01, le=10_000, description="Mbit/s for images; default: as required, within the network's rate."),
+    ] = None
     network: Annotated[
         File | None, Field(description="TOML of a network, in place of what the environment's is assumed to be.")
     ] = None
@@ -71,6 +81,7 @@ class Measured:
         usage: what the toolbox took while it worked.
         machine: what it ran on.
         wire_bytes: that crossed the network for images and results, overhead and all.
+        encoding: of the images.
     """
 
     answers: Answers
@@ -78,6 +89,7 @@ class Measured:
     usage: Usage
     machine: Machine
     wire_bytes: int
+    encoding: Jpeg
 
     def values(self) -> dict[str, float | None]:
         """By the metrics of `requirements.Requirements`; None: there is no such thing here."""
@@ -105,15 +117,13 @@ def measure(params: MeasureParams, service: Service, report: Report) -> Measured
     """Run a toolbox, and a robot that asks it, over the environment's network.
 
     Raises:
-        InputError: there are no pictures.
+        InputError: there are no pictures, or the network is too slow for any.
         UnavailableError: no network can be made here (it takes root).
         StepError: the toolbox doesn't start, or the robot fails.
     """
-    with (
-        tempfile.TemporaryDirectory(prefix="scan2sim-qos-") as folder,
-        places.between(network(params.environment, params.network)) as ends,
-    ):
-        _write_pictures(params, service.image, Path(folder))
+    between = network(params.environment, params.network)
+    with tempfile.TemporaryDirectory(prefix="scan2sim-qos-") as folder, places.between(between) as ends:
+        chosen = _write_pictures(params, service, between, Path(folder))
         report(0.0, "the toolbox starts")
         with _serving(ends, params.toolbox, Path(folder)) as (server, port):
             _answers(_asking(ends, params, folder, port, WARM))
@@ -126,11 +136,37 @@ def measure(params: MeasureParams, service: Service, report: Report) -> Measured
                 time.sleep(0.2)
             answers, usage, seen = _answers(asking), usage.updated(), ends.seen(probing)
             crossed = ends.bytes() - before - (seen.bytes if seen else 0)
-    return Measured(answers, seen, usage, machine(), crossed)
+    return Measured(answers, seen, usage, machine(), crossed, chosen)
 
 
-def _write_pictures(params: MeasureParams, size: tuple[int, int] | None, folder: Path) -> None:
-    """JPEGs that the robot sends, of the size that the requirements are for."""
+def _write_pictures(params: MeasureParams, service: Service, between: Network | None, folder: Path) -> Jpeg:
+    """JPEGs that the robot sends, of the size that the requirements are for, as well as they allow."""
+    images = _pictures(params, service.image)
+    chosen = encoding_of(images, params, service.of(params.environment), between)
+    for number, image in enumerate(images):
+        (folder / f"{number:03}.jpg").write_bytes(chosen.encoded(image))
+    return chosen
+
+
+def encoding_of(images: Sequence[U8], params: MeasureParams, required: Requirements, between: Network | None) -> Jpeg:
+    """The quality that is asked for, or the best that fits what is allowed, required and there.
+
+    Raises:
+        InputError: nothing fits.
+    """
+    if params.quality is not None:
+        return encoding.as_jpeg(images, params.rate, params.quality)
+    rate = between.there.rate if between else None
+    allowed = (
+        params.budget,
+        None if params.budget or not required.bandwidth else required.bandwidth.value,
+        None if rate is None else FREE * rate * 1e-6,
+    )
+    return encoding.choose_jpeg(images, params.rate, min((one for one in allowed if one is not None), default=math.inf))
+
+
+def _pictures(params: MeasureParams, size: tuple[int, int] | None) -> list[U8]:
+    """(H, W, 3) RGB."""
     import cv2
 
     place = params.images or STREET
@@ -139,9 +175,8 @@ def _write_pictures(params: MeasureParams, size: tuple[int, int] | None, folder:
     pictures = [image for path in found[::step][:PICTURES] if (image := cv2.imread(str(path))) is not None]
     if not pictures:
         raise InputError(place, "holds no pictures", "Give --images a folder of JPEGs or PNGs")
-    for number, image in enumerate(pictures):
-        fitted = image if size is None else _fitted(np.asarray(image, np.uint8), size)
-        cv2.imwrite(str(folder / f"{number:03}.jpg"), fitted, [cv2.IMWRITE_JPEG_QUALITY, params.quality])
+    loaded = (np.ascontiguousarray(image[..., ::-1]) for image in pictures)
+    return [image if size is None else _fitted(image, size) for image in loaded]
 
 
 def _fitted(image: U8, size: tuple[int, int]) -> U8:

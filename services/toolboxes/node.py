@@ -30,6 +30,7 @@ class ToolboxNode(Monitor):
     def __init__(self, engine: Engine, params: NodeParams) -> None:
         super().__init__(f"toolbox_{engine.name}", **params.monitored())
         self._engine, self._began, self._counted = engine, time.monotonic(), engine.counts.copy()
+        self._slowest = 0.0  # seconds from an image's coming to its result, of those done lately
         string = ros.message_type(STRING)
         self._results = self.create_publisher(string, params.results, RESULTS)
         kind = ros.message_type(COMPRESSED if params.compressed else IMAGE)
@@ -52,6 +53,8 @@ class ToolboxNode(Monitor):
         self._engine.submit(Frame(f"{topic}@{stamp}", topic, stamp, _image(message, compressed), self._publish))
 
     def _publish(self, result: Result) -> None:
+        if result.state == State.DONE and result.times:
+            self._slowest = max(self._slowest, result.times.waited + result.times.worked)
         if result.state not in FAILED:
             self._results.publish(ros.message(STRING, data=result.json_line()))
 
@@ -68,10 +71,10 @@ class ToolboxNode(Monitor):
             refused=sum(since[state] for state in State if state != State.DONE),
             waiting=waiting,
             oldest=oldest,
-            oldest_done=self._engine.typical(),
+            oldest_done=self._slowest,
             workers=int(self._engine.is_ready()),
         )
-        self._began, self._counted = now, counts
+        self._began, self._counted, self._slowest = now, counts, 0.0
         self._bus.events.send("queue", state)
 
     def destroy_node(self) -> Any:

@@ -7,6 +7,7 @@ import threading
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,9 +15,10 @@ import pytest
 from scan2sim.pipeline.errors import InputError, UnavailableError
 from scan2sim.pipeline.step import silent
 from scan2sim.services.qos import environments, places, robot
+from scan2sim.services.qos.encoding import Jpeg
 from scan2sim.services.qos.environments import Network, network
 from scan2sim.services.qos.machine import Machine, Usage
-from scan2sim.services.qos.measure import Measured, MeasureParams, measure
+from scan2sim.services.qos.measure import FREE, Measured, MeasureParams, encoding_of, measure
 from scan2sim.services.qos.probe import Seen
 from scan2sim.services.qos.requirements import NETWORK, Environment, Requirements, read
 from scan2sim.services.qos.robot import Answers
@@ -65,7 +67,7 @@ def test_a_service_that_isnt_there_is_no_crash() -> None:
 def measured(seen: Seen | None, response: float = 100.0) -> Measured:
     answers = Answers(10, {"done": 10}, response, response, image_bytes=125_000, seconds=10)
     usage = Usage(process=None, began=0, before=0, cpu_seconds=5, memory_mb=300, seconds=10)
-    return Measured(answers, seen, usage, Machine(2, 3000, None, None, None), wire_bytes=1_375_000)
+    return Measured(answers, seen, usage, Machine(2, 3000, None, None, None), 1_375_000, Jpeg(90, 1.0, 1.2))
 
 
 SEEN = Seen(sent=1000, loss_rate=0.002, error_rate=0, delay=20, jitter=3, bytes=0)
@@ -80,6 +82,21 @@ def test_what_was_asked_is_held_against_what_was_measured() -> None:
     assert found["bandwidth"].measured == pytest.approx(1.1) and not found["bandwidth"].passed
     assert found["data_rate"].measured == pytest.approx(1.0) and found["data_rate"].passed is None
     assert not found["cpu_cores"].passed and not passed(list(found.values()), NETWORK)
+
+
+@pytest.mark.parametrize(
+    ("given", "budget"),
+    [({}, 5.0), ({"budget": 3.0}, 3.0), ({"budget": 50.0}, 20 * FREE), ({"environment": Environment.EDGE}, 60.0)],
+)
+def test_images_are_as_good_as_what_is_required_and_there_allows(given: dict[str, Any], budget: float) -> None:
+    """Of detection: 5 Mbit/s in the cloud, whose network has 20 there, and 60 at the edge."""
+    grain = np.random.default_rng(0).integers(0, 255, (640, 640, 3), np.uint8)  # the worst that there is
+    params = MeasureParams(**{"toolbox": "detect", "environment": Environment.CLOUD, "rate": 10, **given})
+    required, between = read("detect").of(params.environment), network(params.environment)
+    chosen = encoding_of([grain], params, required, between)
+    assert 0.4 * min(budget, 30) < chosen.megabits <= budget
+    asked = encoding_of([grain], params.model_copy(update={"quality": 95}), required, between)
+    assert asked.quality == 95 and asked.scale == 1 and asked.megabits > chosen.megabits
 
 
 def test_needs_grow_with_the_rate() -> None:
@@ -124,5 +141,6 @@ def test_a_toolbox_is_measured_over_a_link() -> None:
         pytest.skip(str(error))
     assert found.answers.states.get("done", 0) >= 1 and found.answers.response_p50 > 50  # there and back, at least
     assert found.seen and found.seen.delay > 20
+    assert found.encoding.megabits < 5 and found.wire_bytes * 8e-6 / found.answers.seconds < 5
     assert found.wire_bytes > found.answers.sent * found.answers.image_bytes
     assert found.usage.cpu_seconds > 0 and found.usage.memory_mb > 50
