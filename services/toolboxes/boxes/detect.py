@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -13,8 +13,8 @@ from pydantic import Field
 from scan2sim.pipeline.errors import InputError, SettingError
 from scan2sim.pipeline.types import F32, U8
 from scan2sim.segmentation import sessions
-from scan2sim.services.toolboxes import drawing, models, yolo
-from scan2sim.services.toolboxes.boxes import Facts, Follow
+from scan2sim.services.toolboxes import coco, drawing, models, yolo
+from scan2sim.services.toolboxes.boxes import Facts, Follow, Model
 from scan2sim.services.toolboxes.results import Body, Detection
 from scan2sim.services.toolboxes.settings import ToolboxParams
 
@@ -26,6 +26,10 @@ REMEDY = "Export it as YOLOv5's export.py does: images (N, 3, H, W) in, (N, boxe
 class Params(ToolboxParams):
     """Of detection."""
 
+    network: Annotated[
+        Literal["yolov5", "coco"],
+        Field(description="yolov5: what its form is of; coco: SSD of a package that you install (docs/toolboxes.md)."),
+    ] = "yolov5"
     size: Annotated[
         int, Field(ge=64, le=4096, description="Pixels of the longer side that a model of any size looks at.")
     ] = 640
@@ -40,11 +44,16 @@ class Params(ToolboxParams):
 
 def check(params: Params) -> None:
     """See `boxes.Toolbox`."""
-    models.chosen(params, OWN)
+    if params.network == "coco":
+        coco.files()
+    else:
+        models.chosen(params, OWN)
 
 
-def load(params: Params) -> Detector:
+def load(params: Params) -> Model:
     """The model (`boxes.Toolbox`)."""
+    if params.network == "coco":
+        return coco.Detector(params.threshold, params.overlap, _wanted(params, coco.LABELS.values()))
     return Detector(params)
 
 
@@ -76,10 +85,7 @@ class Detector:
         metadata = self._session.get_modelmeta().custom_metadata_map
         self._stride = int(float(metadata.get("stride", 64)))
         labels = _names(path, metadata)
-        wanted = {name.strip() for name in params.labels.split(",") if name.strip()}
-        if unknown := wanted - set(labels):
-            raise SettingError("--labels", f"{', '.join(sorted(unknown))}: not known", f"Known: {', '.join(labels)}")
-        self._wanted = wanted or set(labels)
+        self._wanted = _wanted(params, labels) or frozenset(labels)
         licence = metadata.get("licence") or metadata.get("license") or "not told"
         self.facts = Facts(path.stem, labels, sessions.digest(path), licence)
 
@@ -114,6 +120,18 @@ class Detector:
                 if labels[label] in self._wanted
             )
         )
+
+
+def _wanted(params: Params, known: Iterable[str]) -> frozenset[str]:
+    """Labels that count; none: all do.
+
+    Raises:
+        SettingError: one isn't known.
+    """
+    wanted = frozenset(name.strip() for name in params.labels.split(",") if name.strip())
+    if unknown := wanted - set(known):
+        raise SettingError("--labels", f"{', '.join(sorted(unknown))}: not known", f"Known: {', '.join(known)}")
+    return wanted
 
 
 def _names(path: Path, metadata: dict[str, str]) -> tuple[str, ...]:

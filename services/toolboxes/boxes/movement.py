@@ -12,7 +12,7 @@ from pydantic import Field
 
 from scan2sim.pipeline.types import U8
 from scan2sim.services.toolboxes import drawing, tracking
-from scan2sim.services.toolboxes.boxes import Follow, detect
+from scan2sim.services.toolboxes.boxes import Follow, Model, detect
 from scan2sim.services.toolboxes.frames import Frame
 from scan2sim.services.toolboxes.motion import Flow
 from scan2sim.services.toolboxes.results import Body, Moving
@@ -42,7 +42,7 @@ def check(params: Params) -> None:
     detect.check(params)
 
 
-def load(params: Params) -> detect.Detector:
+def load(params: Params) -> Model:
     """The model (`boxes.Toolbox`): the detector's."""
     return detect.load(params)
 
