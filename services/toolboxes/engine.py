@@ -29,6 +29,8 @@ log = logging.getLogger(__name__)
 
 TICK = 0.1
 """Seconds between two looks at whether the worker lives."""
+ENDS_WITHIN = 2.0
+"""Seconds that the model has for what it has begun, when the toolbox ends."""
 LONGEST_PAUSE = 5.0
 """Seconds between two starts of a worker that dies at once, at most."""
 FORGOTTEN = 60.0
@@ -117,6 +119,9 @@ class Engine:
         self._closed.set()
         for frame in self._waiting.close():
             self._answer(frame, State.DROPPED, "the toolbox ends")
+        self._dispatcher.join(ENDS_WITHIN)
+        if self._dispatcher.is_alive() and self._worker:
+            self._worker.kill()  # it hangs, or takes long
         self._dispatcher.join()
         for follower in self._followers.values():
             follower.close()

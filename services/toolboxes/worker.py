@@ -89,6 +89,10 @@ class Worker:
             raise answer
         return answer
 
+    def kill(self) -> None:
+        """End it at once; may be called from any thread."""
+        self._process.kill()
+
     def close(self) -> None:
         """End it."""
         self._connection.close()

@@ -182,6 +182,16 @@ def test_a_toolbox_that_ends_answers_what_waits() -> None:
     assert {one.state for one in sent.wait()} <= {State.DONE, State.DROPPED}
 
 
+def test_a_model_that_hangs_holds_nobody_up_who_ends_the_toolbox() -> None:
+    engine = Engine(BOX, ToolboxParams(hangs=3600))
+    sent = Sent(engine)
+    sent.send(image(HANGS))
+    time.sleep(0.5)
+    began = time.monotonic()
+    engine.close()
+    assert sent.wait()[0].state == State.FAILED and time.monotonic() - began < 20
+
+
 def test_there_is_no_such_toolbox() -> None:
     with pytest.raises(SettingError, match="there is no 'paint'"):
         Engine("paint", ToolboxParams())
