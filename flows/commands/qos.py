@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
+from itertools import islice
 from pathlib import Path
 from typing import Annotated
 
@@ -15,9 +16,14 @@ from scan2sim.flows.commands.display import console, progress
 from scan2sim.flows.commands.options import options
 from scan2sim.pipeline import extras
 from scan2sim.services.qos import requirements
+from scan2sim.services.qos.encoding import ChoiceParams, Jpeg, choose_h264, choose_jpeg
 from scan2sim.services.qos.measure import MeasureParams, measure
 from scan2sim.services.qos.requirements import MACHINE, NETWORK, UNITS, Environment, Requirements
 from scan2sim.services.qos.verdict import RATES, Needs, Row, needs, passed, rows
+from scan2sim.services.toolboxes import sources
+
+TRIED = 60
+"""Images that a choice is tried on, at most: a stream's need to be in a row."""
 
 app = App("Quality of service of toolboxes: what is required, and what a network and a machine give.")
 
@@ -57,9 +63,7 @@ def qos_measure(
     answers = measured.answers
     done = answers.states.get("done", 0)
     _say(f"{done} of {answers.sent} images were answered, half of them within {_or_dash(answers.response_p50)} ms")
-    encoding = measured.encoding
-    size = "" if encoding.scale == 1 else f" of {encoding.scale:g} times the size"
-    _say(f"images were sent as JPEGs{size} of quality {encoding.quality}, at most {encoding.megabits:.3g} Mbit/s")
+    _say(f"images were sent as JPEGs{_told(measured.encoding)}")
     if required.slice:
         _say(f"preferred slice of a 5G network: {required.slice}")
     for name, metrics in (("service", NETWORK), ("machine", MACHINE)):
@@ -73,6 +77,22 @@ def qos_measure(
             "encoding": asdict(measured.encoding),
         }
         out.write_text(json.dumps(told, indent=1))
+
+
+@app.command("choose")
+@options(ChoiceParams, images="IMAGES")
+def qos_choose(params: ChoiceParams) -> None:
+    """Choose how images like these are sent at a rate, so that they fit: as JPEGs, or as a stream of H.264."""
+    images = list(islice(sources.images(params.images), TRIED))
+    jpeg = choose_jpeg(images, params.rate, params.budget)
+    _say(f"JPEGs{_told(jpeg)}")
+    stream = choose_h264(images, params.rate, params.budget)
+    _say(f"H.264: {stream.bitrate * 1e-6:.3g} Mbit/s for the encoder, at most {stream.megabits:.3g} on the wire")
+
+
+def _told(jpeg: Jpeg) -> str:
+    size = "" if jpeg.scale == 1 else f" of {jpeg.scale:g} times the size"
+    return f"{size} of quality {jpeg.quality}: at most {jpeg.megabits:.3g} Mbit/s on the wire"
 
 
 def _json(row: Row) -> dict[str, object]:

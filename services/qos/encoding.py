@@ -10,11 +10,15 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.extras import need
+from scan2sim.pipeline.ranges import File
+from scan2sim.pipeline.step import Params
 from scan2sim.pipeline.types import U8
 
 QUALITIES = (90, 85, 80, 75, 70, 65, 60, 55, 50, 45, 40, 35, 30)
@@ -28,6 +32,16 @@ PACKET, PACKET_HEADERS = 1400, 54
 """Bytes of an RTP packet's load, and of its headers (Ethernet 14, IP 20, UDP 8, RTP 12)."""
 BITRATES = tuple(40e6 * 0.85**step for step in range(48))
 """Of streams, highest first, down to 20 kbit/s."""
+
+
+class ChoiceParams(Params):
+    """Of a choice."""
+
+    images: Annotated[File, Field(description="Folder of pictures, a picture or a video.")]
+    rate: Annotated[float, Field(ge=0.01, le=1000, description="Images a second.")] = 10.0
+    budget: Annotated[float, Field(ge=0.01, le=10_000, description="Mbit/s that they may take, overhead and all.")] = (
+        5.0
+    )
 
 
 @dataclass(frozen=True)

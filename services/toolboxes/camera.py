@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +12,7 @@ import numpy as np
 from scan2sim.pipeline.types import U8
 from scan2sim.services.monitoring.monitor import Monitor, ros
 from scan2sim.services.qos.encoding import jpeg
-from scan2sim.services.toolboxes import frames, sources
-from scan2sim.services.toolboxes.frames import Frame
+from scan2sim.services.toolboxes import sources
 from scan2sim.services.toolboxes.settings import COMPRESSED, IMAGE, CameraParams
 from scan2sim.services.transport import QoS
 
@@ -41,7 +39,8 @@ class CameraNode(Monitor):
         self._publisher = self.create_publisher(ros.message_type(kind), params.topic, IMAGES)
         self._newest: U8 | None = None
         self._reader = sources.Reader(params.images, self._keep) if live else None
-        self._shown = iter(()) if live else _images(Path(params.images), params.loop)
+        rounds = itertools.count() if params.loop else range(1)
+        self._shown = (image for _ in rounds for image in sources.images(Path(params.images)))
         if self._reader:
             self._reader.start()
         self.create_timer(1 / rate, self._send_next)
@@ -78,10 +77,3 @@ class CameraNode(Monitor):
         if self._reader:
             self._reader.stop()
         return super().destroy_node()
-
-
-def _images(path: Path, loop: bool) -> Iterator[U8]:
-    """(H, W, 3) RGB of a folder, a picture or a video, once or for ever."""
-    for _ in itertools.count() if loop else range(1):
-        for shot in sources.shots(path):
-            yield frames.rgb(Frame(shot.name, str(path), shot.stamp, shot.image, lambda _: None))

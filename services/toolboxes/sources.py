@@ -13,6 +13,7 @@ import numpy as np
 
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.types import U8
+from scan2sim.services.toolboxes import frames
 from scan2sim.services.toolboxes.engine import Engine
 from scan2sim.services.toolboxes.frames import Frame
 from scan2sim.services.toolboxes.results import Result
@@ -84,6 +85,16 @@ def shots(path: Path) -> Iterator[Shot]:
         number += 1
     if number == 0:
         raise InputError(path, "is no video that can be read", "Give a folder of pictures, a picture or a video")
+
+
+def images(path: Path) -> Iterator[U8]:
+    """(H, W, 3) RGB of all of them.
+
+    Raises:
+        InputError: there are none, or one can't be decoded.
+    """
+    for shot in shots(path):
+        yield frames.rgb(Frame(shot.name, str(path), shot.stamp, shot.image, lambda _: None))
 
 
 def _is_pictures(path: Path) -> bool:

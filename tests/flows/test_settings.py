@@ -25,6 +25,7 @@ from scan2sim.services.monitoring.kept import QueryParams
 from scan2sim.services.monitoring.shown import PageParams
 from scan2sim.services.monitoring.traffic import TrafficParams
 from scan2sim.services.monitoring.watched import DatasetParams, TalkerParams, TopicParams, WorkParams
+from scan2sim.services.qos.encoding import ChoiceParams
 from scan2sim.services.qos.measure import MeasureParams
 from scan2sim.services.toolboxes.boxes import classify, detect, movement, segment
 from scan2sim.services.toolboxes.settings import CameraParams, NodeParams, ServeParams
@@ -147,7 +148,7 @@ def test_every_number_that_a_command_takes_has_a_range() -> None:
     numbers = {name for of in hints for name, kind in of.items() if {int, float} & {kind, *get_args(kind)}}
     assert len(numbers) > 15 and numbers <= {
         name
-        for model in (Numbers, Filmed, CutParams, SweepsParams, MeasureParams, *bus, *boxes)
+        for model in (Numbers, Filmed, CutParams, SweepsParams, MeasureParams, ChoiceParams, *bus, *boxes)
         for name in model.model_fields
     }
 

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
+from typer.testing import CliRunner
 
+from scan2sim.flows.cli import app
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.types import U8
 from scan2sim.services.qos.encoding import (
@@ -77,3 +81,13 @@ def test_a_streams_pictures_come_back_in_order_and_better_for_more(images: list[
 def test_scales_and_qualities_make_less(images: list[U8]) -> None:
     assert scaled(images[0], 0.5).shape == (90, 160, 3) and scaled(images[0], 1.0) is images[0]
     assert len(jpeg(images[0], 30)) < len(jpeg(images[0], 80))
+
+
+def test_the_command_tells_both_choices(images: list[U8], tmp_path: Path) -> None:
+    pytest.importorskip("av", reason="the extra slam isn't installed")
+    for number, image in enumerate(images):
+        Image.fromarray(image).save(tmp_path / f"{number:02}.png")
+    told = CliRunner().invoke(app, ["qos", "choose", str(tmp_path), "--rate", str(RATE), "--budget", "1"])
+    assert told.exit_code == 0, told.output
+    chosen = choose_jpeg(images, RATE, 1.0)
+    assert f"quality {chosen.quality}" in told.output and "Mbit/s for the encoder" in told.output
