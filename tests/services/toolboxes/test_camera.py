@@ -62,6 +62,15 @@ def test_a_film_goes_round(start: Start, tmp_path: Path) -> None:
     assert np.allclose(levels, [20, 90, 160, 20, 90, 160, 20, 90], atol=6)
 
 
+def test_a_stream_is_sent_at_the_rate_that_is_asked_for(start: Start, tmp_path: Path) -> None:
+    listener = start("cyclone", Path(hearing.__file__), "/front", IMAGE, "5")
+    stream = film(tmp_path / "f.avi", [20, 90, 160]).as_uri()  # comes as fast as it is read, and again
+    start("cyclone", *COMMAND, "camera", stream, "/front", "--rate", "5", "--subscribers", "1")
+    heard = lines(listener)
+    assert all(min(abs(one["level"] - known) for known in (20, 90, 160)) <= 6 for one in heard)
+    assert np.median(np.diff([one["stamp"] for one in heard])) == pytest.approx(0.2, abs=0.08)
+
+
 def test_a_cameras_images_become_results(start: Start, folder: Path) -> None:
     listener = start("cyclone", Path(hearing.__file__), "/seen", STRING, "6")
     node = ("node", shaky.__name__, "--images", "/front", "--results", "/seen", "--compressed")
