@@ -77,6 +77,8 @@ class Spool:
     def __init__(self, path: Path, most_bytes: int = KEPT_BYTES) -> None:
         """Keep them in a file, which is made if it isn't there; what an earlier life left there is sent first.
 
+        Where it left any unsent, who took its last ones may have gone away, and forgotten them: they are sent again.
+
         Raises:
             BusyError: another process has it.
             InputError: there is something else in its place.
@@ -87,6 +89,8 @@ class Spool:
         shares = self._base.execute("SELECT share, sum(length(body)) FROM records GROUP BY share").fetchall()
         self._bytes = Counter(dict(shares))
         self.dropped = Counter[str]()
+        if len(self):
+            self.again()
 
     def append(self, record_id: str, body: bytes, share: str = "") -> None:
         """Keep a record."""

@@ -96,7 +96,8 @@ def test_the_bus_is_told_of_a_run(
         if len(runs) == 3 or time.monotonic() - began > 90:
             break
     count = len(steps)
-    assert runs == [(str(street), count - 1, 1), (str(street), count, 0), (str(street), count, 0)]
+    # each run's events are in order, runs may be read in any: a broker parts them
+    assert sorted(runs) == [(str(street), count - 1, 1), (str(street), count, 0), (str(street), count, 0)]
     assert set(steps.values()) == {"kept"} and "preview" in steps
 
 

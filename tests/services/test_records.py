@@ -111,6 +111,19 @@ def test_what_was_taken_by_one_who_went_away_is_sent_again(tmp_path: Path) -> No
 
 
 @pytest.mark.filterwarnings("error")
+def test_what_an_earlier_life_left_unsent_brings_what_it_had_sent_just_before_along(tmp_path: Path) -> None:
+    earlier = Spool(tmp_path / "spool")
+    earlier.append("a:1", b"taken by a broker")
+    earlier.done(earlier.first()[-1])
+    earlier.append("a:2", b"which was gone then")
+    earlier.close()
+    later = Spool(tmp_path / "spool")
+    assert [one.id for one in later.first()] == ["a:1", "a:2"]
+    later.done(later.first()[-1])
+    later.close()
+    assert len(Spool(tmp_path / "spool")) == 0
+
+
 def test_a_spool_that_is_closed_while_its_sender_waits_for_an_answer_ends_it(tmp_path: Path) -> None:
     sending, answered, spool = threading.Event(), threading.Event(), Spool(tmp_path / "records")
 
