@@ -193,10 +193,11 @@ def test_two_of_one_name_keep_apart_and_what_dead_ones_left_is_taken_over(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    running = [
-        subprocess.Popen([sys.executable, "-c", NAMED, name], stdout=subprocess.PIPE, text=True) for name in ("a", "b")
-    ]
-    assert [process.stdout.readline() for process in running if process.stdout] == ["1\n", "1\n"]
+    running = []
+    for name in ("a", "b"):  # one after the other: who looks into a file has it for that moment
+        process = subprocess.Popen([sys.executable, "-c", NAMED, name], stdout=subprocess.PIPE, text=True)
+        assert process.stdout and process.stdout.readline() == "1\n"
+        running.append(process)
     folder = tmp_path / "scan2sim" / "spools"
     assert folder.stat().st_mode & 0o777 == 0o700
     assert sorted(path.name for path in folder.glob("*.spool")) == [
