@@ -1,1 +1,1 @@
-"""Quality of service: links as they are in the field, made on one machine (docs/event-bus.md)."""
+"""Quality of service: what services require, and what networks and machines give (docs/toolboxes.md)."""

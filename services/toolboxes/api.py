@@ -36,7 +36,7 @@ IMAGES = 64
 """Of a request, at most."""
 ENCODED = ("image/jpeg", "image/png", "image/webp", "application/octet-stream")
 STATUS = {State.DONE: 200, State.DROPPED: 503, State.LATE: 504, State.REFUSED: 422, State.FAILED: 500}
-MASTER = "http"
+UNNAMED = "http"
 """Source of images whose sender names none."""
 
 Text = Annotated[str, Field(max_length=200)]
@@ -129,7 +129,7 @@ def _infer(app: FastAPI, engine: Engine) -> None:
         request: Request,
         content_type: Annotated[str, Header()] = "",
         frame_id: Annotated[str, Header(max_length=200)] = "",
-        source: Annotated[str, Header(max_length=200)] = MASTER,
+        source: Annotated[str, Header(max_length=200)] = UNNAMED,
         stamp: Annotated[int | None, Header(ge=0, lt=2**63)] = None,
     ) -> Response:
         """What the model says of images; an image alone may bring its `Frame-Id`, `Source` and `Stamp` as headers."""
@@ -153,7 +153,7 @@ def _infer(app: FastAPI, engine: Engine) -> None:
         images = [image for tensor in asked.inputs for image in _images(tensor)]
         if len(images) > IMAGES:
             raise SettingError("inputs", f"hold {len(images)} images", f"Send {IMAGES} at most")
-        source, name = str(asked.parameters.get("source", MASTER))[:200], asked.id or "image"
+        source, name = str(asked.parameters.get("source", UNNAMED))[:200], asked.id or "image"
         results = await _results(engine, [(f"{name}:{i}", source, None, image) for i, image in enumerate(images)])
         worst = max(results, key=lambda one: STATUS[one.state])
         output = {
