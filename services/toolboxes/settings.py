@@ -14,6 +14,16 @@ from scan2sim.services.served import Served
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 
 
+Batch = Annotated[int, Field(ge=1, le=256, description="Images that the model is given at once, at most.")]
+Waiting = Annotated[
+    int, Field(ge=1, le=10_000, description="Images of one source that wait; then its oldest are dropped.")
+]
+Deadline = Annotated[
+    float, Field(ge=0.01, le=3600, description="Seconds from an image's coming to its result; later ones are none.")
+]
+"""Settings whose defaults differ by toolbox."""
+
+
 class ToolboxParams(Params):
     """Of every toolbox."""
 
@@ -25,16 +35,12 @@ class ToolboxParams(Params):
     ] = None
     device: Annotated[Device, Field(description="auto, cpu, cuda, or cuda:1 for the second GPU.")] = "auto"
     threads: Annotated[int, Field(ge=0, le=1024, description="Threads of the model; 0: one a core.")] = 0
-    batch: Annotated[int, Field(ge=1, le=256, description="Images that the model is given at once, at most.")] = 1
+    batch: Batch = 1
     linger: Annotated[
         float, Field(ge=0, le=10, description="Seconds to wait for a batch to fill, once there is an image.")
     ] = 0.02
-    waiting: Annotated[
-        int, Field(ge=1, le=10_000, description="Images of one source that wait; then its oldest are dropped.")
-    ] = 2
-    deadline: Annotated[
-        float, Field(ge=0.01, le=3600, description="Seconds from an image's coming to its result; later ones are none.")
-    ] = 2.0
+    waiting: Waiting = 2
+    deadline: Deadline = 2.0
     hangs: Annotated[
         float, Field(ge=0.1, le=3600, description="Seconds without an answer after which the model is restarted.")
     ] = 60.0

