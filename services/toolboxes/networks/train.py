@@ -2,7 +2,7 @@
 
 `python -m scan2sim.services.toolboxes.networks.train FOLDER --out vehicles.onnx [--minutes 60] [--start WEIGHTS]`: from
 a folder as `labelled` reads it. Runs are repeatable for a seed, on one machine with one number of threads, unless a
-time limit cuts them short.
+time limit cuts them short. Every ten minutes the network is written as it is, to go on from with `--start`.
 """
 
 from __future__ import annotations
@@ -31,6 +31,9 @@ STREETS = STREET.with_suffix(".safetensors")
 """What the trunk starts from: the segmentation network, which has seen such pictures."""
 
 
+KEPT = 600.0
+"""Seconds between networks that are kept while training goes on."""
+
 View = tuple[F32, F32, F32]
 """See `labelled.seen`."""
 
@@ -56,8 +59,18 @@ class Recipe:
     seed: int = 0
 
 
-def train(folder: Path, recipe: Recipe, start: Path | None = STREETS, report: Report = silent) -> VehicleNet:
-    """Train on a folder's pictures; with the trunk, or all, of weights (safetensors) that fit."""
+def train(
+    folder: Path,
+    recipe: Recipe,
+    start: Path | None = STREETS,
+    report: Report = silent,
+    keep: Callable[[VehicleNet], None] | None = None,
+) -> VehicleNet:
+    """Train on a folder's pictures; with the trunk, or all, of weights (safetensors) that fit.
+
+    Args:
+        keep: given the network every `KEPT` seconds.
+    """
     torch.manual_seed(recipe.seed)
     rng = np.random.default_rng(recipe.seed)
     pictures, names = read(folder)
@@ -66,12 +79,14 @@ def train(folder: Path, recipe: Recipe, start: Path | None = STREETS, report: Re
         begin_with(network, start)
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimiser = torch.optim.AdamW(network.parameters(), recipe.rate, weight_decay=1e-2)
-    smooth = torch.optim.swa_utils.AveragedModel(network, avg_fn=averaged, use_buffers=True)
+    smooth = torch.optim.swa_utils.AveragedModel(network, avg_fn=averaged, use_buffers=True).eval()
+    best = smooth.module
+    assert isinstance(best, VehicleNet)
     network.train()
     for early in (network.stem, network.stages[0]):  # they have learnt edges, and cost most
         early.requires_grad_(start is None).train(start is None)
     _mixed(network)
-    begin, done, step = time.monotonic(), 0.0, 0
+    begin, done, step, kept = time.monotonic(), 0.0, 0, 0
     views = _ahead(partial(_views, pictures, recipe, rng))
     while done < 1:
         spent = (time.monotonic() - begin) / 60
@@ -88,9 +103,10 @@ def train(folder: Path, recipe: Recipe, start: Path | None = STREETS, report: Re
         step += 1
         told = ", ".join(f"{name} {value.item():.3f}" for name, value in losses.items())
         report(min(done, 0.99), f"step {step}, {told}, {60 * spent:.0f} s")
-    best = smooth.module
-    assert isinstance(best, VehicleNet)
-    return best.eval()
+        if keep is not None and 60 * spent > KEPT * (kept + 1):
+            kept += 1
+            keep(best)
+    return best
 
 
 def _views(pictures: list[Labelled], recipe: Recipe, rng: np.random.Generator) -> list[View]:
@@ -160,9 +176,12 @@ def main() -> None:
     def report(fraction: float, message: str = "") -> None:
         print(f"\r{fraction:6.1%}  {message:70}", end="", flush=True)
 
-    network = train(a.folder, recipe, a.start, report)
     names = json.loads((a.folder / "classes.json").read_text(encoding="utf-8"))
-    export(network, a.out, names, {"recipe": asdict(recipe)})
+
+    def keep(network: VehicleNet) -> None:
+        export(network, a.out, names, {"recipe": asdict(recipe)})
+
+    keep(train(a.folder, recipe, a.start, report, keep))
     print(f"\n{a.out}")
 
 
