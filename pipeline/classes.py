@@ -59,6 +59,11 @@ CLASSES: tuple[PointClass, ...] = (
     PointClass(69, "sidewalk", "terrain", (200, 180, 190)),
 )
 CODE: dict[str, int] = {c.name: c.code for c in CLASSES}
+CODE_OF_SURFACE: dict[str, int] = {
+    "terrain": CODE["terrain"], "building": CODE["building"], "vegetation": CODE["high_vegetation"],
+    "vehicle": CODE["vehicle"],
+}  # fmt: skip
+"""The label of a surface's faces that have no class of their own."""
 OTHER_NAMES = {"ground": 2, "vegetation": 5, "noise": 7, "bridge": 17, "sign": 64, "car": 66, "wall": 68, "fence": 68}
 SHOWN = (
     "road", "sidewalk", "terrain", "building", "road_sign", "pole", "low_vegetation", "high_vegetation", "vehicle",

@@ -19,7 +19,7 @@ import pytest
 from scan2sim.pipeline import backends, decimation
 from scan2sim.pipeline.errors import SettingError, UnavailableError
 from scan2sim.pipeline.extras import EXTRA_OF
-from scan2sim.pipeline.io import clouds, decoders, gps, meshes, models
+from scan2sim.pipeline.io import clouds, decoders, gps, meshes, models, scenes
 from scan2sim.pipeline.types import Camera
 from scan2sim.segmentation import backends as networks
 from scan2sim.services.qos import links
@@ -37,7 +37,8 @@ PROTOCOLS: dict[ModuleType, tuple[type, ...]] = {
     models: (models.Program,),
     gps: (gps.Format,),
     decoders: (decoders.Decoder,),
-    meshes: (meshes.ModelFormat, meshes.WorldFormat),
+    meshes: (meshes.ModelFormat,),
+    scenes: (scenes.Format,),
     decimation: (decimation.Backend,),
     links: (links.Backend,),
 }
@@ -183,7 +184,7 @@ def write(path, surface, names):
 """)  # fmt: skip
     import trimesh
 
-    world = made_up.world(tmp_path, formats=("obj", "off")).files["world"]
+    world = made_up.world(tmp_path, meshes=("obj", "off")).files["world"]
     folder = world / "models" / "street" / "meshes"
     assert len(trimesh.load_mesh(folder / "terrain.off", process=False).faces) == len(made_up.ground())
     assert (folder / "terrain.obj").is_file() and not (folder / "terrain.dae").exists()

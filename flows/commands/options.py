@@ -66,6 +66,8 @@ def _plain(kind: Any) -> Any:
     parts = get_args(kind)
     if get_origin(kind) is list:
         return list[_plain(parts[0])]  # type: ignore[misc]
+    if get_origin(kind) is tuple and parts[-1] is Ellipsis:
+        return list[_plain(parts[0])]  # type: ignore[misc]
     if get_origin(kind) is tuple:
         return tuple[tuple(_plain(part) for part in parts)]  # type: ignore[misc]
     if parts and type(None) in parts:

@@ -12,9 +12,14 @@ from typing import Literal
 from scan2sim.pipeline.errors import InputError, SettingError, from_os_error
 from scan2sim.pipeline.io import files
 
+MARK = {"tile": "tile.toml", "survey": "survey.toml", "world": "metadata.json"}
+"""Of what is made, the file by which it is known."""
+
 
 @contextmanager
-def tile_folder(out: Path, overwrite: bool = False, kind: Literal["tile", "survey"] = "tile") -> Iterator[Path]:
+def tile_folder(
+    out: Path, overwrite: bool = False, kind: Literal["tile", "survey", "world"] = "tile"
+) -> Iterator[Path]:
     """A temporary folder beside `out` that takes its place when the block ends well, and is removed otherwise.
 
     Args:
@@ -31,7 +36,7 @@ def tile_folder(out: Path, overwrite: bool = False, kind: Literal["tile", "surve
         raise SettingError(out, "is a file, not a folder", "Name another folder")
     if out.is_dir() and any(out.iterdir()) and not overwrite:
         raise SettingError(out, "exists and is not empty", "Name a new folder, or have it overwritten: --overwrite")
-    if out.is_dir() and any(out.iterdir()) and not (out / f"{kind}.toml").is_file():
+    if out.is_dir() and any(out.iterdir()) and not (out / MARK[kind]).is_file():
         raise SettingError(out, f"is no {kind}, and is not overwritten", f"Name a new folder, or a {kind}'s")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)

@@ -25,16 +25,15 @@ from math import degrees
 from pathlib import Path
 from xml.sax.saxutils import escape
 
-from scan2sim.pipeline.classes import CODE
 from scan2sim.pipeline.io import crs
 from scan2sim.pipeline.types import Frame
 
-LABEL = {
-    "terrain": CODE["terrain"], "building": CODE["building"], "vegetation": CODE["high_vegetation"],
-    "vehicle": CODE["vehicle"],
-}  # fmt: skip
 HEADROOM = 500.0
 """Metres that a level reaches above and below its tile: whatever flies over it sees it."""
+BUFFER = 20.0
+"""Metres around a tile within which a performer has it loaded."""
+PERFORMER = "robot"
+"""Name of the model that levels are loaded for."""
 Vector = tuple[float, float, float]
 
 
@@ -129,17 +128,17 @@ def write_levels(
     )
 
 
-def write_model(folder: Path, name: str, visuals: Mapping[str, str], collision: str, friction: float) -> None:
+def write_model(folder: Path, name: str, visuals: Mapping[str, int], collision: str, friction: float) -> None:
     """Write `model.sdf` and `model.config` of a static model.
 
     Args:
         folder: of the model.
         name: of the model; its meshes are found as `model://<name>/...`.
-        visuals: path of every visual mesh, relative to `folder`, to its group.
+        visuals: path of every visual mesh, relative to `folder`, to its label.
         collision: path of the collision mesh, relative to `folder`.
         friction: Coulomb friction coefficient of all surfaces.
     """
-    shown = "".join(_visual(name, mesh, group) for mesh, group in visuals.items())
+    shown = "".join(_visual(name, mesh, label) for mesh, label in visuals.items())
     (folder / "model.sdf").write_text(
         f"""<?xml version="1.0"?>
 <sdf version="1.9">
@@ -250,14 +249,14 @@ def _level(tile: Placed, buffer: float) -> str:
 """
 
 
-def _visual(name: str, mesh: str, group: str) -> str:
+def _visual(name: str, mesh: str, label: int) -> str:
     return f"""      <visual name="{Path(mesh).stem}">
         <cast_shadows>false</cast_shadows>
         <geometry>
           <mesh><uri>model://{name}/{mesh}</uri></mesh>
         </geometry>
         <plugin filename="gz-sim-label-system" name="gz::sim::systems::Label">
-          <label>{LABEL[group]}</label>
+          <label>{label}</label>
         </plugin>
       </visual>
 """

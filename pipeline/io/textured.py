@@ -30,6 +30,12 @@ class Textured:
         return len(self.mesh)
 
     @property
+    def seen(self) -> tuple[Path, ...]:
+        """Image of every page that says of each texel where its colour is from, where there is one."""
+        masks = (page.with_name(f"{page.stem}_seen.png") for page in self.pages)
+        return tuple(mask for mask in masks if mask.is_file())
+
+    @property
     def used_pages(self) -> list[int]:
         """The pages that a face lies on, ascending."""
         assert self.mesh.page is not None

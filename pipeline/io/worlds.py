@@ -18,13 +18,13 @@ from typing import Any
 import numpy as np
 
 from scan2sim.pipeline.errors import DataError, InputError, from_os_error
-from scan2sim.pipeline.io import crs, sdf
+from scan2sim.pipeline.io import crs, scene, sdf
 from scan2sim.pipeline.types import Frame
 
 EDITED = (".sdf", ".config", ".json", ".mtl", ".geojson", ".csv")
 """Suffixes of what users change by hand: copied, never linked."""
 STAMP = ".result"
-VERSION = 1
+VERSION = 2
 """Of what is written: another one makes worlds anew."""
 
 
@@ -47,20 +47,26 @@ class TileWorld:
         """Folder of the tile's model."""
         return self.world / "models" / self.name
 
+    @property
+    def files(self) -> list[Path]:
+        """All files of the tile that go into the survey's world, relative to both worlds."""
+        folders = (self.model, self.world / scene.FOLDER / self.name)
+        return sorted(p.relative_to(self.world) for folder in folders for p in folder.rglob("*") if p.is_file())
+
 
 def assemble(
     out: Path,
     name: str,
     tiles: Sequence[TileWorld],
     *,
-    buffer: float = 20.0,
-    performer: str = "robot",
+    buffer: float = sdf.BUFFER,
+    performer: str = sdf.PERFORMER,
     warn: Callable[[str], None] = lambda _: None,
 ) -> Path:
     """Put the worlds of all tiles into one, `out/world/`, unless it is there and nothing has changed.
 
-    Layout: `<name>.sdf`, `metadata.json`, and `models/<tile>/` of every tile. The world's origin is that of the
-    tile in the middle. An earlier world stays until the new one is complete.
+    Layout: `<name>.sdf`, `metadata.json`, `models/<tile>/` of every tile, and `scene/`, to export from. The
+    world's origin is that of the tile in the middle. An earlier world stays until the new one is complete.
 
     Args:
         name: of the world.
@@ -79,7 +85,7 @@ def assemble(
     if not tiles:
         raise DataError(name, "no tile of the survey has a world", "See in its report why they failed")
     _check(tiles)
-    files = {tile.name: _files(tile.model) for tile in tiles}
+    files = {tile.name: tile.files for tile in tiles}
     world = out / "world"
     stamp = _stamp(name, tiles, files, buffer, performer)
     if not _is_current(world, stamp, tiles, files):
@@ -137,9 +143,9 @@ def _check(tiles: Sequence[TileWorld]) -> None:
     first = tiles[0]
     names = set[str]()
     for tile in tiles:
-        for file in (tile.world / "metadata.json", tile.model / "model.sdf"):
+        for file in (tile.world / "metadata.json", tile.model / "model.sdf", tile.world / scene.FOLDER / scene.ABOUT):
             if not file.is_file():
-                raise InputError(file, "is missing", "Make the tile's world again, with export.gazebo=true")
+                raise InputError(file, "is missing", 'Make the tile\'s world again, with "gazebo" in export.formats')
         if tile.name in names:
             raise InputError(tile.world, f"is a second tile of the name {tile.name}", "Give each tile its own name")
         if not _same_system(tile.frame, first.frame):
@@ -160,16 +166,11 @@ def _same_system(a: Frame, b: Frame) -> bool:
     return a.unit == b.unit and name.startswith("EPSG:") and name == crs.name(b.crs)
 
 
-def _files(model: Path) -> list[Path]:
-    """All files of a model, relative to it."""
-    return sorted(path.relative_to(model) for path in model.rglob("*") if path.is_file())
-
-
 def _stamp(name: str, tiles: Sequence[TileWorld], files: dict[str, list[Path]], buffer: float, performer: str) -> str:
     """A digest of everything the world is made from; of files, their sizes and times of change."""
     parts: list[Any] = [VERSION, name, buffer, performer]
     for tile in tiles:
-        paths = [tile.world / "metadata.json", *(tile.model / file for file in files[tile.name])]
+        paths = [tile.world / "metadata.json", *(tile.world / file for file in files[tile.name])]
         stats = [(path.relative_to(tile.world).as_posix(), path.stat()) for path in paths]
         parts += [tile.name, asdict(tile.frame), [(path, s.st_size, s.st_mtime_ns) for path, s in stats]]
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
@@ -181,7 +182,7 @@ def _is_current(world: Path, stamp: str, tiles: Sequence[TileWorld], files: dict
         same = (world / STAMP).read_text(errors="replace") == stamp
     except OSError:
         return False
-    pairs = [(tile.model / file, world / "models" / tile.name / file) for tile in tiles for file in files[tile.name]]
+    pairs = [(tile.world / file, world / file) for tile in tiles for file in files[tile.name]]
     return same and all(same_unless_edited(file, copy) for file, copy in pairs)
 
 
@@ -198,7 +199,9 @@ def _write(folder: Path, name: str, tiles: Sequence[TileWorld], buffer: float, p
     metadata = {tile.name: _metadata(tile.world / "metadata.json") for tile in tiles}
     placed = [_place(tile, metadata[tile.name], origin) for tile in tiles]
     for tile in tiles:
-        shutil.copytree(tile.model, folder / "models" / tile.name, copy_function=link)
+        for kept in (Path("models") / tile.name, Path(scene.FOLDER) / tile.name):
+            shutil.copytree(tile.world / kept, folder / kept, copy_function=link)
+    scene.describe(folder, name, Frame(first.crs, origin, first.unit), [tile.name for tile in tiles])
     sdf.write_levels(folder / f"{name}.sdf", name, place, placed, buffer, performer)
     about = {
         "name": name,
@@ -218,7 +221,7 @@ def _write(folder: Path, name: str, tiles: Sequence[TileWorld], buffer: float, p
             }
             for tile, model in zip(tiles, placed, strict=True)
         },
-        "triangles_by_file": {k: v for one in metadata.values() for k, v in one["triangles_by_file"].items()},
+        "triangles_by_file": {file: n for one in metadata.values() for file, n in _of_models(one).items()},
     }
     (folder / "metadata.json").write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
 
@@ -228,6 +231,11 @@ def _metadata(path: Path) -> dict[str, Any]:
         return dict(json.loads(path.read_text(encoding="utf-8")))
     except ValueError as error:
         raise InputError(path, f"is not valid JSON ({error})", "Mend it, or make the tile's world again") from None
+
+
+def _of_models(metadata: dict[str, Any]) -> dict[str, int]:
+    """Triangles of the mesh files of a tile's model: the others stay with the tile."""
+    return {file: n for file, n in metadata["triangles_by_file"].items() if file.startswith("models/")}
 
 
 def _origin(tiles: Sequence[TileWorld]) -> sdf.Vector:

@@ -42,8 +42,8 @@ def preview(inputs: Inputs, params: PreviewParams, out: Path, report: Report) ->
     the report's first picture.
     """
     from scan2sim.pipeline import render
-    from scan2sim.pipeline.io import textured
-    from scan2sim.pipeline.io.meshes.glb import write_world
+    from scan2sim.pipeline.io import glb, textured
+    from scan2sim.pipeline.io.scene import whole
 
     read = {group: textured.read(inputs[group]) for group in SURFACES if group in inputs}
     surfaces: dict[str, Textured] = {group: surface for group, surface in read.items() if surface is not None}
@@ -53,12 +53,13 @@ def preview(inputs: Inputs, params: PreviewParams, out: Path, report: Report) ->
     scale = min(1.0, (params.megapixels * 1e6 / _texels(surfaces)) ** 0.5)
     folder = out / "preview"
     folder.mkdir()
-    glb = out / "world.glb"
-    write_world(glb, surfaces, params.jpeg_quality, scale=scale, normals=False)
+    packed = out / "world.glb"
+    shown = [whole(group, surface) for group, surface in surfaces.items()]
+    glb.write(packed, shown, params.jpeg_quality, scale=scale, normals=False)
     report(0.7, "eyes")
     script = folder / "world.js"
-    script.write_bytes(CALL + b'("' + base64.b64encode(glb.read_bytes()) + b'");\n')
-    glb.unlink()
+    script.write_bytes(CALL + b'("' + base64.b64encode(packed.read_bytes()) + b'");\n')
+    packed.unlink()
     path = Trajectory.load(inputs["path"]).positions if "path" in inputs else np.zeros((0, 3))
     driven = len(path) > 1
     points = np.concatenate([surface.mesh.vertices for surface in surfaces.values()])

@@ -14,6 +14,7 @@ from scan2sim.flows.recipes.settings import Settings
 from scan2sim.flows.recipes.steps import STEPS
 from scan2sim.pipeline.corridor import CutParams
 from scan2sim.pipeline.errors import SettingError
+from scan2sim.pipeline.io.scenes import SceneParams
 from scan2sim.pipeline.ranges import described
 from scan2sim.pipeline.step import Params
 from scan2sim.pipeline.steps.decimate import DECIMATE
@@ -148,7 +149,7 @@ def test_every_number_that_a_command_takes_has_a_range() -> None:
     numbers = {name for of in hints for name, kind in of.items() if {int, float} & {kind, *get_args(kind)}}
     assert len(numbers) > 15 and numbers <= {
         name
-        for model in (Numbers, Filmed, CutParams, SweepsParams, MeasureParams, ChoiceParams, *bus, *boxes)
+        for model in (Numbers, Filmed, CutParams, SceneParams, SweepsParams, MeasureParams, ChoiceParams, *bus, *boxes)
         for name in model.model_fields
     }
 

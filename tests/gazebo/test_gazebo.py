@@ -68,7 +68,7 @@ def test_a_tile_away_from_the_worlds_origin(tmp_path: Path) -> None:
 
 
 def test_a_split_local_world_with_collada_visuals(tmp_path: Path) -> None:
-    done = made_up.world(tmp_path, frame=Frame(), formats=("collada",), max_visual_triangles=1000)
+    done = made_up.world(tmp_path, frame=Frame(), meshes=("collada",), max_visual_triangles=1000)
     seen = check_world(done.files["world"] / "street.sdf", (0, 0, 2))
     assert seen["spherical"] is None
     assert sum(mesh["triangles"] for mesh in seen["meshes"] if "terrain" in mesh["file"]) == 3200

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
+from scan2sim.pipeline.classes import CODE
+from scan2sim.pipeline.io import geojson
+from scan2sim.pipeline.io.scene import Scene, describe, keep, read_scene
 from scan2sim.pipeline.step import Done, silent
 from scan2sim.pipeline.steps.collision import COLLISION, CollisionParams
 from scan2sim.pipeline.steps.export import EXPORT, ExportParams
@@ -92,3 +96,24 @@ def by_page(mesh: Mesh) -> dict[int, tuple[np.ndarray, np.ndarray]]:
     """Page to the corners (F, 3, 3) and texture coordinates (F, 3, 2) of its faces, in order."""
     assert mesh.uv is not None and mesh.page is not None
     return {int(p): (mesh.corners[mesh.page == p], mesh.uv[mesh.page == p]) for p in np.unique(mesh.page)}
+
+
+def scene(folder: Path, frame: Frame = UTM, tiles: int = 2) -> Scene:
+    """Tiles in a row, eastwards, around the first one's origin: ground, a house whose roof is labelled as a sign."""
+    world, names = folder / "world", []
+    for i in range(tiles):
+        x, y, z = frame.origin
+        here = replace(frame, origin=(x + 25.0 * i, y + 3.0 * i, z - i))
+        roof = np.where(house().page == 1, CODE["road_sign"], 0).astype(np.uint8)
+        meshes = {"terrain": ground(10, here), "building": replace(house(here), classification=roof)}
+        sources = {group: textured(folder / f"tile{i}" / group, mesh) for group, mesh in meshes.items()}
+        solid = folder / f"tile{i}" / "collision.npz"
+        replace(ground(10, here), uv=None, page=None).save(solid)
+        lists = folder / f"tile{i}" / "furniture.geojson"
+        place = tuple(here.to_crs((-5.0, -5.0, float(height(np.array(-5.0), np.array(-5.0))))).tolist())
+        about = {"kind": "pole", "height_m": 4.0, "radius_m": 0.1}
+        geojson.write_points(lists, frame.crs, [(place, about)])
+        keep(world, f"tile{i}", sources, solid, {"furniture.geojson": lists}, 0.8)
+        names.append(f"tile{i}")
+    describe(world, "town", frame, names)
+    return read_scene(world)

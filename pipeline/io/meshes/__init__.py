@@ -1,12 +1,10 @@
-"""Formats that worlds are exported in: a file a format (`pipeline.backends`), named in `export.formats`.
+"""Formats of the meshes in Gazebo's models: a file a format (`pipeline.backends`), named in `export.meshes`.
 
-A format's module has `SUFFIX`, and either `write` (files for each class of the model, its texture pages beside them) or
-`write_world` (one file of all).
+A format's module has `SUFFIX` and `write`: a file for each class, its texture pages beside it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
@@ -43,16 +41,3 @@ class ModelFormat(Protocol):
 
     def write(self, path: Path, surface: Textured, names: PageNames) -> None:
         """Write a class, or a part of it: local metres, z up."""
-
-
-class WorldFormat(Protocol):
-    """Of one file for all classes.
-
-    Attributes:
-        SUFFIX: of it, with its dot.
-    """
-
-    SUFFIX: str
-
-    def write_world(self, path: Path, surfaces: Mapping[str, Textured], jpeg_quality: int) -> None:
-        """Write all classes, local metres."""

@@ -9,18 +9,18 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from scan2sim.pipeline.io import textured
-from scan2sim.pipeline.io.meshes.glb import write_world
+from scan2sim.pipeline.io import glb, textured
+from scan2sim.pipeline.io.scene import whole
 from tests.pipeline import made_up
 from tests.present import present
 
 
 def _write(folder: Path) -> Path:
-    surfaces = {
-        group: present(textured.read(made_up.textured(folder / group, mesh)))
+    surfaces = [
+        whole(group, present(textured.read(made_up.textured(folder / group, mesh))))
         for group, mesh in {"terrain": made_up.ground(), "building": made_up.house()}.items()
-    }
-    write_world(folder / "a.glb", surfaces)
+    ]
+    glb.write(folder / "a.glb", surfaces)
     return folder / "a.glb"
 
 

@@ -37,9 +37,14 @@ def test_layout(tmp_path: Path) -> None:
         for group in ("terrain", "building")
         for end in (".obj", ".mtl", ".dae", "_0.png", "_1.png")
     }
+    kept = ("mesh.npz", "page_0.png", "page_1.png", "page_0_seen.png", "page_1_seen.png")
     assert _files(world) == groups | {
         "street.sdf",
         "street.glb",
+        "scene/scene.json",
+        "scene/street/tile.json",
+        "scene/street/collision.npz",
+        *(f"scene/street/{group}/{file}" for group in ("terrain", "building") for file in kept),
         "metadata.json",
         "models/street/model.sdf",
         "models/street/model.config",
@@ -108,11 +113,11 @@ def test_a_local_tile_has_no_georeference(tmp_path: Path) -> None:
 
 
 def test_formats_are_chosen(tmp_path: Path) -> None:
-    world = made_up.world(tmp_path, formats=("collada",)).files["world"]
+    world = made_up.world(tmp_path, formats=("gazebo",), meshes=("collada",)).files["world"]
     assert not list(world.rglob("*.glb")) and [p.name for p in world.rglob("*.obj")] == ["collision.obj"]
     assert "terrain.dae" in (world / "models/street/model.sdf").read_text()
-    with pytest.raises(SettingError, match=r"export.formats: has nothing that Gazebo shows"):
-        EXPORT.run({}, ExportParams(formats=("glb",)), tmp_path, silent)
+    with pytest.raises(SettingError, match=r"export.meshes: has nothing that Gazebo shows"):
+        EXPORT.run({}, ExportParams(meshes=()), tmp_path, silent)
 
 
 def test_an_empty_group_is_left_out_and_nothing_at_all_is_refused(tmp_path: Path) -> None:

@@ -2,32 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.io.textured import Textured, unique_uv
+from scan2sim.pipeline.io.scene import Surface, Vector
+from scan2sim.pipeline.io.textured import unique_uv
 
-SUFFIX = ".glb"
 
-
-def write_world(
+def write(
     path: Path,
-    surfaces: Mapping[str, Textured],
+    surfaces: Sequence[Surface],
     jpeg_quality: int = 90,
     *,
+    offset: Vector = (0.0, 0.0, 0.0),
     scale: float = 1.0,
     normals: bool = True,
 ) -> None:
-    """Write all surfaces into one file, a mesh with one primitive for every page.
+    """Write surfaces into one file, each page's faces of each as a mesh of its own, its class among its `extras`.
 
     Local metres, turned from z-up to glTF's y-up: (x, y, z) becomes (x, z, -y). Materials are matt
     (metallic 0, roughness 1) and single-sided. Pages are read and packed one at a time.
 
     Args:
+        offset: of the nodes, metres, z up.
         scale: of the pages' sides.
         normals: False leaves them out, for viewers that show textures in their own light.
     """
@@ -37,11 +38,13 @@ def write_world(
 
     scene = trimesh.Scene()
     images: dict[str, Path] = {}
-    for group, surface in surfaces.items():
-        for page in surface.used_pages:
-            name = f"{group}_{page}"
-            images[name] = surface.pages[page]
-            part = surface.on_page(page)
+    place = np.eye(4)
+    place[:3, 3] = _y_up(np.array([offset]))[0]
+    for surface in surfaces:
+        for page in surface.shape.used_pages:
+            name = f"{surface.group}_{page}"
+            images[name] = surface.shape.pages[page]
+            part = surface.shape.on_page(page)
             assert part.mesh.uv is not None
             uv, corner_uv = unique_uv(part.mesh.uv)
             # glTF has one index for all: a vertex is said again for each of its texture coordinates
@@ -54,16 +57,22 @@ def write_world(
                 vertex_normals=_y_up(part.normal)[vertex],
                 visual=TextureVisuals(uv=uv[coordinate], material=material),
                 process=False,
+                metadata={"class": surface.label, "las_code": surface.code},
             )
-            scene.add_geometry(mesh, node_name=name, geom_name=name)
+            called = f"{surface.name}_{page}"
+            scene.add_geometry(mesh, node_name=called, geom_name=called, transform=place)
 
     def embed(buffers: dict[str, bytes], tree: dict[str, Any]) -> None:
+        textures: dict[str, int] = {}  # several classes may lie on one page
         for material in tree["materials"]:
-            data = _jpeg(images[material["name"]], jpeg_quality, scale)
-            buffers[material["name"]] = data + b"\0" * (-len(data) % 4)
-            tree["images"].append({"name": material["name"], "bufferView": len(buffers) - 1, "mimeType": "image/jpeg"})
-            tree["textures"].append({"source": len(tree["images"]) - 1})
-            material["pbrMetallicRoughness"]["baseColorTexture"] = {"index": len(tree["textures"]) - 1}
+            name = material["name"]
+            if name not in textures:
+                data = _jpeg(images[name], jpeg_quality, scale)
+                buffers[name] = data + b"\0" * (-len(data) % 4)
+                tree["images"].append({"name": name, "bufferView": len(buffers) - 1, "mimeType": "image/jpeg"})
+                tree["textures"].append({"source": len(tree["images"]) - 1})
+                textures[name] = len(tree["textures"]) - 1
+            material["pbrMetallicRoughness"]["baseColorTexture"] = {"index": textures[name]}
 
     path.write_bytes(scene.export(file_type="glb", include_normals=normals, buffer_postprocessor=embed))
 

@@ -1,0 +1,136 @@
+"""Formats that worlds are exported in: a file a format (`pipeline.backends`), named in `export.formats` and `--to`.
+
+A format's module has `write`. All files and folders that it makes have ASCII names, and name each other relatively.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+from pydantic import Field
+
+from scan2sim.pipeline.backends import find, names
+from scan2sim.pipeline.errors import SettingError
+from scan2sim.pipeline.io import image, sdf
+from scan2sim.pipeline.io.files import make_folder
+from scan2sim.pipeline.io.meshes import PageNames
+from scan2sim.pipeline.io.scene import Scene
+from scan2sim.pipeline.io.textured import Textured
+from scan2sim.pipeline.step import Params, Report
+
+PACKAGE = "scan2sim.pipeline.io.scenes"
+SHOWN = ("obj", "collada")
+"""Formats that Gazebo's model shows, the better one first."""
+
+
+class SceneParams(Params):
+    """How a scene is written.
+
+    Attributes:
+        meshes: formats of the meshes in Gazebo's model, files of `pipeline/io/meshes`; it shows the OBJ, which Gazebo
+            reads several times faster than Collada, or Collada where there is no OBJ.
+        max_visual_triangles: of one mesh that is shown; larger surfaces are written in parts.
+        pages: "png", lossless, or "jpeg", a sixth or so of its size, for texture pages that are files of their own.
+        jpeg_quality: of the GLB's textures, and of JPEG pages.
+    """
+
+    meshes: tuple[str, ...] = Field(
+        SHOWN, description="Formats of the meshes in Gazebo's model.", json_schema_extra={"range": "a list of formats"}
+    )
+    max_visual_triangles: int = Field(
+        200_000, ge=1_000, le=10_000_000, description="Of one mesh that is shown; larger surfaces come in parts."
+    )
+    pages: Literal["png", "jpeg"] = Field("png", description="Texture pages that are files: lossless, or a sixth.")
+    jpeg_quality: int = Field(90, ge=1, le=100, description="Of the GLB's textures, and of JPEG pages.")
+
+
+class Format(Protocol):
+    """Of whole scenes."""
+
+    def write(self, scene: Scene, folder: Path, params: SceneParams, report: Report) -> dict[str, int]:
+        """Write a scene below `folder`; returns the triangles of every mesh file, by its path there."""
+
+
+def known() -> list[str]:
+    """Names of all formats."""
+    return names(PACKAGE)
+
+
+def check(formats: Sequence[str], params: SceneParams, setting: str) -> None:
+    """Refuse formats that there aren't, or that can't be written here.
+
+    Raises:
+        SettingError: there is no such format, or nothing that Gazebo shows. UnavailableError: a package is missing.
+    """
+    for name in formats:
+        find(PACKAGE, name, setting)
+    for name in params.meshes:
+        find("scan2sim.pipeline.io.meshes", name, "export.meshes")
+    if "gazebo" in formats and not set(SHOWN) & set(params.meshes):
+        raise SettingError("export.meshes", f"has nothing that Gazebo shows ({' or '.join(SHOWN)})", "Name one, too")
+
+
+def write(scene: Scene, formats: Sequence[str], folder: Path, params: SceneParams, report: Report) -> None:
+    """Write a scene in some formats below `folder`, its lists and `metadata.json` beside them.
+
+    Raises:
+        ScanError: as `check`, before anything is written.
+    """
+    check(formats, params, "export.formats")
+    make_folder(folder)
+    triangles: dict[str, int] = {}
+    for i, name in enumerate(formats):
+
+        def part(fraction: float, message: str = "", begun: int = i, what: str = name) -> None:
+            report((begun + fraction) / len(formats), f"{what} {message}".strip())
+
+        triangles |= find(PACKAGE, name, "export.formats").write(scene, folder, params, part)
+    for tile in scene.tiles:
+        for file, path in tile.lists.items():
+            shutil.copyfile(path, folder / (file if len(scene.tiles) == 1 else f"{tile.name}_{file}"))
+    text = json.dumps(metadata(scene, triangles), indent=2)
+    (folder / "metadata.json").write_text(text + "\n", encoding="utf-8")
+
+
+def metadata(scene: Scene, triangles: dict[str, int]) -> dict[str, Any]:
+    """What a reader needs to put a scene back on the map, and to check that it is whole."""
+    place = sdf.Georeference.of(scene.frame)
+    about = {"name": scene.name, "crs": scene.frame.crs, "unit_m": scene.frame.unit}
+    whole = {
+        "world_origin_m": list(scene.origin),
+        "wgs84": place and place.facts(),
+        "friction": scene.tiles[0].friction,
+        "triangles_by_file": triangles,
+    }
+    if len(scene.tiles) == 1:
+        tile = scene.tiles[0]
+        here = "crs = (local + origin_m) / unit_m; OBJ and Collada are local, z-up; GLB is local, y-up (x, z, -y)"
+        return {**about, "origin_m": list(tile.frame.origin), "to_crs": here, "groups": dict(tile.groups), **whole}
+    tiles = {
+        tile.name: {
+            "origin_m": list(tile.frame.origin),
+            "offset_m": list(tile.offset),
+            "low_m": list(tile.low),
+            "high_m": list(tile.high),
+        }
+        for tile in scene.tiles
+    }
+    here = "crs = (world + world_origin_m) / unit_m; world = local + offset_m, local as in a tile's meshes"
+    return {**about, "to_crs": here, "tiles": tiles, **whole}
+
+
+def write_pages(folder: Path, group: str, shape: Textured, params: SceneParams) -> PageNames:
+    """Put a group's texture pages into `folder`; returns what they are called."""
+    make_folder(folder)
+    materials = tuple(f"{group}_{page}" for page in range(len(shape.pages)))
+    images = tuple(f"{name}.{'png' if params.pages == 'png' else 'jpg'}" for name in materials)
+    for page in shape.used_pages:
+        if params.pages == "png":
+            shutil.copyfile(shape.pages[page], folder / images[page])  # may be edited freely
+        else:
+            image.write(folder / images[page], image.read_rgb(shape.pages[page]), quality=params.jpeg_quality)
+    return PageNames(group, materials, images, tuple(shape.used_pages))

@@ -1,0 +1,62 @@
+"""`scan2sim export`: a finished world in other formats, and what it refuses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from scan2sim.flows.cli import app
+from scan2sim.pipeline.errors import InputError, SettingError
+from scan2sim.pipeline.io import scenes
+from scan2sim.pipeline.types import Frame
+from tests.pipeline import made_up
+
+
+def run(*words: object) -> str:
+    done = CliRunner().invoke(app, ["export", *map(str, words)])
+    if done.exception is not None:
+        raise done.exception
+    return done.output
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_it_writes_what_the_pipeline_writes(tmp_path: Path) -> None:
+    world = made_up.world(tmp_path).files["world"]
+    run(world, "--to", "gazebo,glb", "--out", tmp_path / "out")
+    own = {name: data for name, data in files(world).items() if not name.startswith("scene/")}
+    assert files(tmp_path / "out") == own
+
+
+def test_what_is_there_is_never_destroyed(tmp_path: Path) -> None:
+    world = made_up.world(tmp_path).files["world"]
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "mine.txt").write_text("mine")
+    for more in ((), ("--overwrite",)):
+        with pytest.raises(SettingError, match="not empty|is no world"):
+            run(world, "--to", "glb", "--out", out, *more)
+    assert files(out) == {"mine.txt": b"mine"}
+    run(world, "--to", "glb", "--out", tmp_path / "new")
+    run(world, "--to", "gazebo", "--out", tmp_path / "new", "--overwrite")
+    assert (tmp_path / "new" / "street.sdf").is_file() and not (tmp_path / "new" / "street.glb").exists()
+
+
+def test_formats_that_there_are_not_are_told_with_those_that_there_are(tmp_path: Path) -> None:
+    world = made_up.world(tmp_path).files["world"]
+    for to in ("unreal", "glb,unreal", ","):
+        with pytest.raises(SettingError) as caught:
+            run(world, "--to", to, "--out", tmp_path / "out")
+        assert all(name in caught.value.remedy for name in scenes.known())
+    assert not (tmp_path / "out").exists()
+    with pytest.raises(InputError, match="holds no world"):
+        run(tmp_path / "tile", "--to", "glb", "--out", tmp_path / "out")
+
+
+def test_a_world_without_a_crs_is_told_of(tmp_path: Path) -> None:
+    world = made_up.world(tmp_path, frame=Frame()).files["world"]
+    assert "has no CRS" in run(world, "--to", "glb", "--out", tmp_path / "out")

@@ -1,0 +1,104 @@
+"""One contract over all formats of scenes: all that is there is shown, in its place, in its colours, with its label."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from scan2sim.pipeline.classes import CODE
+from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.io import scenes
+from scan2sim.pipeline.io.scene import Scene, read_scene
+from scan2sim.pipeline.io.scenes import SceneParams
+from scan2sim.pipeline.step import silent
+from scan2sim.pipeline.types import Frame
+from tests.pipeline import made_up
+from tests.pipeline.io.scene_readers import READERS, Shown, image
+
+LABELS = {"terrain": 2, "building": 6, "road_sign": 64}
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return made_up.scene(tmp_path_factory.mktemp("town"))
+
+
+@pytest.fixture(scope="module")
+def exported(town: Scene, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    return {name: tmp_path_factory.mktemp(name) for name in scenes.known()}
+
+
+def expected(scene: Scene) -> list[Shown]:
+    """What a scene shows, by its own files."""
+    shown = []
+    for tile in scene.tiles:
+        for surface in tile.surfaces():
+            for page in surface.shape.used_pages:
+                part = surface.shape.on_page(page)
+                assert part.mesh.uv is not None
+                corners = part.mesh.corners + np.array(tile.offset)
+                shown.append(Shown(surface.code, corners, part.mesh.uv, image(part.pages[page])))
+    return shown
+
+
+def faces(shown: list[Shown]) -> np.ndarray:
+    """Of all meshes: label, middle, corners, colour in the middle; (F, 16), in one order whatever theirs was."""
+    rows = []
+    for one in shown:
+        label = one.label if isinstance(one.label, int) else CODE[one.label]
+        first = np.lexsort(np.round(one.corners, 2).transpose(2, 0, 1)[::-1], axis=-1)[:, 0]
+        turned = np.take_along_axis(one.corners, ((first[:, None] + np.arange(3)) % 3)[..., None], axis=1)
+        height, width = one.image.shape[:2]
+        u, v = one.uv.mean(axis=1).T
+        column = (u * width).astype(int).clip(0, width - 1)
+        row = ((1 - v) * height).astype(int).clip(0, height - 1)
+        colour = one.image[row, column].astype(float)
+        rows.append(np.column_stack([np.full(len(turned), label), turned.reshape(-1, 9), colour]))
+    every = np.concatenate(rows)
+    return every[np.lexsort(np.round(every[:, :10], 2).T[::-1])]
+
+
+@pytest.mark.parametrize("name", scenes.known())
+def test_everything_is_shown_in_its_place_and_colours(town: Scene, exported: dict[str, Path], name: str) -> None:
+    scenes.write(town, [name], exported[name], SceneParams(), silent)
+    for path in exported[name].rglob("*"):
+        assert path.name.isascii() and " " not in path.name
+    own, seen = faces(expected(town)), faces(list(READERS[name](exported[name], town)))
+    assert len(seen) == len(own)
+    np.testing.assert_array_equal(seen[:, 0], own[:, 0])
+    np.testing.assert_allclose(seen[:, 1:10], own[:, 1:10], atol=1e-3)
+    assert np.abs(seen[:, 10:] - own[:, 10:]).mean() < 3 and np.percentile(np.abs(seen[:, 10:] - own[:, 10:]), 95) < 20
+
+
+@pytest.mark.parametrize("name", scenes.known())
+def test_a_scene_without_a_crs_has_no_georeference(tmp_path: Path, name: str) -> None:
+    scene = made_up.scene(tmp_path, Frame(), tiles=1)
+    scenes.write(scene, [name], tmp_path / "out", SceneParams(), silent)
+    assert faces(list(READERS[name](tmp_path / "out", scene))).shape == faces(expected(scene)).shape
+    assert json.loads((tmp_path / "out" / "metadata.json").read_text())["wgs84"] is None
+
+
+def test_a_scene_is_read_from_a_run_or_its_world(tmp_path: Path) -> None:
+    scene = made_up.scene(tmp_path)
+    assert read_scene(tmp_path) == read_scene(tmp_path / "world") == scene
+    assert [tile.offset for tile in scene.tiles] == [(0, 0, 0), (25, 3, -1)]
+    assert {surface.label for surface in scene.tiles[0].surfaces()} == set(LABELS)
+
+
+def test_worlds_that_keep_no_scene_are_told_of(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="holds no world"):
+        read_scene(tmp_path)
+    world = made_up.world(tmp_path).files["world"]
+    about = world / "scene" / "scene.json"
+    about.write_text(about.read_text().replace('"version": 1', '"version": 9'))
+    with pytest.raises(InputError, match=r"version 9.*run.*again"):
+        read_scene(world)
+    about.unlink()
+    with pytest.raises(InputError, match=r"earlier version.*run.*again"):
+        read_scene(world)
+    about.write_text("{")
+    with pytest.raises(InputError, match=r"can't be read.*run.*again"):
+        read_scene(world)
