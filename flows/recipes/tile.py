@@ -337,7 +337,8 @@ class _Graph:
     ) -> None:
         """What users get: the world, maps, figures and pictures."""
         at, add, tile = self.at, self.add, self.tile
-        add(COLLISION, surfaces, keep_border=bool(self.cell))
+        cell = {"place": self.cell["seed"], "neighbours": self.cell["neighbours"]} if self.cell else {}
+        add(COLLISION, {**surfaces, "cloud": at(SPLIT, "terrain")}, **cell)
         add(EXPORT, textured | lists | self.listed | {"collision": at(COLLISION, "mesh")}, name=tile.name)
         if self.settings.params(EXPORT).rasters:
             add(RASTERS, textured, name=tile.name, **_fineness(self.settings))

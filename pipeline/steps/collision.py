@@ -1,22 +1,30 @@
-"""Collision: one light mesh for physics, and how far it lies from what is seen."""
+"""Collision: what bodies touch, apart from what is seen, and how far it lies from the cloud."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import Field
 
-from scan2sim.pipeline.classes import SURFACES
+from scan2sim.pipeline.cells import Cell
+from scan2sim.pipeline.classes import CODE, SURFACES, name_of
 from scan2sim.pipeline.errors import DataError, StepError
-from scan2sim.pipeline.ranges import Seed
+from scan2sim.pipeline.ranges import Place, Seed
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.steps.decimate import with_things
-from scan2sim.pipeline.types import Mesh
+from scan2sim.pipeline.types import F32, U8, Frame, Mesh, PointCloud
 
-SAMPLES = 100_000  # points at which the deviation is measured
+SAMPLES = 100_000  # points at which the distance to what is seen is measured
+POINTS = 1_000_000  # of the cloud, at most, that the ground is fitted to
 MOST = 200_000  # triangles, whatever the borders need
+GROUND = 0.6  # of the triangles, at most
+DENSE = 10  # triangles a square metre: finer ones would follow the points' noise
+VOTERS = 9  # points that tell a triangle's class
+SOLID = {"building": CODE["building"], "vegetation": CODE["high_vegetation"], "vehicle": CODE["vehicle"]}
 
 
 class CollisionParams(Params):
@@ -24,92 +32,189 @@ class CollisionParams(Params):
 
     Attributes:
         triangles: at most; physics engines stay interactive up to about 50 thousand.
-        vegetation: whether plants are solid too.
+        vegetation: whether plants are solid too; trunks always are.
         seed: of the points at which the deviation is measured.
-        keep_border: never thin borders, be there too many triangles; set by the recipe where tiles meet.
+        place: the tile's (x, y), world metres, where it meets others: its borders with them stay as they are; set by
+            the recipe.
+        neighbours: names of tiles whose cells touch to their seeds, world metres; set by the recipe.
     """
 
     triangles: int = Field(50_000, ge=100, le=MOST)
     vegetation: bool = False
     seed: Seed = 0
-    keep_border: bool = False
+    place: Place | None = None
+    neighbours: dict[str, Place] = Field(default_factory=dict)
 
 
 def collision(inputs: Inputs, params: CollisionParams, out: Path, report: Report) -> Done:
-    """Simplify `terrain`, `building` and `vehicle` (and `vegetation`, if asked) into one mesh.
+    """Make the ground, walls, poles and trunks that bodies collide with; leaves are passable.
 
-    They are simplified together, so the budget goes where the error would be greatest. Borders are
-    kept where the budget allows it (or always, with `keep_border`); if not, a warning says so.
-    Street furniture (faces with a class) stays as it is, trunks too; where it would take more than half the budget, it
-    is simplified with the rest.
+    The ground (`terrain`) is decimated, and its heights are fitted to the points of `cloud` (the ground's own, as
+    scanned; optional): smooth, and nearer to what was measured than what is seen. `building` and `vehicle` (and
+    `vegetation`, if asked) share what is left of the triangles. Of open edges, those on borders with other tiles
+    stay as they are, vertex for vertex; all others are thinned. Street furniture stays as it is, so that its poles and
+    trunks can be told apart as cylinders (`pipeline.cylinders`); where it would take more than half the budget, it is
+    simplified as well.
+
+    File: `mesh`, with a class code for every face: of the ground, that of the points around it. Facts in metres:
+    `ground_m`, heights between the cloud's points and the ground; `deviation_m`, from what is seen to what is touched.
 
     Raises:
         DataError: no mesh has a face.
-        StepError: the budget can't be met; with `keep_border`, the borders alone need over 200,000 triangles.
+        StepError: the borders alone need over 200,000 triangles.
     """
-    from scan2sim.pipeline.decimation import simplify
+    from scan2sim.pipeline.borders.rims import on_border
+    from scan2sim.pipeline.cylinders import told_apart
 
-    left_out = {"vegetation"} if not params.vegetation else set()
-    groups = tuple(g for g in SURFACES if g not in left_out and (g in inputs or g != "vehicle"))
-    whole = _joined(inputs, groups)
-    source, things = _parted(whole, params.triangles)
+    meshes = {group: Mesh.load(inputs[group]) for group in SURFACES if group in inputs}
+    frame = next(iter(meshes.values())).frame
+    cell = None if params.place is None else Cell(params.place, params.neighbours)
+    points = _ground_points(inputs, params.seed)
+    terrain = meshes.pop("terrain", _joined(frame, []))
+    parted = {group: _parted(mesh, SOLID[group]) for group, mesh in meshes.items()}
+    things = _joined(frame, [things for _, things in parted.values()])
+    surfaces = [surface for group, (surface, _) in parted.items() if group != "vegetation" or params.vegetation]
+    if len(things) > params.triangles / 2:
+        surfaces, things = [*surfaces, things], _joined(frame, [])
+    whole = _joined(frame, [terrain, *surfaces, things])
+    _check(whole, params)
     report(0.1, f"{len(whole):,} triangles")
-    budget = params.triangles - len(things)
-    small, warnings = simplify(source, budget), []
-    border_kept = len(small) <= budget or params.keep_border
-    if len(small) > budget and params.keep_border:
-        warnings.append(f"collision: the borders alone need {len(small):,} triangles, kept since other tiles join them")
-    elif not border_kept:
-        warnings.append(f"collision: the borders alone need {len(small):,} triangles, so they were thinned too")
-        small = simplify(small, budget, keep_border=False)
-    small = replace(with_things(small, things), classification=None) if len(things) else small
-    allowed = MOST if params.keep_border else params.triangles
-    if len(small) > allowed:
+    ground = _ground(terrain, points, params, cell)
+    report(0.5, "walls")
+    small = _joined(frame, [ground, *_walls(surfaces, params.triangles - len(ground) - len(things), cell), things])
+    if len(small) > MOST:
         raise StepError(
             "collision",
-            f"{len(small):,} triangles are left where {allowed:,} are allowed",
-            "Raise collision.triangles, or remove small islands",
+            f"{len(small):,} triangles are left where {MOST:,} are allowed",
+            "Raise islands.min_area, so that less of the surface is crumbs, or cut smaller tiles",
         )
-    report(0.7, "deviation")
-    apart = deviation(whole, small, params.seed)
+    report(0.8, "deviation")
     small.save(out / "collision.npz")
-    facts = {
+    facts: dict[str, Any] = {
         "triangles_in": len(whole),
         "triangles": len(small),
-        "border_kept": border_kept,
-        "deviation_m": apart,
+        "ground_triangles": len(ground),
+        "cylinders": len(told_apart(things)[0]),
+        "border_vertices": int(on_border(small, cell).sum()),
+        "deviation_m": deviation(whole, small, params.seed),
+        "ground_m2": _areas(ground),
     }
+    if points is not None and len(ground):
+        facts["ground_m"] = _off(ground, points.xyz)
+    over = len(small) > params.triangles
+    warnings = (
+        [f"{len(small):,} triangles where {params.triangles:,} are wanted: the borders need them"] if over else []
+    )
     return Done({"mesh": out / "collision.npz"}, facts, warnings)
 
 
-def _joined(inputs: Inputs, groups: tuple[str, ...]) -> Mesh:
-    """The meshes of `groups` that there are, as one."""
-    read = {group: Mesh.load(inputs[group]) for group in SURFACES if group in inputs}
-    parts = [mesh if group in groups else _parted(mesh, MOST)[1] for group, mesh in read.items()]
-    meshes = [mesh for mesh in parts if len(mesh)]
-    if not meshes:
+def _check(whole: Mesh, params: CollisionParams) -> None:
+    if not len(whole):
+        empty = "terrain and building" + (" and vegetation" if params.vegetation else "")
         raise DataError(
             "collision",
-            f"there is no surface to collide with ({' and '.join(groups)} are empty)",
+            f"there is no surface to collide with ({empty} are empty)",
             "Check the cloud's classes, and voxel, poisson, trim, islands where set, or set collision.vegetation=true",
         )
+
+
+def _ground_points(inputs: Inputs, seed: int) -> PointCloud | None:
+    """Points of the ground as scanned, not too many."""
+    if "cloud" not in inputs:
+        return None
+    cloud = PointCloud.load(inputs["cloud"])
+    if len(cloud) > POINTS:
+        cloud = cloud.take(np.sort(np.random.default_rng(seed).choice(len(cloud), POINTS, replace=False)))
+    return cloud
+
+
+def _ground(terrain: Mesh, points: PointCloud | None, params: CollisionParams, cell: Cell | None) -> Mesh:
+    """The ground, light and smooth, with its classes."""
+    from scan2sim.pipeline.borders.rims import on_border, thinned
+    from scan2sim.pipeline.fit import fitted
+
+    ground = thinned(terrain, min(round(GROUND * params.triangles), _enough(terrain)), cell)
+    if points is not None:
+        ground = fitted(ground, points.xyz, on_border(ground, cell))
+    return replace(ground, classification=_classes(ground, points))
+
+
+def _walls(surfaces: Sequence[Mesh], budget: int, cell: Cell | None) -> list[Mesh]:
+    """What stands, thinned, the triangles shared out by area; each of one class."""
+    from scan2sim.pipeline.borders.rims import thinned
+
+    wanted = [(mesh, _enough(mesh)) for mesh in surfaces if len(mesh)]
+    share = min(1.0, max(0, budget) / max(1, sum(count for _, count in wanted)))
+    return [_of_class(thinned(mesh, int(share * count), cell), _code(mesh)) for mesh, count in wanted]
+
+
+def _enough(mesh: Mesh) -> int:
+    """Triangles that a surface needs."""
+    return max(100, round(DENSE * float(mesh.face_area.sum())))
+
+
+def _of_class(mesh: Mesh, code: int) -> Mesh:
+    return replace(mesh, classification=np.full(len(mesh), code, np.uint8))
+
+
+def _code(mesh: Mesh) -> int:
+    """The class that most faces have."""
+    return int(np.bincount(np.asarray(mesh.classification)).argmax())
+
+
+def _joined(frame: Frame, meshes: Sequence[Mesh]) -> Mesh:
+    """Meshes as one, with their classes."""
     first = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])
+    faces = [mesh.faces + start for mesh, start in zip(meshes, first[:-1], strict=True)]
+    codes = [np.zeros(len(m), np.uint8) if m.classification is None else m.classification for m in meshes]
     return Mesh(
-        meshes[0].frame,
-        np.concatenate([mesh.vertices for mesh in meshes]),
-        np.concatenate([mesh.faces + start for mesh, start in zip(meshes, first[:-1], strict=True)]).astype(np.int32),
-        classification=np.concatenate(
-            [np.zeros(len(m), np.uint8) if m.classification is None else m.classification for m in meshes]
-        ),
+        frame,
+        np.concatenate([np.zeros((0, 3), np.float32), *(mesh.vertices for mesh in meshes)]),
+        np.concatenate([np.zeros((0, 3), np.int32), *faces]).astype(np.int32),
+        classification=np.concatenate([np.zeros(0, np.uint8), *codes]),
     )
 
 
-def _parted(mesh: Mesh, budget: int) -> tuple[Mesh, Mesh]:
-    """The surface, and the street furniture that stays as it is: none where it would take over half the budget."""
+def _parted(mesh: Mesh, code: int) -> tuple[Mesh, Mesh]:
+    """The surface, given its class, and the street furniture, which has classes already."""
     own = np.zeros(len(mesh), bool) if mesh.classification is None else mesh.classification > 0
-    if own.sum() > budget / 2:
-        own[:] = False
-    return mesh.keep(~own), mesh.keep(own)
+    return _of_class(mesh.keep(~own), code), mesh.keep(own)
+
+
+def _classes(ground: Mesh, points: PointCloud | None) -> U8:
+    """(F,) class codes: what most of the points nearest to a triangle's middle are."""
+    from scipy.spatial import cKDTree
+
+    if points is None or points.classification is None or not len(points):
+        return np.full(len(ground), CODE["terrain"], np.uint8)
+    k = min(VOTERS, len(points))
+    _, near = cKDTree(points.xyz).query(ground.corners.mean(axis=1), k=k, workers=-1)
+    votes = points.classification[near.reshape(len(ground), k)]
+    codes = np.unique(votes)
+    return codes[np.argmax([(votes == code).sum(axis=1) for code in codes], axis=0)]
+
+
+def _areas(ground: Mesh) -> dict[str, float]:
+    """Square metres of the ground by class."""
+    assert ground.classification is not None
+    codes, area = np.unique(ground.classification), ground.face_area
+    return {name_of(int(code)): round(float(area[ground.classification == code].sum()), 1) for code in codes}
+
+
+def _off(ground: Mesh, points: F32) -> dict[str, float]:
+    """Heights between points of the cloud and the ground in metres; all within 15 cm of it count."""
+    from scan2sim.pipeline.fit import off_ground
+
+    _, _, above = off_ground(ground, points)
+    return _figures(np.abs(above)) if len(above) else {}
+
+
+def _figures(distance: npt.NDArray[np.floating]) -> dict[str, float]:
+    return {
+        "mean": round(float(distance.mean()), 4),
+        "p95": round(float(np.percentile(distance, 95)), 4),
+        "max": round(float(distance.max()), 4),
+    }
 
 
 def deviation(source: Mesh, small: Mesh, seed: int) -> dict[str, float]:
@@ -126,12 +231,7 @@ def deviation(source: Mesh, small: Mesh, seed: int) -> dict[str, float]:
     scene.add_triangles(
         o3d.core.Tensor.from_numpy(small.vertices), o3d.core.Tensor.from_numpy(small.faces.astype(np.uint32))
     )
-    distance = scene.compute_distance(o3d.core.Tensor.from_numpy(points.astype(np.float32))).numpy()
-    return {
-        "mean": round(float(distance.mean()), 4),
-        "p95": round(float(np.percentile(distance, 95)), 4),
-        "max": round(float(distance.max()), 4),
-    }
+    return _figures(scene.compute_distance(o3d.core.Tensor.from_numpy(points.astype(np.float32))).numpy())
 
 
-COLLISION = Step("collision", 2, collision, CollisionParams)
+COLLISION = Step("collision", 3, collision, CollisionParams)

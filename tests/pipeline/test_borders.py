@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 
 from scan2sim.pipeline.borders.clip import Clipped, clip
+from scan2sim.pipeline.borders.curve import curve
 from scan2sim.pipeline.borders.gap import Gap, gap
 from scan2sim.pipeline.borders.grid import GRID, world
 from scan2sim.pipeline.borders.join import join
+from scan2sim.pipeline.borders.rims import on_border
 from scan2sim.pipeline.cells import Cell
 from scan2sim.pipeline.classes import CODE, GROUPS, group_of
 from scan2sim.pipeline.decimation import simplify
@@ -253,10 +255,46 @@ def test_the_steps_pass_it_on(two: Any, tmp_path: Path) -> None:
 
     thin = go(DECIMATE, tmp_path / "thin", {"mesh": done.files["mesh"]}, target=10_000, keep_border=True)
     assert thin.facts["border_kept"] and not thin.warnings
-    solid = go(COLLISION, tmp_path / "solid", {"terrain": thin.files["mesh"]}, triangles=100, keep_border=True)
-    assert solid.facts["border_kept"] and solid.facts["triangles"] > 100 and "kept" in solid.warnings[0]
-    between = gap(joined["east"], Mesh.load(solid.files["mesh"]), cells(SEEDS)["east"], "west")
+
+
+def test_what_is_touched_meets_at_the_border_and_is_thinned_at_all_other_rims(two: Any, tmp_path: Path) -> None:
+    _, _, joined = two
+    solid = {}
+    for name, mesh in joined.items():
+        cell, out = cells(SEEDS)[name], tmp_path / name
+        out.mkdir()
+        mesh.save(out / "terrain.npz")
+        around = cloud(mesh.frame, seed=3)
+        replace(around, xyz=around.xyz + np.array([0, 0, 0.05], np.float32)).save(
+            out / "cloud.npz"
+        )  # it is fitted to that
+        inputs = {"terrain": out / "terrain.npz", "cloud": out / "cloud.npz"}
+        done = go(COLLISION, out, inputs, triangles=1000, place=cell.seed, neighbours=cell.neighbours)
+        solid[name] = Mesh.load(done.files["mesh"])
+        assert len(solid[name]) <= 1000 and not done.warnings
+        before, after = (rim_edges(one, cell) for one in (mesh, solid[name]))
+        assert before > 300 and after < before / 3
+    between = gap(solid["east"], solid["west"], cells(SEEDS)["east"], "west")
+    assert between.shared == 1 and between.length_m == pytest.approx(
+        gap(joined["east"], joined["west"], cells(SEEDS)["east"], "west").length_m
+    )
+
+
+def test_a_border_that_needs_more_than_the_budget_is_kept_and_said(two: Any, tmp_path: Path) -> None:
+    _, _, joined = two
+    cell = cells(SEEDS)["west"]
+    joined["west"].save(tmp_path / "terrain.npz")
+    given = {"place": cell.seed, "neighbours": cell.neighbours}
+    done = go(COLLISION, tmp_path / "solid", {"terrain": tmp_path / "terrain.npz"}, triangles=100, **given)
+    assert done.facts["triangles"] > 100 and "borders" in done.warnings[0]
+    between = gap(joined["east"], Mesh.load(done.files["mesh"]), cells(SEEDS)["east"], "west")
     assert between.shared == 1
+
+
+def rim_edges(mesh: Mesh, cell: Cell) -> int:
+    """Open edges that are on no border."""
+    opened = curve(mesh.faces, np.ones(len(mesh.vertices), bool)).edges
+    return int((~on_border(mesh, cell)[opened].all(axis=1)).sum())
 
 
 def test_decimate_may_be_told_to_keep_the_border(tmp_path: Path) -> None:

@@ -42,12 +42,11 @@ def test_the_house_keeps_its_shape(tmp_path: Path) -> None:
     assert mesh.vertices[inside, 2].max() == pytest.approx(4.5, abs=0.01)
 
 
-def test_a_border_that_busts_the_budget_is_thinned_with_a_warning(tmp_path: Path) -> None:
+def test_a_surface_in_crumbs_keeps_to_the_budget_too(tmp_path: Path) -> None:
     ground = made_up.ground(40)
-    patches = ground.keep(np.arange(len(ground)) % 3 == 0)  # nearly all of it is border
+    patches = ground.keep(np.arange(len(ground)) % 3 == 0)  # nearly all of its edges are open
     mesh, done = _run(tmp_path, {"terrain": patches}, triangles=300)
-    assert len(mesh) <= 300
-    assert done.warnings and not done.facts["border_kept"]
+    assert 100 < len(mesh) <= 300 and not done.warnings
 
 
 def test_plants_are_solid_only_when_asked(tmp_path: Path) -> None:
