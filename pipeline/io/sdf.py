@@ -25,7 +25,9 @@ from math import degrees
 from pathlib import Path
 from xml.sax.saxutils import escape
 
+from scan2sim.pipeline.cylinders import Cylinder
 from scan2sim.pipeline.io import crs
+from scan2sim.pipeline.solids import Solid
 from scan2sim.pipeline.types import Frame
 
 HEADROOM = 500.0
@@ -128,35 +130,24 @@ def write_levels(
     )
 
 
-def write_model(folder: Path, name: str, visuals: Mapping[str, int], collision: str, friction: float) -> None:
+def write_model(folder: Path, name: str, visuals: Mapping[str, int], solids: Sequence[Solid]) -> None:
     """Write `model.sdf` and `model.config` of a static model.
 
     Args:
         folder: of the model.
         name: of the model; its meshes are found as `model://<name>/...`.
         visuals: path of every visual mesh, relative to `folder`, to its label.
-        collision: path of the collision mesh, relative to `folder`.
-        friction: Coulomb friction coefficient of all surfaces.
+        solids: what bodies collide with; meshes are found as `meshes/collision_<name>.obj`.
     """
     shown = "".join(_visual(name, mesh, label) for mesh, label in visuals.items())
+    touched = "".join(_collision(name, solid) for solid in solids)
     (folder / "model.sdf").write_text(
         f"""<?xml version="1.0"?>
 <sdf version="1.9">
   <model name="{name}">
     <static>true</static>
     <link name="link">
-{shown}      <collision name="collision">
-        <geometry>
-          <mesh><uri>model://{name}/{collision}</uri></mesh>
-        </geometry>
-        <surface>
-          <friction>
-            <ode><mu>{friction:g}</mu><mu2>{friction:g}</mu2></ode>
-            <bullet><friction>{friction:g}</friction><friction2>{friction:g}</friction2></bullet>
-          </friction>
-        </surface>
-      </collision>
-    </link>
+{shown}{touched}    </link>
   </model>
 </sdf>
 """,
@@ -171,7 +162,7 @@ def write_model(folder: Path, name: str, visuals: Mapping[str, int], collision: 
   <author>
     <name>scan2sim</name>
   </author>
-  <description>A street scanned by lidar and photos: textured surfaces and one collision mesh.</description>
+  <description>A street scanned by lidar and photos: textured surfaces, and what bodies collide with.</description>
 </model>
 """,
         encoding="utf-8",
@@ -259,6 +250,28 @@ def _visual(name: str, mesh: str, label: int) -> str:
           <label>{label}</label>
         </plugin>
       </visual>
+"""
+
+
+def _collision(name: str, solid: Solid) -> str:
+    shape = solid.shape
+    if isinstance(shape, Cylinder):
+        place = f"        <pose>{_numbers(shape.centre)} {_numbers(shape.angles)}</pose>\n"
+        form = f"<cylinder><radius>{shape.radius:.4f}</radius><length>{shape.length:.4f}</length></cylinder>"
+    else:
+        place, form = "", f"<mesh><uri>model://{name}/meshes/collision_{solid.name}.obj</uri></mesh>"
+    mu = f"{solid.friction:g}"
+    return f"""      <collision name="collision_{solid.name}">
+{place}        <geometry>
+          {form}
+        </geometry>
+        <surface>
+          <friction>
+            <ode><mu>{mu}</mu><mu2>{mu}</mu2></ode>
+            <bullet><friction>{mu}</friction><friction2>{mu}</friction2></bullet>
+          </friction>
+        </surface>
+      </collision>
 """
 
 

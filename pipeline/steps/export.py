@@ -33,7 +33,7 @@ class ExportParams(SceneParams):
     Attributes:
         name: of the tile, its world and its model; set by the recipe.
         formats: files of `pipeline/io/scenes`; `scan2sim export` writes others later.
-        friction: Coulomb friction coefficient of the ground; 0.9 is rubber on dry asphalt.
+        friction: Coulomb friction coefficient of roads; 0.9 is rubber on dry asphalt, and other classes follow.
         world_origin: metres in the CRS; several tiles with the same one share their georeference.
             Default: the tile's own origin.
         rasters: metres a pixel of an orthophoto, a DSM and a DTM as cloud-optimised GeoTIFF (the step `rasters`);
@@ -90,4 +90,4 @@ def can_export(params: ExportParams) -> None:
         need("export.rasters", "rasterio")
 
 
-EXPORT = Step("export", 3, export, ExportParams, check=can_export)
+EXPORT = Step("export", 4, export, ExportParams, check=can_export)

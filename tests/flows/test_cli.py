@@ -202,9 +202,10 @@ def test_gazebo_loads_the_world_and_a_box_rests_on_its_road(street: Path, world:
     tile = read_tile(street)
     assert tile.trajectory is not None
     x, y, z = tile.trajectory.positions[len(tile.trajectory.times) // 4]
-    seen = check_world(next((world / "world").glob("*.sdf")), (float(x), float(y), float(z)))
-    assert seen["speed"] < 0.1
-    assert abs(seen["rest"][2] - (z - 2.0 + 0.2)) < 0.15, "the scanner rides 2 m above the road; the box is 40 cm high"
+    seen = check_world(next((world / "world").glob("*.sdf")), ("box", (float(x), float(y), float(z))))
+    (box,) = seen["bodies"]
+    assert box["speed"] < 0.1
+    assert abs(box["rest"][2] - (z - 2.0 + 0.2)) < 0.15, "the scanner rides 2 m above the road; the box is 40 cm high"
     textures = {texture for mesh in seen["meshes"] for texture in mesh["textures"]}
     assert {name.split("_")[0] for name in textures} == {"terrain", "building", "vegetation"}
 

@@ -21,7 +21,7 @@ def run(tile: Path, out: Path, *options: object) -> dict[str, Any]:
     ground = json.loads((out / "world" / "metadata.json").read_text())["groups"]["terrain"]
     x, y, _ = ((a + b) / 2 for a, b in zip(ground["low_m"], ground["high_m"], strict=True))
     above = (x, y, ground["high_m"][2] + 2)
-    seen = check_world(next((out / "world").glob("*.sdf")), above)
+    seen = check_world(next((out / "world").glob("*.sdf")), ("box", above))
     shown = sum(mesh["triangles"] for mesh in seen["meshes"] if mesh["role"] == "visual")
     assert shown == sum(report["world"]["triangles"].values())
     return report

@@ -81,8 +81,9 @@ def test_gazebo_loads_all_tiles_as_one_world(made: Path) -> None:
     (world,) = (made / "world").glob("*.sdf")
     tiles = json.loads((made / "world" / "metadata.json").read_text())["tiles"]
     assert len(tiles) == 2
-    seen = check_world(world, (0, 0, 2))
-    assert abs(seen["rest"][2]) < 5 and seen["speed"] < 0.1
+    seen = check_world(world, ("box", (0, 0, 2)))
+    (box,) = seen["bodies"]
+    assert abs(box["rest"][2]) < 5 and box["speed"] < 0.1
 
 
 def test_an_unchanged_survey_is_left_as_it_is(survey: Path, made: Path) -> None:

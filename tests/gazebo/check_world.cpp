@@ -1,11 +1,12 @@
-// Reads a world as Gazebo does and drops a box in it.
+// Reads a world as Gazebo does and drops bodies in it.
 //
-//   check_world WORLD.sdf X Y Z [FILE=TRIANGLES ...]
+//   check_world WORLD.sdf [BODY@X,Y,Z ...] [FILE=TRIANGLES ...]
 //
 // Parses the world with warnings as errors (libsdformat), loads the mesh of every visual and
-// collision (ignition-common), checks their textures, normals and numbers of triangles, then lets a
-// box of 40 cm fall from (X, Y, Z) for four seconds (ignition-physics, DART). FILE is a mesh's path
-// below the world's folder; files that the world doesn't show are loaded too.
+// collision (ignition-common), checks their textures, normals and numbers of triangles, then lets
+// bodies fall from (X, Y, Z), all at once, for two and a half seconds (ignition-physics, DART): a box of 40 cm, a
+// ball of 22 cm, a car of 4.2 x 1.8 x 1.4 m. FILE is a mesh's path below the world's folder; files
+// that the world doesn't show are loaded too.
 //
 // Prints one line of JSON and returns 0; or the first problem, and returns 1.
 
@@ -50,7 +51,7 @@ using Features = physics::FeatureList<
     physics::GetEntities, physics::LinkFrameSemantics, physics::mesh::AttachMeshShapeFeature,
     physics::sdf::ConstructSdfModel, physics::sdf::ConstructSdfWorld>;
 
-constexpr int STEPS = 4000;  // of one millisecond
+constexpr int STEPS = 2500;  // of one millisecond
 
 [[noreturn]] void fail(const std::string &problem) { throw std::runtime_error(problem); }
 
@@ -200,16 +201,46 @@ std::string checked(const common::Mesh &mesh, const std::string &file, const std
          ", \"low\": " + numbers(mesh.Min()) + ", \"high\": " + numbers(mesh.Max()) + "}";
 }
 
-// Collision meshes with their poses in the world, as physics needs them.
+// What is collided with, and its pose in the world: a mesh, or what SDF says of a simpler shape.
 struct Solid
 {
   const common::Mesh *mesh;
+  std::string shape;
   math::Pose3d pose;
   math::Vector3d scale;
 };
 
-// Where the box came to rest after falling from `start` onto `solids`, and its last speed in m/s.
-std::pair<math::Vector3d, double> drop(const World &world, const std::vector<Solid> &solids, const math::Vector3d &start)
+struct Body
+{
+  std::string kind;
+  math::Vector3d start;
+};
+
+// SDF of a body's link: its mass (kg), moments of inertia and shape.
+std::string link_of(const std::string &kind)
+{
+  const auto link = [](double mass, double x, double y, double z, const std::string &shape) {
+    std::ostringstream text;
+    text << "<link name='link'><inertial><mass>" << mass << "</mass><inertia><ixx>" << x << "</ixx><iyy>" << y
+         << "</iyy><izz>" << z << "</izz></inertia></inertial><collision name='shape'><geometry>" << shape
+         << "</geometry></collision></link>";
+    return text.str();
+  };
+  if (kind == "box") return link(10, 0.27, 0.27, 0.27, "<box><size>0.4 0.4 0.4</size></box>");
+  if (kind == "ball") return link(1, 0.00484, 0.00484, 0.00484, "<sphere><radius>0.11</radius></sphere>");
+  if (kind == "car") return link(1200, 520, 1960, 2088, "<box><size>4.2 1.8 1.4</size></box>");
+  fail("there is no body " + kind);
+}
+
+sdf::Root model(const std::string &name, const std::string &content)
+{
+  sdf::Root root;
+  check(root.LoadSdfString("<sdf version='1.9'><model name='" + name + "'>" + content + "</model></sdf>"));
+  return root;
+}
+
+// JSON of where the bodies came to rest, how they lie (a quaternion w, x, y, z) and their last speeds in m/s.
+std::string drop(const World &world, const std::vector<Solid> &solids, const std::vector<Body> &bodies)
 {
   at_work_on = "the collision meshes together";
   ignition::plugin::Loader loader;
@@ -224,33 +255,43 @@ std::pair<math::Vector3d, double> drop(const World &world, const std::vector<Sol
   const auto scene = engine->ConstructWorld(empty);
   for (std::size_t i = 0; i < solids.size(); ++i)
   {
-    sdf::Root root;
+    const auto &solid = solids[i];
     std::ostringstream text;
-    text << "<sdf version='1.9'><model name='solid" << i << "'><static>true</static><pose>" << solids[i].pose
-         << "</pose><link name='link'/></model></sdf>";
-    check(root.LoadSdfString(text.str()));
-    const auto link = scene->ConstructModel(*root.Model())->GetLink("link");
+    text << "<static>true</static><pose>" << solid.pose << "</pose><link name='link'>";
+    if (solid.mesh == nullptr) text << "<collision name='shape'>" << solid.shape << "</collision>";
+    text << "</link>";
+    const auto link = scene->ConstructModel(*model("solid" + std::to_string(i), text.str()).Model())->GetLink("link");
+    if (solid.mesh == nullptr) continue;
     const Captured said;
-    link->AttachMeshShape("mesh", *solids[i].mesh, Eigen::Isometry3d::Identity(),
-                          Eigen::Vector3d(solids[i].scale.X(), solids[i].scale.Y(), solids[i].scale.Z()));
+    link->AttachMeshShape("mesh", *solid.mesh, Eigen::Isometry3d::Identity(),
+                          Eigen::Vector3d(solid.scale.X(), solid.scale.Y(), solid.scale.Z()));
     check_silent(said, "collision mesh");
   }
-  sdf::Root root;
-  std::ostringstream text;
-  text << "<sdf version='1.9'><model name='box'><pose>" << start << " 0 0 0</pose><link name='link'>"
-       << "<inertial><mass>10</mass><inertia><ixx>0.27</ixx><iyy>0.27</iyy><izz>0.27</izz></inertia></inertial>"
-       << "<collision name='box'><geometry><box><size>0.4 0.4 0.4</size></box></geometry></collision>"
-       << "</link></model></sdf>";
-  check(root.LoadSdfString(text.str()));
-  const auto box = scene->ConstructModel(*root.Model())->GetLink("link");
+  std::vector<decltype(scene->ConstructModel(sdf::Model())->GetLink("link"))> links;
+  for (std::size_t i = 0; i < bodies.size(); ++i)
+  {
+    std::ostringstream text;
+    text << "<pose>" << bodies[i].start << " 0 0 0</pose>" << link_of(bodies[i].kind);
+    links.push_back(scene->ConstructModel(*model("body" + std::to_string(i), text.str()).Model())->GetLink("link"));
+  }
 
   physics::ForwardStep::Input input;
   physics::ForwardStep::State state;
   physics::ForwardStep::Output output;
-  for (int i = 0; i < STEPS; ++i) scene->Step(output, state, input);
-  const auto frame = box->FrameDataRelativeToWorld();
-  const Eigen::Vector3d at = frame.pose.translation();
-  return {math::Vector3d(at.x(), at.y(), at.z()), frame.linearVelocity.norm()};
+  for (int i = 0; i < STEPS && !bodies.empty(); ++i) scene->Step(output, state, input);
+  std::vector<std::string> rests;
+  for (const auto &link : links)
+  {
+    const auto frame = link->FrameDataRelativeToWorld();
+    const Eigen::Vector3d at = frame.pose.translation();
+    const Eigen::Quaterniond lies(frame.pose.linear());
+    std::ostringstream text;
+    text << std::setprecision(9) << "{\"rest\": " << numbers({at.x(), at.y(), at.z()}) << ", \"lies\": [" << lies.w()
+         << ", " << lies.x() << ", " << lies.y() << ", " << lies.z() << "], \"speed\": " << frame.linearVelocity.norm()
+         << "}";
+    rests.push_back(text.str());
+  }
+  return list(rests);
 }
 
 std::string spherical(const sdf::World &world)
@@ -269,7 +310,7 @@ std::string spherical(const sdf::World &world)
   return text.str();
 }
 
-std::string run(const fs::path &file, const math::Vector3d &start, std::map<std::string, unsigned long> expected)
+std::string run(const fs::path &file, const std::vector<Body> &bodies, std::map<std::string, unsigned long> expected)
 {
   const World world(file);
   const auto &sdf = world.Sdf();
@@ -298,27 +339,30 @@ std::string run(const fs::path &file, const math::Vector3d &start, std::map<std:
       {
         const auto &collision = *link.CollisionByIndex(c);
         const auto *mesh = take(*collision.Geom(), "collision");
-        if (mesh == nullptr) continue;
         math::Pose3d pose;
         check(collision.SemanticPose().Resolve(pose, "__model__"));
-        solids.push_back({mesh, model.RawPose() * pose, collision.Geom()->MeshShape()->Scale()});
+        const auto place = model.RawPose() * pose;
+        if (mesh == nullptr)
+          solids.push_back({nullptr, collision.Geom()->Element()->ToString(""), place, math::Vector3d::One});
+        else
+          solids.push_back({mesh, "", place, collision.Geom()->MeshShape()->Scale()});
       }
     }
   }
   for (const auto &[name, count] : std::map(expected)) meshes.push_back(checked(load(world, name), name, "spare", count));
   check(!solids.empty(), "nothing to collide with");
-  const auto [rest, speed] = drop(world, solids, start);
   std::ostringstream json;
   json << "{\"world\": " << quoted(sdf.Name()) << ", \"spherical\": " << spherical(sdf)
-       << ", \"meshes\": " << list(meshes) << ", \"rest\": " << numbers(rest) << ", \"speed\": " << speed << "}";
+       << ", \"meshes\": " << list(meshes) << ", \"solids\": " << solids.size()
+       << ", \"bodies\": " << drop(world, solids, bodies) << "}";
   return json.str();
 }
 
 int main(int argc, char **argv)
 {
-  if (argc < 5)
+  if (argc < 2)
   {
-    std::cerr << "usage: check_world WORLD.sdf X Y Z [FILE=TRIANGLES ...]\n";
+    std::cerr << "usage: check_world WORLD.sdf [BODY@X,Y,Z ...] [FILE=TRIANGLES ...]\n";
     return 2;
   }
   std::signal(SIGSEGV, crashed);
@@ -327,14 +371,20 @@ int main(int argc, char **argv)
   {
     common::Console::SetVerbosity(2);
     std::map<std::string, unsigned long> expected;
-    for (int i = 5; i < argc; ++i)
+    std::vector<Body> bodies;
+    for (int i = 2; i < argc; ++i)
     {
       const std::string text = argv[i];
-      const auto at = text.rfind('=');
-      check(at != std::string::npos, text + " is no FILE=TRIANGLES");
-      expected[text.substr(0, at)] = std::stoul(text.substr(at + 1));
+      const auto at = text.rfind('='), where = text.find('@');
+      double x, y, z;
+      if (at != std::string::npos)
+        expected[text.substr(0, at)] = std::stoul(text.substr(at + 1));
+      else if (where != std::string::npos && std::sscanf(text.c_str() + where, "@%lf,%lf,%lf", &x, &y, &z) == 3)
+        bodies.push_back({text.substr(0, where), {x, y, z}});
+      else
+        fail(text + " is neither BODY@X,Y,Z nor FILE=TRIANGLES");
     }
-    std::cout << run(argv[1], {std::stod(argv[2]), std::stod(argv[3]), std::stod(argv[4])}, expected) << std::endl;
+    std::cout << run(argv[1], bodies, expected) << std::endl;
     return 0;
   }
   catch (const std::exception &problem)

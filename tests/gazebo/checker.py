@@ -14,6 +14,7 @@ import pytest
 
 HERE = Path(__file__).resolve().parent
 BUILD = HERE / "build"
+Body = tuple[str, tuple[float, float, float]]
 
 
 class Refused(Exception):
@@ -21,41 +22,67 @@ class Refused(Exception):
 
 
 @functools.cache
-def program() -> Path:
-    """The checker, built once; the test is skipped where what it needs is not installed."""
+def built() -> str:
+    """Build the programs once; returns why they can't be, or an empty text."""
     if shutil.which("cmake") is None:
-        pytest.skip("cmake is not installed (tests/gazebo/packages.txt)")
+        return "cmake is not installed (tests/gazebo/packages.txt)"
     BUILD.mkdir(exist_ok=True)
     with open(BUILD / "lock", "w") as lock:  # tests may run in several processes
         fcntl.flock(lock, fcntl.LOCK_EX)
         made = _run("cmake", "-S", HERE, "-B", BUILD, "-DCMAKE_BUILD_TYPE=Release")
         if made.returncode:
-            pytest.skip(f"Gazebo's libraries are not installed (tests/gazebo/packages.txt): {made.stderr[:300]}")
-        built = _run("cmake", "--build", BUILD)
-        assert built.returncode == 0, built.stdout[-3000:] + built.stderr[-3000:]
-    return BUILD / "check_world"
+            return f"Gazebo's libraries are not installed (tests/gazebo/packages.txt): {made.stderr[:300]}"
+        done = _run("cmake", "--build", BUILD)
+        assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    return ""
 
 
-def check_world(world: Path, drop_at: tuple[float, float, float]) -> dict[str, Any]:
-    """What Gazebo reads of an exported world, and where a box (40 cm, 10 kg) dropped in it comes to rest.
+def program(name: str) -> Path:
+    """One of the programs; the test is skipped where what it needs is not installed."""
+    if why := built():
+        pytest.skip(why)
+    return BUILD / name
+
+
+def check_world(world: Path, *bodies: Body) -> dict[str, Any]:
+    """What Gazebo reads of an exported world, and where bodies that are dropped in it come to rest.
 
     Triangles of every mesh file must be as many as `metadata.json` beside the world says.
 
+    Args:
+        world: its .sdf.
+        bodies: what is dropped, all at once, and from where, world coordinates: a "box" (40 cm), a "ball" (22 cm), a
+            "car" (a box of 4.2 x 1.8 x 1.4 m).
+
     Returns:
         `world`; `spherical` (latitude, longitude, elevation, heading, `at_y_100`: latitude and
-        longitude 100 m along y) or None; `meshes` (file, role, triangles, textures, low, high);
-        `rest` (x, y, z) of the box's centre, world coordinates; `speed` m/s at the end.
+        longitude 100 m along y) or None; `meshes` (file, role, triangles, textures, low, high); `solids`: how many
+        shapes can be collided with; `bodies`: `rest` (x, y, z) of each one's centre, world coordinates, `lies`, the
+        quaternion (w, x, y, z) of its attitude, and `speed` m/s at the end.
 
     Raises:
         Refused: with the first problem.
     """
     expected = json.loads((world.parent / "metadata.json").read_text())["triangles_by_file"]
     files = [f"{file}={count}" for file, count in expected.items() if file.startswith("models/")]
-    done = _run(program(), world, *drop_at, *files)
+    dropped = [f"{kind}@{x:.4f},{y:.4f},{z:.4f}" for kind, (x, y, z) in bodies]
+    done = _run(program("check_world"), world, *dropped, *files)
+    if done.returncode:
+        raise Refused(done.stderr.strip() or f"exit code {done.returncode}")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def load_meshes(*files: Path) -> dict[str, float]:
+    """`seconds` and `megabytes` that ignition-common takes to load meshes.
+
+    Raises:
+        Refused: one can't be loaded.
+    """
+    done = _run(program("load_meshes"), *files)
     if done.returncode:
         raise Refused(done.stderr.strip() or f"exit code {done.returncode}")
     return json.loads(done.stdout.splitlines()[-1])
 
 
 def _run(*command: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([str(part) for part in command], capture_output=True, text=True, timeout=300)
+    return subprocess.run([str(part) for part in command], capture_output=True, text=True, timeout=900)

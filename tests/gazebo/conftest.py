@@ -10,4 +10,4 @@ from tests.gazebo import checker
 @pytest.fixture(scope="session", autouse=True)
 def built() -> None:
     """Build before the first test, so that none is timed with the compiler."""
-    checker.program()
+    checker.program("check_world")

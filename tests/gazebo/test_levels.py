@@ -30,25 +30,27 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_every_tiles_meshes_and_textures_load(world: Path) -> None:
-    seen = check_world(world, (0, 0, 2))
+    seen = check_world(world)
     assert seen["world"] == "town"
     meshes = {mesh["file"]: mesh["role"] for mesh in seen["meshes"]}
     for i in range(3):
         folder = f"models/tile{i}/meshes"
         assert meshes[f"{folder}/terrain.obj"] == meshes[f"{folder}/building.obj"] == "visual"
-        assert meshes[f"{folder}/collision.obj"] == "collision" and meshes[f"{folder}/terrain.dae"] == "spare"
-    assert len(meshes) == 15
+        assert meshes[f"{folder}/collision_terrain.obj"] == "collision" and meshes[f"{folder}/terrain.dae"] == "spare"
+    assert len(meshes) == 18
 
 
 @pytest.mark.parametrize("tile", [0, 2])  # the world's origin is the second tile's
 def test_a_box_comes_to_rest_on_the_roof_of_each_tile(world: Path, tile: int) -> None:
     x, y = made_up.HOUSE[0] + 1.5 + EAST * (tile - 1), made_up.HOUSE[1] + 1
     roof = 4.5 - DOWN * (tile - 1)
-    assert check_world(world, (x, y, roof + 1.5))["rest"] == pytest.approx([x, y, roof + BOX], abs=0.02)
+    assert check_world(world, ("box", (x, y, roof + 1.5)))["bodies"][0]["rest"] == pytest.approx(
+        [x, y, roof + BOX], abs=0.02
+    )
 
 
 def test_the_world_stands_where_its_middle_tile_does(world: Path) -> None:
-    place = check_world(world, (0, 0, 2))["spherical"]
+    place = check_world(world)["spherical"]
     assert [place["latitude"], place["longitude"]] == pytest.approx(
         present(crs.to_wgs84(made_up.UTM, (EAST, 0, 0)))[:2], abs=1e-8
     )

@@ -14,6 +14,7 @@ from scan2sim.pipeline.io import geojson
 from scan2sim.pipeline.io.scene import Scene, describe, keep, read_scene
 from scan2sim.pipeline.step import Done, silent
 from scan2sim.pipeline.steps.collision import COLLISION, CollisionParams
+from scan2sim.pipeline.steps.decimate import with_things
 from scan2sim.pipeline.steps.export import EXPORT, ExportParams
 from scan2sim.pipeline.types import Frame, Mesh
 
@@ -79,13 +80,16 @@ def textured(folder: Path, mesh: Mesh) -> Path:
     return folder
 
 
-def world(folder: Path, frame: Frame = UTM, name: str = "street", **params: Any) -> Done:
-    """The made-up tile, collision made and exported below `folder`."""
+def world(folder: Path, frame: Frame = UTM, name: str = "street", things: Mesh | None = None, **params: Any) -> Done:
+    """The made-up tile, collision made (with street furniture, if any) and exported below `folder`."""
     meshes = {"terrain": ground(frame=frame), "building": house(frame)}
     inputs = {group: textured(folder / group, mesh) for group, mesh in meshes.items()}
     solid = folder / "collision"
     solid.mkdir()
     sources = {group: path / "mesh.npz" for group, path in inputs.items()}
+    if things is not None:
+        sources["building"] = folder / "furnished.npz"
+        with_things(replace(house(frame), uv=None, page=None), things).save(sources["building"])
     made = COLLISION.run(sources, CollisionParams(triangles=1000), solid, silent)
     out = folder / "export"
     out.mkdir()

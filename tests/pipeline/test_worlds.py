@@ -120,10 +120,10 @@ def test_nothing_is_done_where_nothing_has_changed(tmp_path: Path) -> None:
     assert len(warned) == 1 and "tile0/model.sdf was changed since it was made" in warned[0]
     assemble(tmp_path, "town", row, buffer=5)
     assert _snapshot(folder) != before and _root(folder / "town.sdf").findtext(".//level/buffer") == "5"
-    (folder / "models/tile1/meshes/collision.obj").unlink()
+    (folder / "models/tile1/meshes/collision_terrain.obj").unlink()
     assemble(tmp_path, "town", row, buffer=5)
-    assert (folder / "models/tile1/meshes/collision.obj").is_file()
-    damaged = folder / "models/tile1/meshes/collision.obj"
+    assert (folder / "models/tile1/meshes/collision_terrain.obj").is_file()
+    damaged = folder / "models/tile1/meshes/collision_terrain.obj"
     whole = damaged.read_bytes()
     damaged.unlink()
     damaged.write_bytes(b"x" * len(whole))  # as many bytes

@@ -1,7 +1,8 @@
 """Gazebo: a world and a static model for each tile, in SDF; meshes in the formats of `export.meshes`.
 
 Layout: `<name>.sdf`, and for each tile `models/<tile>/` with `model.sdf`, `model.config` and `meshes/`: a file a class
-(a visual with its label) and `collision.obj`. Tiles of a survey are in levels that a simulator loads by itself.
+(a visual with its label), and of what bodies collide with (`collision_<class>.obj`; poles and trunks are cylinders).
+Tiles of a survey are in levels that a simulator loads by itself.
 """
 
 from __future__ import annotations
@@ -13,7 +14,9 @@ from scan2sim.pipeline.io import scenes, sdf
 from scan2sim.pipeline.io.meshes import obj
 from scan2sim.pipeline.io.scene import Scene, SceneTile, by_class
 from scan2sim.pipeline.io.scenes import SHOWN, SceneParams
+from scan2sim.pipeline.solids import solids
 from scan2sim.pipeline.step import Report
+from scan2sim.pipeline.types import Mesh
 
 
 def write(scene: Scene, folder: Path, params: SceneParams, report: Report) -> dict[str, int]:
@@ -47,7 +50,10 @@ def _model(folder: Path, tile: SceneTile, params: SceneParams) -> dict[str, int]
                     form.write(meshes / f"{part.name}{form.SUFFIX}", part.shape, names)
                     triangles[f"{part.name}{form.SUFFIX}"] = len(part.shape)
                 labels[f"meshes/{part.name}{shown}"] = part.code
-    solid = tile.solid()
-    obj.write_plain(meshes / "collision.obj", solid)
-    sdf.write_model(folder, tile.name, labels, "meshes/collision.obj", tile.friction)
-    return triangles | {"collision.obj": len(solid)}
+    bodies = solids(tile.solid(), tile.friction)
+    for body in bodies:
+        if isinstance(body.shape, Mesh):
+            obj.write_plain(meshes / f"collision_{body.name}.obj", body.shape)
+            triangles[f"collision_{body.name}.obj"] = len(body.shape)
+    sdf.write_model(folder, tile.name, labels, bodies)
+    return triangles

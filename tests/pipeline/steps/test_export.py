@@ -48,7 +48,8 @@ def test_layout(tmp_path: Path) -> None:
         "metadata.json",
         "models/street/model.sdf",
         "models/street/model.config",
-        f"{meshes}/collision.obj",
+        f"{meshes}/collision_terrain.obj",
+        f"{meshes}/collision_building.obj",
     }
 
 
@@ -57,7 +58,7 @@ def test_model_names_files_that_exist(tmp_path: Path) -> None:
     model = present(ET.parse(world / "models/street/model.sdf").getroot().find("model"))
     assert model.findtext("static") == "true"
     uris = [present(uri.text) for uri in model.iter("uri")]
-    assert len(uris) == 3
+    assert len(uris) == 4
     for uri in uris:
         assert (world / uri.replace("model://", "models/")).is_file()
     friction = present(model.find("link/collision/surface/friction"))
@@ -114,7 +115,7 @@ def test_a_local_tile_has_no_georeference(tmp_path: Path) -> None:
 
 def test_formats_are_chosen(tmp_path: Path) -> None:
     world = made_up.world(tmp_path, formats=("gazebo",), meshes=("collada",)).files["world"]
-    assert not list(world.rglob("*.glb")) and [p.name for p in world.rglob("*.obj")] == ["collision.obj"]
+    assert not list(world.rglob("*.glb")) and all(p.name.startswith("collision_") for p in world.rglob("*.obj"))
     assert "terrain.dae" in (world / "models/street/model.sdf").read_text()
     with pytest.raises(SettingError, match=r"export.meshes: has nothing that Gazebo shows"):
         EXPORT.run({}, ExportParams(meshes=()), tmp_path, silent)
