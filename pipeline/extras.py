@@ -23,6 +23,7 @@ EXTRA_OF = {
     "ray": "ray",
     "s3fs": "s3",
     "rasterio": "rasters",
+    "pxr": "usd",
     "cyclonedds": "bus",
     "rosbags": "bus",
     "confluent_kafka": "bus",

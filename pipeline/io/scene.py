@@ -22,10 +22,10 @@ import numpy as np
 
 from scan2sim.pipeline.classes import CODE_OF_SURFACE, SURFACES, name_of
 from scan2sim.pipeline.errors import DataError, InputError
-from scan2sim.pipeline.io import textured
+from scan2sim.pipeline.io import image, textured
 from scan2sim.pipeline.io.files import make_folder, pass_on
 from scan2sim.pipeline.io.textured import Textured
-from scan2sim.pipeline.types import Frame, Mesh
+from scan2sim.pipeline.types import U8, Frame, Mesh
 
 FOLDER, ABOUT, TILE, SOLID = "scene", "scene.json", "tile.json", "collision.npz"
 VERSION = 1
@@ -57,6 +57,25 @@ class Surface:
     def on_page(self, page: int) -> Surface:
         """The faces on a texture page."""
         return replace(self, shape=self.shape.on_page(page))
+
+    def seen(self) -> U8 | None:
+        """(F,) what the middle of each face has its colour from, as the step `texture` codes it; None: not known."""
+        from scan2sim.pipeline.sampling import of_uv
+
+        shape = self.shape
+        assert shape.mesh.uv is not None and shape.mesh.page is not None
+        if len(shape.seen) < len(shape.pages):
+            return None
+        found = np.zeros(len(shape), np.uint8)
+        for page in shape.used_pages:
+            here = shape.mesh.page == page
+            levels = image.read_levels(shape.seen[page])
+            column, row = of_uv(levels, *shape.mesh.uv[here].mean(axis=1).T)
+            rows, columns = levels.shape
+            found[here] = levels[
+                np.rint(row).astype(int).clip(0, rows - 1), np.rint(column).astype(int).clip(0, columns - 1)
+            ]
+        return found
 
     def parts(self, limit: int) -> list[Surface]:
         """Compact parts of at most `limit` triangles, named `_part1` and on; itself where it is small enough."""

@@ -19,7 +19,7 @@ Choices, and why:
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from math import degrees
 from pathlib import Path
@@ -210,7 +210,7 @@ def _world(path: Path, name: str, place: Georeference | None, content: str, note
 def _include(name: str, offset: Vector) -> str:
     return f"""    <include>
       <uri>model://{name}</uri>
-      <pose>{_numbers(offset)} 0 0 0</pose>
+      <pose>{numbers(offset)} 0 0 0</pose>
     </include>
 """
 
@@ -232,8 +232,8 @@ def _level(tile: Placed, buffer: float) -> str:
     x, y, z = (offset + (low + high) / 2 for offset, low, high in corners)
     dx, dy, dz = (high - low + 2 * r for (_, low, high), r in zip(corners, reach, strict=True))
     return f"""      <level name="{tile.name}_level">
-        <pose>{_numbers((x, y, z))} 0 0 0</pose>
-        <geometry><box><size>{_numbers((dx, dy, dz))}</size></box></geometry>
+        <pose>{numbers((x, y, z))} 0 0 0</pose>
+        <geometry><box><size>{numbers((dx, dy, dz))}</size></box></geometry>
         <buffer>{buffer:g}</buffer>
         <ref>{tile.name}</ref>
       </level>
@@ -289,5 +289,6 @@ def _spherical(place: Georeference | None) -> str:
 """
 
 
-def _numbers(values: Vector) -> str:
+def numbers(values: Iterable[float]) -> str:
+    """As XML has them, to a thousandth of a millimetre."""
     return " ".join(f"{value:.6f}".rstrip("0").rstrip(".") for value in values)

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -17,8 +18,8 @@ from scan2sim.pipeline.backends import find, names
 from scan2sim.pipeline.errors import SettingError
 from scan2sim.pipeline.io import image, sdf
 from scan2sim.pipeline.io.files import make_folder
-from scan2sim.pipeline.io.meshes import PageNames
-from scan2sim.pipeline.io.scene import Scene
+from scan2sim.pipeline.io.meshes import PageNames, obj
+from scan2sim.pipeline.io.scene import Scene, SceneTile, by_class
 from scan2sim.pipeline.io.textured import Textured
 from scan2sim.pipeline.step import Params, Report
 
@@ -134,3 +135,35 @@ def write_pages(folder: Path, group: str, shape: Textured, params: SceneParams) 
         else:
             image.write(folder / images[page], image.read_rgb(shape.pages[page]), quality=params.jpeg_quality)
     return PageNames(group, materials, images, tuple(shape.used_pages))
+
+
+@dataclass(frozen=True)
+class Single:
+    """A mesh file with one material, which is all that some readers take.
+
+    Attributes:
+        name: of the file, without its suffix, and of its material.
+        code: LAS code of its class.
+        label: its name.
+        image: name of its texture page's file, in the same folder.
+        triangles: how many.
+    """
+
+    name: str
+    code: int
+    label: str
+    image: str
+    triangles: int
+
+
+def write_single(folder: Path, tile: SceneTile, params: SceneParams) -> Iterator[Single]:
+    """Write an OBJ for each class and page of a tile below `folder`, and its pages."""
+    for group, shape in tile.textured().items():
+        pages = write_pages(folder, group, shape, params)
+        for surface in by_class(group, shape):
+            for page in surface.shape.used_pages:
+                for part in surface.on_page(page).parts(params.max_visual_triangles):
+                    name = f"{part.name}_{page}"
+                    names = PageNames(name, pages.materials, pages.images, (page,))
+                    obj.write(folder / f"{name}.obj", part.shape, names)
+                    yield Single(name, part.code, part.label, pages.images[page], len(part.shape))

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 
 from scan2sim.pipeline.io.scene import Scene
 
@@ -82,4 +83,61 @@ def glb(folder: Path, scene: Scene) -> Iterator[Shown]:
             yield Shown(mesh.metadata["class"], corners, mesh.visual.uv[mesh.faces], picture)
 
 
-READERS: dict[str, Callable[[Path, Scene], Iterator[Shown]]] = {"gazebo": gazebo, "glb": glb}
+def usd(folder: Path, scene: Scene) -> Iterator[Shown]:
+    from pxr import Usd, UsdGeom, UsdSemantics, UsdShade
+
+    stage = Usd.Stage.Open(str(folder / f"{scene.name}.usdc"))
+    assert UsdGeom.GetStageUpAxis(stage) == "Z" and UsdGeom.GetStageMetersPerUnit(stage) == 1
+    for prim in stage.Traverse():
+        if not prim.IsA(UsdGeom.Mesh) or UsdGeom.Imageable(prim).ComputePurpose() != "default":
+            continue
+        mesh = UsdGeom.Mesh(prim)
+        assert mesh.GetSubdivisionSchemeAttr().Get() == "none"
+        place = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(prim))
+        index = np.array(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
+        corners = (np.array(mesh.GetPointsAttr().Get()) @ place[:3, :3] + place[3, :3])[index]
+        uv = np.array(UsdGeom.PrimvarsAPI(prim).GetPrimvar("st").ComputeFlattened()).reshape(-1, 3, 2)
+        (label,) = UsdSemantics.LabelsAPI(prim, "class").GetLabelsAttr().Get()
+        for subset in UsdGeom.Subset.GetAllGeomSubsets(mesh):
+            look = UsdShade.MaterialBindingAPI(subset.GetPrim()).ComputeBoundMaterial()[0]
+            page = UsdShade.Shader(stage.GetPrimAtPath(look.GetPath().AppendChild("page")))
+            file = Path(page.GetInput("file").Get().resolvedPath)
+            faces = np.array(subset.GetIndicesAttr().Get())
+            yield Shown(label, corners[faces], uv[faces], image(file))
+
+
+def mujoco(folder: Path, scene: Scene) -> Iterator[Shown]:
+    mj = pytest.importorskip("mujoco", reason="mujoco is not installed")
+    model = mj.MjModel.from_xml_path(str(folder / f"{scene.name}.xml"))
+    data = mj.MjData(model)
+    mj.mj_forward(model, data)
+    for geom in np.flatnonzero(model.geom_type == mj.mjtGeom.mjGEOM_MESH):
+        mesh = model.geom_dataid[geom]
+        v = model.mesh_vert[model.mesh_vertadr[mesh] :][: model.mesh_vertnum[mesh]]
+        uv = model.mesh_texcoord[model.mesh_texcoordadr[mesh] :][: model.mesh_texcoordnum[mesh]]
+        face = slice(model.mesh_faceadr[mesh], model.mesh_faceadr[mesh] + model.mesh_facenum[mesh])
+        world = v @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
+        texture = model.mat_texid[model.geom_matid[geom]].max()
+        height, width = model.tex_height[texture], model.tex_width[texture]
+        start, channels = model.tex_adr[texture], model.tex_nchannel[texture]
+        picture = model.tex_data[start : start + height * width * channels].reshape(height, width, channels)
+        corner_uv = uv[model.mesh_facetexcoord[face]] * (1, -1) + (0, 1)  # its pictures begin at v = 0
+        yield Shown(int(model.geom_user[geom, 0]), world[model.mesh_face[face]], corner_uv, picture[..., :3])
+
+
+def urdf(folder: Path, scene: Scene) -> Iterator[Shown]:
+    robot = ET.parse(folder / f"{scene.name}.urdf").getroot()
+    places = {"world": np.zeros(3)}
+    for joint in robot.iter("joint"):
+        parent, child, origin = joint.find("parent"), joint.find("child"), joint.find("origin")
+        assert parent is not None and child is not None and origin is not None
+        places[child.attrib["link"]] = places[parent.attrib["link"]] + np.array(origin.attrib["xyz"].split(), float)
+    for link in robot.iter("link"):
+        for mesh in link.iterfind("visual/geometry/mesh"):
+            ((corners, uv, picture),) = obj(folder / mesh.attrib["filename"])
+            name = link.attrib["name"]
+            yield Shown(int(name.split("/")[-1]), corners + places[name], uv, picture)
+
+
+Reader = Callable[[Path, Scene], Iterator[Shown]]
+READERS: dict[str, Reader] = {"gazebo": gazebo, "glb": glb, "usd": usd, "mujoco": mujoco, "urdf": urdf}

@@ -1,0 +1,75 @@
+"""URDF, for PyBullet: a link a class, so that its segmentation camera tells classes; a concave mesh to collide with.
+
+Layout: `<name>.urdf`, and for each tile `urdf/<tile>/` with an OBJ for each class and texture page, the pages, and
+`collision.obj`. Load it with `useFixedBase=True`; links are named `<tile>/<class>/<LAS code>`. The first class's link
+has the collision mesh: PyBullet would draw that of a link that shows nothing.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from scan2sim.pipeline.io import scenes, sdf
+from scan2sim.pipeline.io.files import make_folder
+from scan2sim.pipeline.io.meshes import obj
+from scan2sim.pipeline.io.scene import Scene, SceneTile
+from scan2sim.pipeline.io.scenes import SceneParams, Single
+from scan2sim.pipeline.step import Report
+
+FOLDER = "urdf"
+STATIC = '<inertial><mass value="0"/><inertia ixx="0" ixy="0" ixz="0" iyy="0" iyz="0" izz="0"/></inertial>'
+
+
+def write(scene: Scene, folder: Path, params: SceneParams, report: Report) -> dict[str, int]:
+    """Write the robot that is a world, and its meshes."""
+    triangles: dict[str, int] = {}
+    links = [f'  <link name="world">\n    {STATIC}\n  </link>\n']
+    for i, tile in enumerate(scene.tiles):
+        report(i / len(scene.tiles), tile.name)
+        place = folder / FOLDER / tile.name
+        make_folder(place)
+        shown: dict[tuple[str, int], list[Single]] = {}
+        for part in scenes.write_single(place, tile, params):
+            shown.setdefault((part.label, part.code), []).append(part)
+            triangles[f"{FOLDER}/{tile.name}/{part.name}.obj"] = part.triangles
+        hull = tile.solid()
+        obj.write_plain(place / "collision.obj", hull)
+        triangles[f"{FOLDER}/{tile.name}/collision.obj"] = len(hull)
+        links.append(_link(tile.name, "") + _joint("world", tile.name, sdf.numbers(tile.offset)))
+        solid = _solid(tile)
+        for (label, code), parts in shown.items():
+            name = f"{tile.name}/{label}/{code}"
+            content = solid + "".join(_visual(tile, part) for part in parts)
+            links.append(_link(name, content) + _joint(tile.name, name, "0 0 0"))
+            solid = ""
+    text = f'<?xml version="1.0"?>\n<robot name="{scene.name}">\n{"".join(links)}</robot>\n'
+    (folder / f"{scene.name}.urdf").write_text(text, encoding="ascii")
+    return triangles
+
+
+def _link(name: str, content: str) -> str:
+    return f'  <link name="{name}">\n    {STATIC}\n{content}  </link>\n'
+
+
+def _joint(parent: str, child: str, offset: str) -> str:
+    return f"""  <joint name="{child}/place" type="fixed">
+    <parent link="{parent}"/>
+    <child link="{child}"/>
+    <origin xyz="{offset}" rpy="0 0 0"/>
+  </joint>
+"""
+
+
+def _visual(tile: SceneTile, part: Single) -> str:
+    return f"""    <visual name="{part.name}">
+      <geometry><mesh filename="{FOLDER}/{tile.name}/{part.name}.obj"/></geometry>
+    </visual>
+"""
+
+
+def _solid(tile: SceneTile) -> str:
+    return f"""    <contact><lateral_friction value="{tile.friction:g}"/></contact>
+    <collision concave="yes">
+      <geometry><mesh filename="{FOLDER}/{tile.name}/collision.obj"/></geometry>
+    </collision>
+"""

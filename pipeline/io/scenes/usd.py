@@ -1,0 +1,191 @@
+"""OpenUSD: crate files, Z-up, metres; a payload a tile, so that large worlds load by parts.
+
+Layout: `<name>.usdc` places the tiles; `usd/<tile>.usdc` is a tile (`Looks`, `Visual`, `Collision`), with its texture
+pages in `usd/<tile>/`. Labels are `UsdSemanticsLabelsAPI:class`. Where the world is on the map stands in the custom
+data of the root layer and of `/World`: USD has no schema for it.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scan2sim.pipeline.io import scenes, sdf
+from scan2sim.pipeline.io.files import make_folder
+from scan2sim.pipeline.io.scene import Scene, SceneTile, Surface, by_class
+from scan2sim.pipeline.io.scenes import SceneParams
+from scan2sim.pipeline.io.textured import unique_uv, vertex_normals
+from scan2sim.pipeline.step import Report
+from scan2sim.pipeline.types import F32, Mesh
+
+NEEDS = ("pxr",)
+FOLDER = "usd"
+SKY = 1000.0
+"""Nits of an even sky: the photos hold the light of their day."""
+
+
+def write(scene: Scene, folder: Path, params: SceneParams, report: Report) -> dict[str, int]:
+    """Write the root layer and a layer for each tile."""
+    from pxr import Gf, Kind, Usd, UsdGeom, UsdLux, UsdPhysics
+
+    make_folder(folder / FOLDER)
+    triangles = {}
+    stage = _stage(folder / f"{scene.name}.usdc")
+    world = UsdGeom.Xform.Define(stage, "/World")
+    stage.SetDefaultPrim(world.GetPrim())
+    Usd.ModelAPI(world).SetKind(Kind.Tokens.assembly)
+    place = _georeference(scene)
+    stage.GetRootLayer().customLayerData = {"scan2sim": place}
+    world.GetPrim().SetCustomDataByKey("scan2sim", place)
+    UsdPhysics.Scene.Define(stage, "/World/Physics").CreateGravityDirectionAttr(Gf.Vec3f(0, 0, -1))
+    UsdLux.DomeLight.Define(stage, "/World/Sky").CreateIntensityAttr(SKY)
+    for i, tile in enumerate(scene.tiles):
+        report(i / len(scene.tiles), tile.name)
+        file = f"{FOLDER}/{tile.name}.usdc"
+        triangles[file] = _write_tile(folder / file, tile, params)
+        placed = UsdGeom.Xform.Define(stage, f"/World/{_prim(tile.name)}")
+        placed.AddTranslateOp().Set(Gf.Vec3d(*tile.offset))
+        placed.GetPrim().GetPayloads().AddPayload(f"./{file}")
+    stage.GetRootLayer().Save()
+    return triangles
+
+
+def _write_tile(path: Path, tile: SceneTile, params: SceneParams) -> int:
+    """Write a tile's layer, local metres; how many triangles it shows."""
+    from pxr import Kind, Usd, UsdGeom
+
+    stage = _stage(path)
+    root = UsdGeom.Xform.Define(stage, f"/{_prim(tile.name)}")
+    stage.SetDefaultPrim(root.GetPrim())
+    Usd.ModelAPI(root).SetKind(Kind.Tokens.component)
+    for scope in ("Looks", "Visual"):
+        UsdGeom.Scope.Define(stage, root.GetPath().AppendChild(scope))
+    triangles = 0
+    for group, shape in tile.textured().items():
+        pages = scenes.write_pages(path.with_suffix(""), group, shape, params)
+        looks = {
+            page: _look(stage, root, pages.materials[page], f"./{tile.name}/{pages.images[page]}")
+            for page in pages.used
+        }
+        for surface in by_class(group, shape):
+            for part in surface.parts(params.max_visual_triangles):
+                _show(stage, root, part, looks)
+                triangles += len(part.shape)
+    _collide(stage, root, tile.solid(), tile.friction)
+    stage.GetRootLayer().Save()
+    return triangles
+
+
+def _show(stage: Any, root: Any, surface: Surface, looks: dict[int, Any]) -> None:
+    """A surface, a subset of its faces for each page, with its labels."""
+    from pxr import Sdf, UsdGeom, UsdSemantics, UsdShade, Vt
+
+    shape = surface.shape
+    assert shape.mesh.uv is not None and shape.mesh.page is not None
+    mesh = _mesh(stage, root.GetPath().AppendPath(f"Visual/{surface.name}"), shape.mesh, shape.normal)
+    uv, corner_uv = unique_uv(shape.mesh.uv)
+    primvars = UsdGeom.PrimvarsAPI(mesh)
+    st = primvars.CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.faceVarying)
+    st.Set(Vt.Vec2fArray.FromNumpy(uv))
+    st.SetIndices(Vt.IntArray.FromNumpy(corner_uv.ravel()))
+    seen = surface.seen()
+    if seen is not None:
+        given = primvars.CreatePrimvar("scan2sim:seen", Sdf.ValueTypeNames.IntArray, UsdGeom.Tokens.uniform)
+        given.Set(Vt.IntArray.FromNumpy(seen.astype(np.int32)))
+    prim = mesh.GetPrim()
+    for taxonomy, label in {"class": surface.label, "las_code": str(surface.code)}.items():
+        UsdSemantics.LabelsAPI.Apply(prim, taxonomy).CreateLabelsAttr([label])
+    UsdShade.MaterialBindingAPI.Apply(prim)
+    for page in shape.used_pages:
+        faces = np.flatnonzero(shape.mesh.page == page).astype(np.int32)
+        subset = UsdGeom.Subset.CreateGeomSubset(
+            mesh, f"page_{page}", UsdGeom.Tokens.face, Vt.IntArray.FromNumpy(faces),
+            UsdShade.Tokens.materialBind, UsdGeom.Tokens.partition,
+        )  # fmt: skip
+        UsdShade.MaterialBindingAPI.Apply(subset.GetPrim()).Bind(looks[page])
+
+
+def _collide(stage: Any, root: Any, solid: Mesh, friction: float) -> None:
+    """What bodies collide with: static, as it is, and not drawn."""
+    from pxr import UsdGeom, UsdPhysics, UsdShade
+
+    mesh = _mesh(stage, root.GetPath().AppendChild("Collision"), solid, vertex_normals(solid))
+    mesh.CreatePurposeAttr(UsdGeom.Tokens.guide)
+    prim = mesh.GetPrim()
+    UsdPhysics.CollisionAPI.Apply(prim)
+    UsdPhysics.MeshCollisionAPI.Apply(prim).CreateApproximationAttr(UsdPhysics.Tokens.none)
+    material = UsdShade.Material.Define(stage, root.GetPath().AppendPath("Looks/Ground"))
+    physics = UsdPhysics.MaterialAPI.Apply(material.GetPrim())
+    physics.CreateStaticFrictionAttr(friction)
+    physics.CreateDynamicFrictionAttr(friction)
+    binding = UsdShade.MaterialBindingAPI.Apply(prim)
+    binding.Bind(material, UsdShade.Tokens.weakerThanDescendants, "physics")
+
+
+def _mesh(stage: Any, path: Any, mesh: Mesh, normal: F32) -> Any:
+    """Triangles as they are: no subdivision."""
+    from pxr import UsdGeom, Vt
+
+    made = UsdGeom.Mesh.Define(stage, path)
+    made.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    made.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(mesh.vertices))
+    made.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(normal))
+    made.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+    made.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(mesh.faces.ravel()))
+    made.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(mesh), 3, np.int32)))
+    made.CreateExtentAttr(UsdGeom.PointBased.ComputeExtent(made.GetPointsAttr().Get()))
+    return made
+
+
+def _look(stage: Any, root: Any, name: str, image: str) -> Any:
+    """A matt material of a texture page."""
+    from pxr import Sdf, UsdShade
+
+    path = root.GetPath().AppendPath(f"Looks/{name}")
+    material = UsdShade.Material.Define(stage, path)
+    places = UsdShade.Shader.Define(stage, path.AppendChild("st"))
+    places.CreateIdAttr("UsdPrimvarReader_float2")
+    places.CreateInput("varname", Sdf.ValueTypeNames.String).Set("st")
+    page = UsdShade.Shader.Define(stage, path.AppendChild("page"))
+    page.CreateIdAttr("UsdUVTexture")
+    page.CreateInput("file", Sdf.ValueTypeNames.Asset).Set(image)
+    page.CreateInput("sourceColorSpace", Sdf.ValueTypeNames.Token).Set("sRGB")
+    page.CreateInput("wrapS", Sdf.ValueTypeNames.Token).Set("clamp")
+    page.CreateInput("wrapT", Sdf.ValueTypeNames.Token).Set("clamp")
+    st = places.CreateOutput("result", Sdf.ValueTypeNames.Float2)
+    page.CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(st)
+    surface = UsdShade.Shader.Define(stage, path.AppendChild("surface"))
+    surface.CreateIdAttr("UsdPreviewSurface")
+    surface.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(1.0)
+    surface.CreateInput("metallic", Sdf.ValueTypeNames.Float).Set(0.0)
+    colour = page.CreateOutput("rgb", Sdf.ValueTypeNames.Float3)
+    surface.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).ConnectToSource(colour)
+    shown = surface.CreateOutput("surface", Sdf.ValueTypeNames.Token)
+    material.CreateSurfaceOutput().ConnectToSource(shown)
+    return material
+
+
+def _georeference(scene: Scene) -> dict[str, Any]:
+    """Where the world is on the map, as numbers and text that USD keeps."""
+    from pxr import Gf
+
+    place = sdf.Georeference.of(scene.frame)
+    own = {"crs": scene.frame.crs, "worldOriginMetres": Gf.Vec3d(*scene.origin), "unitMetres": scene.frame.unit}
+    return own if place is None else {**own, "wgs84": place.facts()}
+
+
+def _stage(path: Path) -> Any:
+    from pxr import Usd, UsdGeom, UsdPhysics
+
+    stage = Usd.Stage.CreateNew(str(path))
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    UsdPhysics.SetStageKilogramsPerUnit(stage, 1.0)
+    return stage
+
+
+def _prim(name: str) -> str:
+    """A tile's name for a prim, which begins with no digit."""
+    return f"tile_{name}" if name[0].isdigit() else name

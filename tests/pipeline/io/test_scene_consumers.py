@@ -1,0 +1,131 @@
+"""Simulators and validators take what is exported; each is skipped with a reason where it is not installed."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from scan2sim.pipeline.io import scenes
+from scan2sim.pipeline.io.scene import Scene
+from scan2sim.pipeline.io.scenes import SceneParams
+from scan2sim.pipeline.step import silent
+from tests.pipeline import made_up
+
+RADIUS = 0.2  # of the ball that is dropped, metres
+PLACES = [(-4.7, 0.3), (3.0, -6.0), (12.6, 1.0), (25.0, 8.0), (31.0, -4.0)]
+"""Of balls, metres from the scene's origin: on both tiles, and where they meet (from 10 to 15 m there is neither)."""
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return made_up.scene(tmp_path_factory.mktemp("town"))
+
+
+def module(name: str) -> Any:
+    return pytest.importorskip(name, reason=f"{name} is not installed")
+
+
+def export(scene: Scene, name: str, folder: Path) -> Path:
+    scenes.write(scene, [name], folder, SceneParams(), silent)
+    return folder
+
+
+def ground(x: float, y: float) -> float:
+    """Height of the made-up scene's ground, which is of squares of 2 m."""
+    tile = 0 if x < 12.5 else 1
+    return float(made_up.height(np.array(x - 25 * tile), np.array(y - 3 * tile))) - tile
+
+
+def test_a_ball_rests_on_mujocos_ground_and_none_falls_through(town: Scene, tmp_path: Path) -> None:
+    mujoco = module("mujoco")
+    path = export(town, "mujoco", tmp_path) / "town.xml"
+    spec = mujoco.MjSpec.from_file(str(path))
+    on = [(x, y) for x, y in PLACES if not 10 < x < 15]
+    for i, (x, y) in enumerate(on):
+        ball = spec.worldbody.add_body(name=f"ball{i}", pos=[x, y, 2.0])
+        ball.add_freejoint()
+        ball.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[RADIUS] * 3, mass=10)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, nstep=int(2 / model.opt.timestep))
+    for i, (x, y) in enumerate(on):
+        assert data.body(f"ball{i}").xpos[2] == pytest.approx(ground(x, y) + RADIUS, abs=0.12)
+
+
+def test_mujocos_walls_and_poles_are_solid_where_they_stand(town: Scene, tmp_path: Path) -> None:
+    mujoco = module("mujoco")
+    model = mujoco.MjModel.from_xml_path(str(export(town, "mujoco", tmp_path) / "town.xml"))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    hit = np.zeros(1, np.int32)
+    solid = np.array([0, 0, 0, 1, 0, 0], np.uint8)  # the geom group of what collides
+
+    def reach(start: tuple[float, float, float], along: tuple[float, float, float]) -> float:
+        return float(mujoco.mj_ray(model, data, np.array(start), np.array(along), solid, 1, -1, hit))
+
+    x, y = made_up.HOUSE
+    assert reach((x - 3, y + 1, 2), (1, 0, 0)) == pytest.approx(3, abs=0.25)  # the west wall
+    assert reach((x + 1.5, y + 1, 8), (0, 0, -1)) == pytest.approx(3.5, abs=0.3)  # the roof
+    assert reach((-7, -5, 2), (1, 0, 0)) == pytest.approx(1.9, abs=0.01)  # the pole
+
+
+def test_a_ball_rests_on_pybullets_ground_and_its_camera_tells_classes(town: Scene, tmp_path: Path) -> None:
+    bullet = module("pybullet")
+    path = export(town, "urdf", tmp_path) / "town.urdf"
+    client = bullet.connect(bullet.DIRECT)
+    try:
+        bullet.setGravity(0, 0, -9.8)
+        body = bullet.loadURDF(str(path), useFixedBase=True)
+        names = {i: bullet.getJointInfo(body, i)[12].decode() for i in range(bullet.getNumJoints(body))}
+        assert set(names.values()) >= {"tile0", "tile1", "tile0/terrain/2", "tile1/road_sign/64"}
+        shape = bullet.createCollisionShape(bullet.GEOM_SPHERE, radius=RADIUS)
+        on = [(x, y) for x, y in PLACES if not 10 < x < 15]
+        balls = [bullet.createMultiBody(10, shape, basePosition=[x, y, ground(x, y) + 0.5]) for x, y in on]
+        for ball in balls:
+            bullet.changeDynamics(ball, -1, rollingFriction=0.1, spinningFriction=0.1)
+        for _ in range(240):
+            bullet.stepSimulation()
+        for ball in balls:
+            x, y, z = bullet.getBasePositionAndOrientation(ball)[0]
+            assert z == pytest.approx(ground(x, y) + RADIUS, abs=0.12)
+        x, y = made_up.HOUSE
+        view = bullet.computeViewMatrix([x - 4, y + 1, 2], [x, y + 1, 2], [0, 0, 1])
+        lens = bullet.computeProjectionMatrixFOV(60, 1, 0.1, 100)
+        flag = bullet.ER_SEGMENTATION_MASK_OBJECT_AND_LINKINDEX
+        picture = bullet.getCameraImage(64, 64, view, lens, flags=flag, renderer=bullet.ER_TINY_RENDERER)
+        mask = np.reshape(picture[4], (64, 64))
+        assert names[int(mask[32, 32] >> 24) - 1] == "tile0/building/6"
+        assert names[int(mask[60, 32] >> 24) - 1] == "tile0/terrain/2"
+    finally:
+        bullet.disconnect(client)
+
+
+def test_usd_has_no_fault(town: Scene, tmp_path: Path) -> None:
+    module("pxr")
+    from pxr import Usd, UsdGeom, UsdPhysics, UsdValidation
+
+    path = str(export(town, "usd", tmp_path) / "town.usdc")
+    every = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    faults = UsdValidation.ValidationContext(every).Validate(Usd.Stage.Open(path))
+    assert len(every) > 20 and not [fault.GetErrorAsString() for fault in faults]
+    bare = Usd.Stage.Open(path, Usd.Stage.LoadNone)
+    assert not [prim for prim in bare.Traverse() if prim.IsA(UsdGeom.Mesh)]  # tiles load one by one
+    bare.Load("/World/tile1")
+    solid = bare.GetPrimAtPath("/World/tile1/Collision")
+    assert solid.HasAPI(UsdPhysics.CollisionAPI) and UsdGeom.Imageable(solid).ComputePurpose() == "guide"
+    place = bare.GetDefaultPrim().GetCustomDataByKey("scan2sim")
+    assert place["crs"] == "EPSG:32632" and tuple(place["worldOriginMetres"]) == made_up.UTM.origin
+
+
+def test_omniverses_validator_finds_nothing_that_fails(town: Scene, tmp_path: Path) -> None:
+    module("pxr")
+    if importlib.util.find_spec("omni") is None:
+        pytest.skip("omniverse-asset-validator is not installed")
+    from omni.asset_validator import ValidationEngine
+
+    issues = ValidationEngine().validate(str(export(town, "usd", tmp_path) / "town.usdc")).issues()
+    assert not [str(issue.message) for issue in issues if issue.severity.name in ("ERROR", "FAILURE")]
