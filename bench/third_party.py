@@ -41,7 +41,8 @@ BUNDLED = {
     "scipy_openblas64_": "BSD-3-Clause", "sharpyuv": "BSD-3-Clause", "sqlite3": "public domain",
     "ssl": "OpenSSL (1.1) or Apache-2.0 (3)", "SvtAv1Enc": "BSD-3-Clause-Clear", "swresample": FFMPEG,
     "swscale": FFMPEG, "sz": "BSD-2-Clause", "tbb": "Apache-2.0", "tiff": "libtiff", "unistring": NETTLE,
-    "usd_ms": "LicenseRef-TOST-1.0", "vpl": "MIT", "vpx": "BSD-3-Clause", "webp": "BSD-3-Clause", "webpdemux": "BSD-3-Clause", "webpmux": "BSD-3-Clause",
+    "usd_ms": "LicenseRef-TOST-1.0", "vpl": "MIT", "vpx": "BSD-3-Clause",
+    "webp": "BSD-3-Clause", "webpdemux": "BSD-3-Clause", "webpmux": "BSD-3-Clause",
     "x264": "GPL-2.0-or-later", "x265": "GPL-2.0-or-later", "Xau": "MIT", "xcb": "MIT", "xcb-shape": "MIT",
     "xcb-shm": "MIT", "xcb-xfixes": "MIT", "xerces-c": "Apache-2.0", "zstd": "BSD-3-Clause",
 }  # fmt: skip

@@ -256,7 +256,7 @@ def _visual(name: str, mesh: str, label: int) -> str:
 def _collision(name: str, solid: Solid) -> str:
     shape = solid.shape
     if isinstance(shape, Cylinder):
-        place = f"        <pose>{_numbers(shape.centre)} {_numbers(shape.angles)}</pose>\n"
+        place = f"        <pose>{numbers(shape.centre)} {numbers(shape.angles)}</pose>\n"
         form = f"<cylinder><radius>{shape.radius:.4f}</radius><length>{shape.length:.4f}</length></cylinder>"
     else:
         place, form = "", f"<mesh><uri>model://{name}/meshes/collision_{solid.name}.obj</uri></mesh>"

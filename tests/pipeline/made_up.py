@@ -12,6 +12,7 @@ import numpy as np
 from scan2sim.pipeline.classes import CODE
 from scan2sim.pipeline.io import geojson
 from scan2sim.pipeline.io.scene import Scene, describe, keep, read_scene
+from scan2sim.pipeline.primitives import tube
 from scan2sim.pipeline.step import Done, silent
 from scan2sim.pipeline.steps.collision import COLLISION, CollisionParams
 from scan2sim.pipeline.steps.decimate import with_things
@@ -102,6 +103,21 @@ def by_page(mesh: Mesh) -> dict[int, tuple[np.ndarray, np.ndarray]]:
     return {int(p): (mesh.corners[mesh.page == p], mesh.uv[mesh.page == p]) for p in np.unique(mesh.page)}
 
 
+def collided(frame: Frame = UTM) -> Mesh:
+    """What bodies collide with: ground, the house, and a pole of 10 cm at (-5, -5)."""
+    ends = [(-5.0, -5.0, z) for z in (0.0, 4.0)]
+    vertices, faces = tube(ends, (0.1, 0.1), 16)
+    pole = Mesh(frame, vertices.astype(np.float32), faces)
+    parts = {CODE["terrain"]: ground(10, frame), CODE["building"]: house(frame), CODE["pole"]: pole}
+    first = np.cumsum([0, *(len(part.vertices) for part in parts.values())])
+    return Mesh(
+        frame,
+        np.concatenate([part.vertices for part in parts.values()]),
+        np.concatenate([part.faces + n for part, n in zip(parts.values(), first, strict=False)]).astype(np.int32),
+        classification=np.repeat(np.array([*parts], np.uint8), [len(part) for part in parts.values()]),
+    )
+
+
 def scene(folder: Path, frame: Frame = UTM, tiles: int = 2) -> Scene:
     """Tiles in a row, eastwards, around the first one's origin: ground, a house whose roof is labelled as a sign."""
     world, names = folder / "world", []
@@ -112,12 +128,10 @@ def scene(folder: Path, frame: Frame = UTM, tiles: int = 2) -> Scene:
         meshes = {"terrain": ground(10, here), "building": replace(house(here), classification=roof)}
         sources = {group: textured(folder / f"tile{i}" / group, mesh) for group, mesh in meshes.items()}
         solid = folder / f"tile{i}" / "collision.npz"
-        replace(ground(10, here), uv=None, page=None).save(solid)
-        lists = folder / f"tile{i}" / "furniture.geojson"
-        place = tuple(here.to_crs((-5.0, -5.0, float(height(np.array(-5.0), np.array(-5.0))))).tolist())
-        about = {"kind": "pole", "height_m": 4.0, "radius_m": 0.1}
-        geojson.write_points(lists, frame.crs, [(place, about)])
-        keep(world, f"tile{i}", sources, solid, {"furniture.geojson": lists}, 0.8)
+        collided(here).save(solid)
+        lists = folder / f"tile{i}" / "plants.geojson"
+        geojson.write_points(lists, frame.crs, [(here.to_crs((-5.0, -5.0, 0.0)).tolist(), {"height_m": 4.0})])
+        keep(world, f"tile{i}", sources, solid, {"plants.geojson": lists}, 0.8)
         names.append(f"tile{i}")
     describe(world, "town", frame, names)
     return read_scene(world)

@@ -21,7 +21,9 @@ from scan2sim.pipeline.io.files import make_folder
 from scan2sim.pipeline.io.meshes import PageNames, obj
 from scan2sim.pipeline.io.scene import Scene, SceneTile, by_class
 from scan2sim.pipeline.io.textured import Textured
+from scan2sim.pipeline.solids import Solid, solids
 from scan2sim.pipeline.step import Params, Report
+from scan2sim.pipeline.types import Mesh
 
 PACKAGE = "scan2sim.pipeline.io.scenes"
 SHOWN = ("obj", "collada")
@@ -135,6 +137,17 @@ def write_pages(folder: Path, group: str, shape: Textured, params: SceneParams) 
         else:
             image.write(folder / images[page], image.read_rgb(shape.pages[page]), quality=params.jpeg_quality)
     return PageNames(group, materials, images, tuple(shape.used_pages))
+
+
+def write_solids(folder: Path, tile: SceneTile) -> tuple[list[Solid], dict[str, int]]:
+    """What bodies collide with in a tile; meshes go into `folder` (`collision_<name>.obj`), with their triangles."""
+    found = solids(tile.solid(), tile.friction)
+    triangles = {}
+    for solid in found:
+        if isinstance(solid.shape, Mesh):
+            obj.write_plain(folder / f"collision_{solid.name}.obj", solid.shape)
+            triangles[f"collision_{solid.name}.obj"] = len(solid.shape)
+    return found, triangles
 
 
 @dataclass(frozen=True)

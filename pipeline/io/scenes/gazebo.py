@@ -11,12 +11,9 @@ from pathlib import Path
 
 from scan2sim.pipeline.backends import find
 from scan2sim.pipeline.io import scenes, sdf
-from scan2sim.pipeline.io.meshes import obj
 from scan2sim.pipeline.io.scene import Scene, SceneTile, by_class
 from scan2sim.pipeline.io.scenes import SHOWN, SceneParams
-from scan2sim.pipeline.solids import solids
 from scan2sim.pipeline.step import Report
-from scan2sim.pipeline.types import Mesh
 
 
 def write(scene: Scene, folder: Path, params: SceneParams, report: Report) -> dict[str, int]:
@@ -50,10 +47,6 @@ def _model(folder: Path, tile: SceneTile, params: SceneParams) -> dict[str, int]
                     form.write(meshes / f"{part.name}{form.SUFFIX}", part.shape, names)
                     triangles[f"{part.name}{form.SUFFIX}"] = len(part.shape)
                 labels[f"meshes/{part.name}{shown}"] = part.code
-    bodies = solids(tile.solid(), tile.friction)
-    for body in bodies:
-        if isinstance(body.shape, Mesh):
-            obj.write_plain(meshes / f"collision_{body.name}.obj", body.shape)
-            triangles[f"collision_{body.name}.obj"] = len(body.shape)
-    sdf.write_model(folder, tile.name, labels, bodies)
-    return triangles
+    solids, touched = scenes.write_solids(meshes, tile)
+    sdf.write_model(folder, tile.name, labels, solids)
+    return triangles | touched

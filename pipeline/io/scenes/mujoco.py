@@ -8,19 +8,22 @@ is seen carries its LAS code as `user`. Height fields of neighbouring tiles have
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
 from scan2sim.pipeline import columns
+from scan2sim.pipeline.classes import group_of
+from scan2sim.pipeline.cylinders import Cylinder
 from scan2sim.pipeline.io import scenes, sdf
 from scan2sim.pipeline.io.files import make_folder
 from scan2sim.pipeline.io.scene import Scene, SceneTile
 from scan2sim.pipeline.io.scenes import SceneParams
+from scan2sim.pipeline.solids import Solid, solids
 from scan2sim.pipeline.step import Report
-from scan2sim.pipeline.types import F32, F64
+from scan2sim.pipeline.types import F64, Mesh
 
 FOLDER = "mujoco"
 CELL = 0.1
@@ -29,8 +32,6 @@ COLUMN = 0.2
 """Metres a side of the columns that walls are made of."""
 BELOW = 2.0
 """Metres of ground below its lowest node."""
-SOLID = ("building", "vehicle")
-"""Surfaces that bodies can't pass; leaves they can."""
 
 
 def write(scene: Scene, folder: Path, params: SceneParams, report: Report) -> dict[str, int]:
@@ -47,7 +48,7 @@ def write(scene: Scene, folder: Path, params: SceneParams, report: Report) -> di
         assets += [asset for asset, _ in shown]
         hull, height = ground.field(tile, place)
         assets.append(hull)
-        geoms = [geom for _, geom in shown] + [height, *_boxes(tile), *_cylinders(tile)]
+        geoms = [geom for _, geom in shown] + [height, *_walls(solids(tile.solid(), tile.friction))]
         bodies.append(f'    <body name="{tile.name}" pos="{sdf.numbers(tile.offset)}">\n{"".join(geoms)}    </body>\n')
     (folder / f"{scene.name}.xml").write_text(_model(scene, assets, bodies), encoding="ascii")
     return triangles
@@ -104,19 +105,25 @@ class _Ground:
 
         self._rays = o3d.t.geometry.RaycastingScene()
         for tile in scene.tiles:
-            shape = tile.textured().get("terrain")
-            if shape is not None:
-                xyz = (shape.mesh.vertices + np.asarray(tile.offset)).astype(np.float32)
-                faces = shape.mesh.faces.astype(np.uint32)
+            for mesh in self._of(tile):
+                xyz = (mesh.vertices + np.asarray(tile.offset)).astype(np.float32)
+                faces = mesh.faces.astype(np.uint32)
                 self._rays.add_triangles(o3d.core.Tensor.from_numpy(xyz), o3d.core.Tensor.from_numpy(faces))
+
+    def _of(self, tile: SceneTile) -> list[Mesh]:
+        """The ground of a tile, local metres."""
+        found = solids(tile.solid(), tile.friction)
+        return [one.shape for one in found if isinstance(one.shape, Mesh) and _is_ground(one)]
 
     def field(self, tile: SceneTile, folder: Path) -> tuple[str, str]:
         """Asset and geom of a tile's height field; both empty where it has no ground."""
-        if "terrain" not in tile.groups:
+        ground = self._of(tile)
+        if not ground:
             return "", ""
         shift = np.asarray(tile.offset)
-        low = np.floor((np.asarray(tile.groups["terrain"]["low_m"]) + shift) / CELL)[:2] * CELL
-        high = np.ceil((np.asarray(tile.groups["terrain"]["high_m"]) + shift) / CELL)[:2] * CELL
+        places = np.concatenate([mesh.vertices for mesh in ground]) + shift
+        low = np.floor(places.min(axis=0) / CELL)[:2] * CELL
+        high = np.ceil(places.max(axis=0) / CELL)[:2] * CELL
         count = np.rint((high - low) / CELL).astype(int) + 1
         x, y = (low[k] + CELL * np.arange(count[k]) for k in (0, 1))
         heights = self._heights(x, y) - shift[2]
@@ -150,27 +157,22 @@ class _Ground:
         return np.asarray(found[tuple(nearest)])
 
 
-def _boxes(tile: SceneTile) -> Iterator[str]:
-    """Walls and the like, as boxes."""
-    corners = [s.shape.mesh.corners for s in tile.surfaces() if s.group in SOLID and s.label != "pole"]
-    every: F32 = np.concatenate([np.zeros((0, 3, 3), np.float32), *corners])
-    for low, high in zip(*columns.boxes(every, COLUMN), strict=True):
-        yield (
-            f'      <geom type="box" pos="{sdf.numbers((low + high) / 2)}" size="{sdf.numbers((high - low) / 2)}" '
-            'group="3" rgba="0.7 0.5 0.4 1"/>\n'
-        )
-
-
-def _cylinders(tile: SceneTile) -> Iterator[str]:
-    """Poles and trunks, as the list of furniture has them."""
-    path = tile.lists.get("furniture.geojson")
-    features = json.loads(path.read_text(encoding="utf-8"))["features"] if path else []
-    for feature in features:
-        about = feature["properties"]
-        if "radius_m" in about and feature["geometry"]["type"] == "Point":
-            x, y, z = tile.frame.to_local(feature["geometry"]["coordinates"]).tolist()
-            half = about["height_m"] / 2
+def _walls(solids: Iterable[Solid]) -> Iterator[str]:
+    """What isn't ground, as boxes and cylinders."""
+    for solid in solids:
+        shape, friction = solid.shape, f'group="3" friction="{solid.friction:g} 0.005 0.0001"'
+        if isinstance(shape, Cylinder):
             yield (
-                f'      <geom type="cylinder" pos="{sdf.numbers((x, y, z + half))}" '
-                f'size="{about["radius_m"]:g} {half:g}" group="3" rgba="0.6 0.6 0.6 1"/>\n'
+                f'      <geom type="cylinder" pos="{sdf.numbers(shape.centre)}" zaxis="{sdf.numbers(shape.axis)}" '
+                f'size="{shape.radius:.4f} {shape.length / 2:.4f}" {friction} rgba="0.6 0.6 0.6 1"/>\n'
             )
+        elif not _is_ground(solid):
+            for low, high in zip(*columns.boxes(shape.corners, COLUMN), strict=True):
+                yield (
+                    f'      <geom type="box" pos="{sdf.numbers((low + high) / 2)}" '
+                    f'size="{sdf.numbers((high - low) / 2)}" {friction} rgba="0.7 0.5 0.4 1"/>\n'
+                )
+
+
+def _is_ground(solid: Solid) -> bool:
+    return bool(group_of()[solid.code] == 0)

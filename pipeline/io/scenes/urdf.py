@@ -1,19 +1,20 @@
-"""URDF, for PyBullet: a link a class, so that its segmentation camera tells classes; a concave mesh to collide with.
+"""URDF, for PyBullet: a link a class, so that its segmentation camera tells them; concave meshes, cylinders to touch.
 
 Layout: `<name>.urdf`, and for each tile `urdf/<tile>/` with an OBJ for each class and texture page, the pages, and
-`collision.obj`. Load it with `useFixedBase=True`; links are named `<tile>/<class>/<LAS code>`. The first class's link
-has the collision mesh: PyBullet would draw that of a link that shows nothing.
+`collision_<class>.obj`. Load it with `useFixedBase=True`; links are named `<tile>/<class>/<LAS code>`. The first
+class's link has what bodies collide with: PyBullet would draw that of a link that shows nothing.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 
+from scan2sim.pipeline.cylinders import Cylinder
 from scan2sim.pipeline.io import scenes, sdf
 from scan2sim.pipeline.io.files import make_folder
-from scan2sim.pipeline.io.meshes import obj
 from scan2sim.pipeline.io.scene import Scene, SceneTile
 from scan2sim.pipeline.io.scenes import SceneParams, Single
+from scan2sim.pipeline.solids import Solid
 from scan2sim.pipeline.step import Report
 
 FOLDER = "urdf"
@@ -32,11 +33,10 @@ def write(scene: Scene, folder: Path, params: SceneParams, report: Report) -> di
         for part in scenes.write_single(place, tile, params):
             shown.setdefault((part.label, part.code), []).append(part)
             triangles[f"{FOLDER}/{tile.name}/{part.name}.obj"] = part.triangles
-        hull = tile.solid()
-        obj.write_plain(place / "collision.obj", hull)
-        triangles[f"{FOLDER}/{tile.name}/collision.obj"] = len(hull)
+        solids, touched = scenes.write_solids(place, tile)
+        triangles |= {f"{FOLDER}/{tile.name}/{file}": count for file, count in touched.items()}
+        solid = "".join([_friction(tile), *(_collision(tile, one) for one in solids)])
         links.append(_link(tile.name, "") + _joint("world", tile.name, sdf.numbers(tile.offset)))
-        solid = _solid(tile)
         for (label, code), parts in shown.items():
             name = f"{tile.name}/{label}/{code}"
             content = solid + "".join(_visual(tile, part) for part in parts)
@@ -67,9 +67,20 @@ def _visual(tile: SceneTile, part: Single) -> str:
 """
 
 
-def _solid(tile: SceneTile) -> str:
-    return f"""    <contact><lateral_friction value="{tile.friction:g}"/></contact>
-    <collision concave="yes">
-      <geometry><mesh filename="{FOLDER}/{tile.name}/collision.obj"/></geometry>
+def _friction(tile: SceneTile) -> str:
+    """Of a whole link, as PyBullet has it: the roads'."""
+    return f'    <contact><lateral_friction value="{tile.friction:g}"/></contact>\n'
+
+
+def _collision(tile: SceneTile, solid: Solid) -> str:
+    shape = solid.shape
+    if isinstance(shape, Cylinder):
+        return f"""    <collision name="{solid.name}">
+      <origin xyz="{sdf.numbers(shape.centre)}" rpy="{sdf.numbers(shape.angles)}"/>
+      <geometry><cylinder radius="{shape.radius:.4f}" length="{shape.length:.4f}"/></geometry>
+    </collision>
+"""
+    return f"""    <collision name="{solid.name}" concave="yes">
+      <geometry><mesh filename="{FOLDER}/{tile.name}/collision_{solid.name}.obj"/></geometry>
     </collision>
 """

@@ -12,11 +12,13 @@ from typing import Any
 
 import numpy as np
 
+from scan2sim.pipeline.cylinders import Cylinder
 from scan2sim.pipeline.io import scenes, sdf
 from scan2sim.pipeline.io.files import make_folder
 from scan2sim.pipeline.io.scene import Scene, SceneTile, Surface, by_class
 from scan2sim.pipeline.io.scenes import SceneParams
 from scan2sim.pipeline.io.textured import unique_uv, vertex_normals
+from scan2sim.pipeline.solids import Solid, solids
 from scan2sim.pipeline.step import Report
 from scan2sim.pipeline.types import F32, Mesh
 
@@ -60,7 +62,7 @@ def _write_tile(path: Path, tile: SceneTile, params: SceneParams) -> int:
     root = UsdGeom.Xform.Define(stage, f"/{_prim(tile.name)}")
     stage.SetDefaultPrim(root.GetPrim())
     Usd.ModelAPI(root).SetKind(Kind.Tokens.component)
-    for scope in ("Looks", "Visual"):
+    for scope in ("Looks", "Visual", "Collision"):
         UsdGeom.Scope.Define(stage, root.GetPath().AppendChild(scope))
     triangles = 0
     for group, shape in tile.textured().items():
@@ -73,7 +75,8 @@ def _write_tile(path: Path, tile: SceneTile, params: SceneParams) -> int:
             for part in surface.parts(params.max_visual_triangles):
                 _show(stage, root, part, looks)
                 triangles += len(part.shape)
-    _collide(stage, root, tile.solid(), tile.friction)
+    for solid in solids(tile.solid(), tile.friction):
+        _collide(stage, root, solid)
     stage.GetRootLayer().Save()
     return triangles
 
@@ -107,20 +110,29 @@ def _show(stage: Any, root: Any, surface: Surface, looks: dict[int, Any]) -> Non
         UsdShade.MaterialBindingAPI.Apply(subset.GetPrim()).Bind(looks[page])
 
 
-def _collide(stage: Any, root: Any, solid: Mesh, friction: float) -> None:
-    """What bodies collide with: static, as it is, and not drawn."""
-    from pxr import UsdGeom, UsdPhysics, UsdShade
+def _collide(stage: Any, root: Any, solid: Solid) -> None:
+    """What bodies collide with: static, as it is, with its friction, and not drawn."""
+    from pxr import Gf, UsdGeom, UsdPhysics, UsdShade
 
-    mesh = _mesh(stage, root.GetPath().AppendChild("Collision"), solid, vertex_normals(solid))
-    mesh.CreatePurposeAttr(UsdGeom.Tokens.guide)
-    prim = mesh.GetPrim()
-    UsdPhysics.CollisionAPI.Apply(prim)
-    UsdPhysics.MeshCollisionAPI.Apply(prim).CreateApproximationAttr(UsdPhysics.Tokens.none)
-    material = UsdShade.Material.Define(stage, root.GetPath().AppendPath("Looks/Ground"))
+    path, shape = root.GetPath().AppendPath(f"Collision/{solid.name}"), solid.shape
+    if isinstance(shape, Cylinder):
+        body = UsdGeom.Cylinder.Define(stage, path)
+        body.CreateAxisAttr(UsdGeom.Tokens.z)
+        body.CreateRadiusAttr(shape.radius)
+        body.CreateHeightAttr(shape.length)
+        body.CreateExtentAttr(UsdGeom.Boundable.ComputeExtentFromPlugins(body, 0))
+        body.AddTranslateOp().Set(Gf.Vec3d(*shape.centre))
+        body.AddOrientOp().Set(Gf.Quatf(Gf.Rotation(Gf.Vec3d(0, 0, 1), Gf.Vec3d(*shape.axis)).GetQuat()))
+    else:
+        body = _mesh(stage, path, shape, vertex_normals(shape))
+        UsdPhysics.MeshCollisionAPI.Apply(body.GetPrim()).CreateApproximationAttr(UsdPhysics.Tokens.none)
+    body.CreatePurposeAttr(UsdGeom.Tokens.guide)
+    UsdPhysics.CollisionAPI.Apply(body.GetPrim())
+    material = UsdShade.Material.Define(stage, root.GetPath().AppendPath(f"Looks/Friction_{solid.name}"))
     physics = UsdPhysics.MaterialAPI.Apply(material.GetPrim())
-    physics.CreateStaticFrictionAttr(friction)
-    physics.CreateDynamicFrictionAttr(friction)
-    binding = UsdShade.MaterialBindingAPI.Apply(prim)
+    physics.CreateStaticFrictionAttr(solid.friction)
+    physics.CreateDynamicFrictionAttr(solid.friction)
+    binding = UsdShade.MaterialBindingAPI.Apply(body.GetPrim())
     binding.Bind(material, UsdShade.Tokens.weakerThanDescendants, "physics")
 
 

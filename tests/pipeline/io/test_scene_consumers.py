@@ -115,8 +115,12 @@ def test_usd_has_no_fault(town: Scene, tmp_path: Path) -> None:
     bare = Usd.Stage.Open(path, Usd.Stage.LoadNone)
     assert not [prim for prim in bare.Traverse() if prim.IsA(UsdGeom.Mesh)]  # tiles load one by one
     bare.Load("/World/tile1")
-    solid = bare.GetPrimAtPath("/World/tile1/Collision")
-    assert solid.HasAPI(UsdPhysics.CollisionAPI) and UsdGeom.Imageable(solid).ComputePurpose() == "guide"
+    solids = bare.GetPrimAtPath("/World/tile1/Collision").GetChildren()
+    assert {prim.GetName(): prim.GetTypeName() for prim in solids} == {
+        "terrain": "Mesh", "building": "Mesh", "pole_1": "Cylinder",
+    }  # fmt: skip
+    for prim in solids:
+        assert prim.HasAPI(UsdPhysics.CollisionAPI) and UsdGeom.Imageable(prim).ComputePurpose() == "guide"
     place = bare.GetDefaultPrim().GetCustomDataByKey("scan2sim")
     assert place["crs"] == "EPSG:32632" and tuple(place["worldOriginMetres"]) == made_up.UTM.origin
 
