@@ -160,6 +160,17 @@ class Renderer:
 
         return self._cast(width, height, rays, background, shaded, wireframe, samples)
 
+    def down(self, places: F64) -> Image:
+        """What is straight below each of the places (H, W, 3), as a picture of them; `range` is the depth below."""
+        height, width = places.shape[:2]
+        flat = places.reshape(-1, 3)
+
+        def rays(column: F64, row: F64) -> tuple[F64, F64]:
+            origin = flat[(row * width + column).astype(int)]
+            return origin, np.broadcast_to([0.0, 0.0, -1.0], origin.shape)
+
+        return self._cast(width, height, rays, (0, 0, 0), shaded=False, wireframe=False, samples=1)
+
     def nearest(self, points: F32) -> tuple[U8, U8, F32]:
         """Colours (N, 3) and masks (N,) of the places on the meshes nearest to points (N, 3), and metres to them."""
         rgb, seen = np.zeros((len(points), 3), np.uint8), np.zeros(len(points), np.uint8)

@@ -34,6 +34,7 @@ from scan2sim.pipeline.steps.poisson import POISSON
 from scan2sim.pipeline.steps.preview import PREVIEW
 from scan2sim.pipeline.steps.rasters import RASTERS
 from scan2sim.pipeline.steps.reach import REACH
+from scan2sim.pipeline.steps.roads import ROADS
 from scan2sim.pipeline.steps.split import SPLIT
 from scan2sim.pipeline.steps.trim import TRIM
 from scan2sim.pipeline.steps.views import VIEWS
@@ -58,7 +59,7 @@ from scan2sim.texturing.unwrap import UNWRAP
 STEPS: tuple[Step, ...] = (
     INGEST, PATH, CARVE, VIEWS, LABEL, SEGMENT, THINGS, REACH, OVERLAP, FURNITURE, SPLIT, VOXEL, GROUND, WALLS, FACADES,
     POISSON, TRIM, PLANES, ISLANDS, CLIP, JOIN, DECIMATE, PLANTS, UNWRAP, REFINE, SIGNS, VISIBILITY, EXPOSURE,
-    AGREEMENT, CHOOSE, TEXTURE, LEVEL, COLLISION, EXPORT, RASTERS, GEOMETRY, SCORE, PICTURES, PREVIEW, BORDERS,
+    AGREEMENT, CHOOSE, TEXTURE, LEVEL, ROADS, COLLISION, EXPORT, RASTERS, GEOMETRY, SCORE, PICTURES, PREVIEW, BORDERS,
 )  # fmt: skip
 
 
@@ -87,6 +88,7 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
     lists = graph.places()
     surfaces, seen = graph.photos(evidence, lists)
     textured = graph.textures(surfaces, seen, made)
+    lists |= graph.roads(textured)
     graph.results(surfaces, textured, seen, lists, made)
     return graph.nodes
 
@@ -331,6 +333,14 @@ class _Graph:
                 others = self.of_neighbours(TEXTURE, "textured", group, prefix="neighbour")
                 add(LEVEL, {"textured": at(TEXTURE, "textured", group)} | others, group)
         return {group: at(last, "textured", group) for group in self.groups}
+
+    def roads(self, textured: Sources) -> Sources:
+        """Roads as data, for the export."""
+        if not self.scanner or self.settings.params(ROADS).when == "never":
+            return {}
+        ground = {"cloud": self.at(SPLIT, "terrain"), "textured": textured["terrain"]}
+        self.add(ROADS, ground | self.scanner, **self.cell)
+        return {"roads": self.at(ROADS, "geojson"), "roads_seen": self.at(ROADS, "seen")}
 
     def results(
         self, surfaces: Sources, textured: Sources, seen: Sources, lists: Sources, made: Mapping[str, Sources]

@@ -106,6 +106,18 @@ def has_heights(crs: str) -> bool:
     return crs != LOCAL and bool(_parsed(crs).is_compound)
 
 
+def proj_string(crs: str) -> str:
+    """A projected CRS as PROJ's text, in metres whatever its own units are; what it says of heights is left out."""
+    import warnings
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # that PROJ's text says less than WKT: why formats want both
+        text = _horizontal(crs).to_proj4()
+    return (
+        " ".join(part for part in text.split() if not part.startswith(("+units", "+to_meter", "+type"))) + " +units=m"
+    )
+
+
 def _parsed(crs: str) -> CRS:
     from pyproj import CRS
     from pyproj.exceptions import CRSError

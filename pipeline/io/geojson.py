@@ -1,4 +1,4 @@
-"""GeoJSON: points and polygons with properties, in a tile's CRS."""
+"""GeoJSON: points, lines and polygons with properties, in a tile's CRS."""
 
 from __future__ import annotations
 
@@ -13,6 +13,11 @@ Place = Sequence[float]
 def write_points(path: Path, crs: str, features: Sequence[tuple[Place, Mapping[str, Any]]]) -> None:
     """Write features, each its (x, y, z) in `crs` and its properties."""
     _write(path, crs, [("Point", list(place), properties) for place, properties in features])
+
+
+def write_lines(path: Path, crs: str, features: Sequence[tuple[Sequence[Place], Mapping[str, Any]]]) -> None:
+    """Write features, each its places along the line in `crs` and its properties."""
+    _write(path, crs, [("LineString", [list(place) for place in line], properties) for line, properties in features])
 
 
 def write_polygons(path: Path, crs: str, features: Sequence[tuple[Sequence[Place], Mapping[str, Any]]]) -> None:

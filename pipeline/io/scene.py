@@ -8,6 +8,7 @@ in the world's folder, `scene/` (files of earlier steps as hard links, so it tak
     scene/<tile>/<group>/           a textured mesh, as `pipeline.io.textured` reads it
     scene/<tile>/collision.npz      what bodies collide with
     scene/<tile>/*.geojson, *.csv   lists of what stands where
+    scene/<tile>/roads.npz          what was seen of roads (`pipeline.roads.observed`), where the step `roads` was run
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from scan2sim.pipeline.io.files import make_folder, pass_on
 from scan2sim.pipeline.io.textured import Textured
 from scan2sim.pipeline.types import U8, Frame, Mesh
 
-FOLDER, ABOUT, TILE, SOLID = "scene", "scene.json", "tile.json", "collision.npz"
+FOLDER, ABOUT, TILE, SOLID, ROADS = "scene", "scene.json", "tile.json", "collision.npz", "roads.npz"
 VERSION = 1
 """Of what is kept."""
 Vector = tuple[float, float, float]

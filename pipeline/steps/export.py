@@ -10,14 +10,15 @@ from pydantic import AfterValidator, Field
 from scan2sim.pipeline.classes import SURFACES
 from scan2sim.pipeline.extras import need
 from scan2sim.pipeline.io import scenes
-from scan2sim.pipeline.io.scene import keep
-from scan2sim.pipeline.io.scenes import SceneParams
+from scan2sim.pipeline.io.scene import ROADS, keep
+from scan2sim.pipeline.io.scenes import SceneParams, opendrive
 from scan2sim.pipeline.ranges import Coordinate, Name
 from scan2sim.pipeline.step import Done, Inputs, Report, Step
 
 LISTS = {
     "plants": "plants.geojson", "plants_csv": "plants.csv",
     "furniture": "furniture.geojson", "furniture_csv": "furniture.csv", "things": "things.geojson",
+    "roads": "roads.geojson", "roads_seen": ROADS,
 }  # fmt: skip  # input to file in the world's folder
 
 
@@ -54,7 +55,8 @@ def export(inputs: Inputs, params: ExportParams, out: Path, report: Report) -> D
 
     Below `world/` is what `pipeline.io.scenes` writes of each of the formats, `metadata.json`, the lists that are
     given, and `scene/`, from which other formats can be written later (`pipeline.io.scene`). Meshes are in the tile's
-    local metres; its place is in poses, nodes and the georeference alone.
+    local metres; its place is in poses, nodes and the georeference alone. OpenDRIVE is written wherever lanes are told
+    (`roads_seen`, which the step `roads` made).
 
     Raises:
         DataError: no group has a face.
@@ -67,7 +69,8 @@ def export(inputs: Inputs, params: ExportParams, out: Path, report: Report) -> D
     surfaces = {str(group): inputs[group] for group in SURFACES if group in inputs}
     lists = {file: inputs[key] for key, file in LISTS.items() if key in inputs}
     scene = keep(world, params.name, surfaces, inputs["collision"], lists, params.friction, params.world_origin)
-    scenes.write(scene, params.formats, world, params, report)
+    formats = dict.fromkeys([*params.formats, *(["opendrive"] if opendrive.has_lanes(scene) else [])])
+    scenes.write(scene, list(formats), world, params, report)
     tile = scene.tiles[0]
     facts = {
         "triangles": {group: figures["triangles"] for group, figures in tile.groups.items()},

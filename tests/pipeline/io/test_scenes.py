@@ -20,7 +20,8 @@ from scan2sim.pipeline.types import Frame
 from tests.pipeline import made_up
 from tests.pipeline.io.scene_readers import READERS, Shown, image
 
-each = pytest.mark.parametrize("name", scenes.known())
+WITHOUT_MESHES = {"opendrive"}
+each = pytest.mark.parametrize("name", READERS)
 LABELS = {"terrain": 2, "building": 6, "road_sign": 64}
 
 
@@ -32,6 +33,10 @@ def town(tmp_path_factory: pytest.TempPathFactory) -> Scene:
 @pytest.fixture(scope="module")
 def exported(town: Scene, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return {name: tmp_path_factory.mktemp(name) for name in scenes.known()}
+
+
+def test_every_format_has_a_reader() -> None:
+    assert set(scenes.known()) == READERS.keys() | WITHOUT_MESHES
 
 
 def written(scene: Scene, name: str, folder: Path, **params: Any) -> Path:

@@ -1,0 +1,165 @@
+"""Roads as data against the synthetic streets' truth.
+
+`python -m bench.roads [--seeds 0 1] [--length 60 --points 3e6 --photos 24] [--out bench-out/roads] [--pictures]`
+makes each street's world as `scan2sim run` does, with its photos, and reads the GeoJSON and the OpenDRIVE beside it.
+
+- `road_centre_p95_m`: metres from places on the reference line to the street's axis, where its centre line is painted;
+  `road_width_p95_m`: error of the width from edge to edge, across each of those places.
+- `lane_edge_p95_m`: metres from places on painted lines and on edges to the nearest true one.
+- `height_p95_m`: of all these places, above or below the true ground.
+- `told`: share of the street's lines (three painted ones, two kerbs) of whose length something is told.
+- `carla_lane_p95_m`, `carla_off_lane`: what `carla.Map` makes of the OpenDRIVE: waypoints a metre apart, metres from
+  the middles of the true lanes, and how many are nearer to another lane's; null without the package `carla`.
+
+`--pictures` draws what is told into an orthophoto, `roads.png` beside each world. Ends with `RESULT {json}`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scan2sim.data_samples.layout import FRAME, Layout, lay_out
+from scan2sim.pipeline.render import Renderer, textured
+from scan2sim.pipeline.types import F64, Bools
+
+ROOT = Path(__file__).resolve().parent.parent
+FROM_EDGE = 0.21
+"""Metres from the carriageway's edge to the middle of the line along it (`data_samples/materials.py`)."""
+PIXEL = 0.04
+COLOURS = {"reference": (255, 0, 255), "edge": (255, 0, 0), "solid": (0, 160, 255), "broken": (0, 255, 0)}
+
+
+def main() -> None:
+    """Run the streets asked for."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
+    parser.add_argument("--length", type=float, default=60.0)
+    parser.add_argument("--points", type=float, default=3e6)
+    parser.add_argument("--photos", type=int, default=24)
+    parser.add_argument("--out", type=Path, default=ROOT / "bench-out" / "roads")
+    parser.add_argument("--pictures", action="store_true")
+    arguments = parser.parse_args()
+    found: dict[str, list[F64]] = {}
+    scan2sim = str(Path(sys.executable).parent / "scan2sim")
+    for seed in arguments.seeds:
+        street = arguments.out / f"street_{arguments.length:g}_{arguments.points:g}_{arguments.photos}_{seed}"
+        if not (street / "tile.toml").is_file():
+            sizes = [f"--{k}={getattr(arguments, k):g}" for k in ("length", "points", "photos")]
+            subprocess.run([scan2sim, "sample", *sizes, f"--seed={seed}", str(street)], check=True)
+        run = street.with_name(f"{street.name}_run")
+        subprocess.run([scan2sim, "run", str(street), "--out", str(run)], check=True, stdout=subprocess.DEVNULL)
+        errors = compared(run / "world", lay_out(arguments.length, seed))
+        print(f"seed {seed}: " + json.dumps(summary(errors)), flush=True)
+        for name, values in errors.items():
+            found.setdefault(name, []).append(values)
+        if arguments.pictures:
+            draw(run)
+    print("RESULT " + json.dumps(summary({name: np.concatenate(values) for name, values in found.items()})))
+
+
+def compared(world: Path, layout: Layout) -> dict[str, F64]:
+    """Errors of all places on lines, metres, by the names of the module's docstring."""
+    features = json.loads((world / "roads.geojson").read_text())["features"]
+    kinds = [f["properties"]["kind"] for f in features]
+    lines = [layout_place(layout, f["geometry"]["coordinates"]) for f in features]
+    painted = np.array([layout.lane - FROM_EDGE, 0.0, FROM_EDGE - layout.lane])
+    kerbs = np.array([layout.kerb(1), -layout.kerb(-1)])
+    s = np.arange(0.5, layout.axis.length, 1.0)
+    found: dict[str, list[F64]] = {"centre": [], "lane_edge": [], "height": []}
+    told: dict[float, Bools] = {t: np.zeros(len(s), bool) for t in (*painted, *kerbs)}
+    for kind, line in zip(kinds, lines, strict=True):
+        found["height"].append(np.abs(line[:, 2]))
+        if kind == "reference":
+            found["centre"].append(np.abs(line[:, 1]))
+            continue
+        true = painted if kind == "marking" else kerbs
+        away = np.abs(line[:, 1:2] - true)
+        found["lane_edge"].append(away.min(axis=1))
+        told[true[int(np.median(away.argmin(axis=1)))]] |= (s >= line[:, 0].min()) & (s <= line[:, 0].max())
+    errors = {name: np.concatenate([np.zeros(0), *values]) for name, values in found.items()}
+    sides = [f["properties"].get("side") for f in features]
+    left, right = (
+        _across(np.concatenate([line for line, own in zip(lines, sides, strict=True) if own == side]), s)
+        for side in ("left", "right")
+    )
+    width = np.abs(np.abs(left - right) - (layout.kerb(1) + layout.kerb(-1)))
+    errors["width"] = width[np.isfinite(width)]
+    errors["told"] = np.concatenate(list(told.values())).astype(float)
+    return errors | driven(next(world.glob("*.xodr")), layout)
+
+
+def _across(line: F64, s: F64) -> F64:
+    """(N,) offsets of a line (M, 3) at chainages; NaN where it isn't told."""
+    line = line[np.argsort(line[:, 0])]
+    return np.interp(s, line[:, 0], line[:, 1], left=np.nan, right=np.nan)
+
+
+def layout_place(layout: Layout, places: Any) -> F64:
+    """(N, 3) chainage, offset and height above the true ground of places (N, 3) in the CRS."""
+    xyz = FRAME.to_local(np.asarray(places, np.float64))
+    s, t = layout.axis.locate(xyz[:, :2])
+    on = np.sign(t) * np.minimum(np.abs(t), np.where(t > 0, layout.kerb(1), layout.kerb(-1)) - 1e-3)
+    return np.column_stack([s, t, xyz[:, 2] - layout.height(s, on)])
+
+
+def driven(xodr: Path, layout: Layout) -> dict[str, F64]:
+    """Where `carla.Map` has waypoints of driving lanes; empty without the package."""
+    try:
+        import carla
+    except ImportError:
+        return {}
+    import xml.etree.ElementTree as ET
+
+    text = xodr.read_text(encoding="utf-8")
+    offset = ET.fromstring(text).find("header/offset")
+    assert offset is not None
+    origin = np.array([float(offset.attrib[k]) for k in "xyz"])
+    points = carla.Map("road", text).generate_waypoints(1.0)
+    places = np.array([(p.transform.location.x, -p.transform.location.y, p.transform.location.z) for p in points])
+    place = layout_place(layout, places + origin)
+    middles = np.array([1, -1]) * (layout.lane - FROM_EDGE) / 2
+    own = np.where([p.lane_id > 0 for p in points], 0, 1) if place[0, 0] < place[-1, 0] else None
+    away = np.abs(place[:, 1:2] - middles)
+    off = np.zeros(len(place)) if own is None else away.argmin(axis=1) != own
+    return {"carla_lane": away.min(axis=1), "carla_off_lane": np.asarray(off, float)}
+
+
+def summary(errors: dict[str, F64]) -> dict[str, float | None]:
+    """The figures of the module's docstring."""
+    names = {"centre": "road_centre", "width": "road_width", "lane_edge": "lane_edge", "height": "height"}
+    names |= {"carla_lane": "carla_lane"}
+    found: dict[str, float | None] = {
+        f"{to}_p95_m": round(float(np.percentile(errors[name], 95)), 3) if len(errors.get(name, ())) else None
+        for name, to in names.items()
+    }
+    found["told"] = round(float(errors["told"].mean()), 3)
+    found["carla_off_lane"] = float(errors["carla_off_lane"].sum()) if "carla_off_lane" in errors else None
+    return found
+
+
+def draw(run: Path) -> None:
+    """What is told of roads in an orthophoto of the ground: `roads.png`."""
+    import cv2
+
+    folder = max((run / "steps" / "texture.terrain").glob("*/textured"), key=lambda path: path.stat().st_mtime)
+    body = textured(folder)
+    low, high = body.mesh.vertices.min(axis=0).astype(float), body.mesh.vertices.max(axis=0).astype(float)
+    picture = Renderer([body]).above(low, high, width=int((high[0] - low[0]) / PIXEL)).rgb.copy()
+    for feature in json.loads((run / "world" / "roads.geojson").read_text())["features"]:
+        about = feature["properties"]
+        places = body.mesh.frame.to_local(feature["geometry"]["coordinates"])[:, :2] - low[:2]
+        pixels = np.column_stack([places[:, 0], high[1] - low[1] - places[:, 1]]) / PIXEL
+        colour = COLOURS[about.get("marking") or about["kind"]]
+        cv2.polylines(picture, [np.rint(pixels).astype(np.int32)], False, colour, 2, cv2.LINE_AA)
+    cv2.imwrite(str(run / "roads.png"), picture[..., ::-1])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Roads as data: reference lines, lanes' edges and kerbs of what was scanned and photographed (docs/roads.md)."""

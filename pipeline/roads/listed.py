@@ -1,0 +1,91 @@
+"""Roads as GeoJSON: lines with heights, in a tile's CRS, and what is known of each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scan2sim.pipeline.io import geojson
+from scan2sim.pipeline.roads.lanes import sections
+from scan2sim.pipeline.roads.model import Line, Road
+from scan2sim.pipeline.roads.profile import Profile
+from scan2sim.pipeline.types import F64, Frame
+
+STEP = 1.0
+"""Metres between places of a line."""
+
+
+def write(path: Path, frame: Frame, roads: Sequence[Road]) -> None:
+    """Write reference lines, painted lines and edges, stretch by stretch where they were seen."""
+    features: list[tuple[list[list[float]], dict[str, Any]]] = []
+    for number, road in enumerate(roads, start=1):
+        zero = Profile.constant(road.height.knots, 0.0)
+        about = {"kind": "reference", "reference": road.reference, "length_m": round(road.line.length, 2)}
+        features.append(
+            (_line(frame, road, zero, 0.0, road.line.length), {"road": number, **about, "notes": notes(road)})
+        )
+        for line in (road.left, *road.markings, road.right):
+            for first, last in line.told if line else ():
+                assert line is not None
+                features.append((_line(frame, road, line.offset, first, last), {"road": number, **_about(line)}))
+    geojson.write_lines(path, frame.crs, features)
+
+
+def _line(frame: Frame, road: Road, offset: Profile, first: float, last: float) -> list[list[float]]:
+    s = np.linspace(first, last, max(2, round((last - first) / STEP) + 1))
+    return [[round(value, 3) for value in place] for place in frame.to_crs(surface(road, s, offset.at(s))).tolist()]
+
+
+def surface(road: Road, s: F64, t: F64) -> F64:
+    """(N, 3) places on a road's surface, local metres."""
+    slope = np.where(t > 0, road.falls[0].at(s), road.falls[1].at(s))
+    return np.column_stack([road.line.places(s, t), road.height.at(s) + slope * np.abs(t)])
+
+
+def _about(line: Line) -> dict[str, Any]:
+    """Properties of a line."""
+    if line.kind == "marking":
+        about = {"kind": "marking", "marking": line.marking, "paint_width_m": line.width}
+        if line.dash is not None:
+            about |= {"dash_m": line.dash, "gap_m": line.gap}
+    else:
+        about = {"kind": "edge", "side": line.kind, "border": "other ground" if line.kerb is None else "kerb"}
+        if line.kerb is not None:
+            about["kerb_m"] = round(line.kerb, 3)
+    return {**about, "deviation_p95_m": round(line.deviation, 3)}
+
+
+def notes(road: Road) -> list[str]:
+    """What can't be told of a road."""
+    said = []
+    if not road.markings:
+        said.append("no painted line is seen: its lanes aren't told, only its edges")
+    elif road.reference != "marking":
+        said.append("no painted line is in its middle: which way its lanes go isn't told")
+    for line, side in ((road.left, "left"), (road.right, "right")):
+        if line is None:
+            said.append(f"its {side} edge isn't told: nothing steps up, and no other ground begins, along one line")
+            continue
+        gaps = [(a, b) for (_, a), (b, _) in zip(line.told, line.told[1:], strict=False)]
+        if gaps:
+            where = ", ".join(f"{a:.0f} to {b:.0f} m" for a, b in gaps)
+            said.append(f"its {side} edge isn't told from {where}: hidden, or other roads and drives begin there")
+    if not sections(road):
+        said.append("it has no two lines beside each other, and so no lanes in OpenDRIVE")
+    return said
+
+
+def facts(road: Road) -> dict[str, Any]:
+    """Figures of a road for reports."""
+    found: dict[str, Any] = {"length_m": round(road.line.length, 1), "reference": road.reference}
+    if road.left and road.right:
+        s = np.arange(0.5, road.line.length, STEP)
+        found["width_m"] = round(float(np.median(road.left.offset.at(s) - road.right.offset.at(s))), 2)
+    lines = [line for line in (road.left, *road.markings, road.right) if line]
+    found["markings"] = len(road.markings)
+    found["kerbs"] = sum(line.kerb is not None for line in lines)
+    found["deviation_p95_m"] = round(max(line.deviation for line in lines), 3)
+    return found | {"notes": notes(road)}

@@ -1,0 +1,67 @@
+"""Chains of clothoids: arcs and corners are drawn, noise and outliers are not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from scan2sim.pipeline.roads import clothoid, driven, profile
+
+
+def arc(radius: float, length: float, step: float = 0.5) -> np.ndarray:
+    angle = np.arange(0, length, step) / radius
+    return np.column_stack([radius * np.sin(angle), radius * (1 - np.cos(angle))])
+
+
+@pytest.mark.parametrize("radius", [60.0, -400.0])
+def test_an_arc_is_found_under_noise_and_outliers(radius: float) -> None:
+    rng = np.random.default_rng(0)
+    true = arc(radius, 100.0)
+    seen = true + rng.normal(0, 0.05, true.shape)
+    seen[::10] += rng.uniform(-3, 3, seen[::10].shape)
+    line = clothoid.fit(clothoid.through(true[::10] + rng.normal(0, 0.3, true[::10].shape)), seen)
+    found = line.places(np.linspace(1, line.length - 1, 200))
+    away = np.abs(np.linalg.norm(found - [0, radius], axis=1) - abs(radius))
+    assert away.max() < 0.06
+    assert 1 / np.median(line.curvature) == pytest.approx(radius, rel=0.1)
+
+
+def test_a_corner_is_turned() -> None:
+    bend = arc(8.0, 4 * np.pi, 0.4)
+    before, after = np.arange(-30.0, 0.0), np.arange(1.0, 31.0)
+    way = np.concatenate([np.column_stack([before, 0 * before]), bend, np.column_stack([0 * after + 8, 8 + after])])
+    line = clothoid.fit(clothoid.through(way), way)
+    assert np.abs(line.locate(way)[1]).max() < 0.3
+
+
+def test_places_are_located_again() -> None:
+    line = clothoid.fit(clothoid.through(arc(50.0, 80.0)), arc(50.0, 80.0))
+    s, t = np.array([-3.0, 0.5, 33.3, 79.0, 90.0]), np.array([1.0, -4.0, 8.0, 0.0, 2.0])
+    np.testing.assert_allclose(line.locate(line.places(s, t)), (s, t), atol=1e-3)
+    part = line.part(10.2, 60.7)
+    np.testing.assert_allclose(part.places([0.0, 20.0, 50.5]), line.places([10.2, 30.2, 60.7]), atol=1e-9)
+
+
+def test_a_profile_follows_most_of_what_is_seen() -> None:
+    rng = np.random.default_rng(1)
+    s = np.linspace(0, 100, 400)
+    values = 0.2 * np.sin(s / 17) + rng.normal(0, 0.02, 400)
+    values[80:130] += 2.0
+    knots = np.linspace(0, 100, 11)
+    found = profile.fit(knots, s, values, 0.02, 0.05)
+    assert np.abs(found.at(s) - 0.2 * np.sin(s / 17)).max() < 0.06
+    for begin, cubic in found.pieces(13.0, 58.0):
+        x = np.array([0.0, 2.0])
+        np.testing.assert_allclose(cubic @ x ** np.arange(4)[:, None], found.at(begin + x), atol=1e-9)
+
+
+def test_what_is_driven_again_is_one_way() -> None:
+    there = np.column_stack([np.arange(0.0, 60.0), np.zeros(60)])
+    back = there[::-1] + [0.0, 3.4]
+    across = np.column_stack([np.full(40, 30.0), np.arange(-20.0, 20.0)])
+    path = np.concatenate([there, back, across])
+    on = np.ones(len(path), bool)
+    on[118:122] = False
+    lengths = sorted(len(way) for way in driven.ways(path, on))
+    assert len(lengths) == 2 and 59 <= lengths[1] <= 64 and lengths[0] > 35
+    assert driven.ways(there[:2], np.ones(2, bool)) == [] == driven.ways(there, np.zeros(60, bool))

@@ -1,0 +1,225 @@
+"""Roads as data, against a made-up one that is known: curved, on a slope, painted, with kerbs."""
+
+from __future__ import annotations
+
+import json
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from scan2sim.pipeline.classes import CODE
+from scan2sim.pipeline.errors import DataError
+from scan2sim.pipeline.io import opendrive, scenes
+from scan2sim.pipeline.io.scene import ROADS as SEEN
+from scan2sim.pipeline.io.scenes import SceneParams
+from scan2sim.pipeline.roads import listed, model, observed
+from scan2sim.pipeline.roads.lanes import sections
+from scan2sim.pipeline.roads.model import Road
+from scan2sim.pipeline.step import Done, silent
+from scan2sim.pipeline.steps.roads import ROADS, RoadsParams
+from scan2sim.pipeline.types import Frame
+from tests.pipeline import made_up as worlds
+from tests.pipeline.roads.made_up import FALL, KERB, Street
+
+STREET = Street()
+
+
+def run(folder: Path, inputs: dict[str, Path], **params: Any) -> Done:
+    out = folder / "out"
+    out.mkdir(parents=True)
+    return ROADS.run(inputs, RoadsParams(**params), out, silent)
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory: pytest.TempPathFactory) -> Done:
+    folder = tmp_path_factory.mktemp("road")
+    return run(folder, STREET.inputs(folder))
+
+
+def drawn(done: Done, frame: Frame = STREET.frame) -> list[Road]:
+    ways = [way.moved(-np.asarray(frame.origin)) for way in observed.load(done.files["seen"])]
+    return [road for road in map(model.drawn, observed.joined(ways)) if road]
+
+
+def features(done: Done) -> list[dict[str, Any]]:
+    return list(json.loads(done.files["geojson"].read_text())["features"])
+
+
+def test_lines_lie_where_the_road_has_them(done: Done) -> None:
+    true = {"marking": [STREET.lane, 0.0, -STREET.lane], "edge": [STREET.edge, -STREET.edge], "reference": [0.0]}
+    count = dict.fromkeys(true, 0)
+    for feature in features(done):
+        about = feature["properties"]
+        xyz = STREET.frame.to_local(feature["geometry"]["coordinates"])
+        s, t = STREET.locate(xyz[:, :2])
+        away = np.abs(t[:, None] - true[about["kind"]])
+        nearest = int(np.median(away.argmin(axis=1)))
+        assert away[:, nearest].max() < 0.06, about
+        inside = np.sign(true[about["kind"]][nearest]) * STREET.edge * 0.99
+        expected = STREET.height(s, t if about["kind"] != "edge" else np.full(len(t), inside))
+        assert np.abs(xyz[:, 2] - expected).max() < 0.03, about
+        assert np.ptp(s) > 0.9 * STREET.length or about["kind"] == "marking"
+        count[about["kind"]] += 1
+        if about["kind"] == "edge":
+            assert about["border"] == "kerb" and about["kerb_m"] == pytest.approx(KERB, abs=0.02)
+        if about.get("marking") == "broken":
+            assert about["dash_m"] == pytest.approx(3, abs=0.15) == about["gap_m"]
+            assert about["paint_width_m"] == pytest.approx(0.12, abs=0.03)
+    assert count == {"marking": 3, "edge": 2, "reference": 1}
+    (road,) = done.facts["roads"]
+    assert road["width_m"] == pytest.approx(2 * STREET.edge, abs=0.1) and road["notes"] == []
+
+
+def test_lanes_and_slopes_of_the_road(done: Done) -> None:
+    (road,) = drawn(done)
+    assert road.keeps_right and road.reference == "marking"
+    (section,) = sections(road)
+    assert section.kinds == ("shoulder", "driving", "driving", "shoulder") and section.centre == 2
+    assert np.abs([float(fall.at(25.0)) - FALL for fall in road.falls]).max() < 0.003
+
+
+def test_opendrive_is_whole(done: Done, tmp_path: Path) -> None:
+    roads = drawn(done)
+    assert opendrive.write(tmp_path / "road.xodr", "road", STREET.frame, roads) == 1
+    root = ET.parse(tmp_path / "road.xodr").getroot()
+    pieces = root.findall("road/planView/geometry")
+    ends = [float(p.attrib["s"]) + float(p.attrib["length"]) for p in pieces]
+    np.testing.assert_allclose(ends[:-1], [float(p.attrib["s"]) for p in pieces[1:]], atol=1e-6)
+    assert float(root.find("road").attrib["length"]) == pytest.approx(ends[-1])  # type: ignore[union-attr]
+    marks = {mark.attrib["type"] for mark in root.iter("roadMark")}
+    assert {"solid", "broken", "curb"} <= marks
+    dash = root.find(".//roadMark[@type='broken']/type/line")
+    assert dash is not None and float(dash.attrib["length"]) == pytest.approx(3, abs=0.15)
+    for lane in root.iter("lane"):
+        assert lane.attrib["id"] == "0" or len(lane.findall("width")) > 0
+
+
+def test_carla_drives_in_the_true_lanes(done: Done, tmp_path: Path) -> None:
+    carla = pytest.importorskip("carla", reason="CARLA's library isn't here (pip install carla==0.9.16)")
+    opendrive.write(tmp_path / "road.xodr", "road", STREET.frame, drawn(done))
+    points = carla.Map("road", (tmp_path / "road.xodr").read_text()).generate_waypoints(1.0)
+    places = np.array([(p.transform.location.x, -p.transform.location.y, p.transform.location.z) for p in points])
+    s, t = STREET.locate(places[:, :2])
+    lane = np.array([p.lane_id for p in points])
+    assert len(points) > 1.8 * STREET.length * 0.9
+    np.testing.assert_allclose(t, np.sign(lane) * STREET.lane / 2, atol=0.05)
+    np.testing.assert_allclose(places[:, 2], STREET.height(s, 0 * t), atol=0.1)
+    turned = {side: [p.transform.rotation.yaw for p in points if p.lane_id * side > 0] for side in (1, -1)}
+    assert np.abs(np.abs(np.subtract(np.mean(turned[1]), np.mean(turned[-1]))) % 360 - 180) < 5
+
+
+@pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:2154", "EPSG:6431"])
+def test_surveyed_points_come_back_from_its_georeference(done: Done, tmp_path: Path, crs: str) -> None:
+    from pyproj import CRS, Transformer
+
+    unit = CRS(crs).axis_info[0].unit_conversion_factor
+    origin = {"EPSG:6431": (950_000.0, 510_000.0, 1600.0)}.get(crs, (690_000.0, 5_335_000.0, 500.0))
+    frame = Frame(crs, origin, unit)
+    opendrive.write(tmp_path / "road.xodr", "road", frame, drawn(done))
+    header = ET.parse(tmp_path / "road.xodr").getroot().find("header")
+    assert header is not None and header.find("offset") is not None
+    offset = np.array([float(header.find("offset").attrib[k]) for k in "xyz"])  # type: ignore[union-attr]
+    local = np.array([(5000.0, -5000.0, 10.0), (-3000.0, 4000.0, 0.0), (1.0, 2.0, 3.0)])
+    degrees = Transformer.from_crs(header.findtext("geoReference", ""), "EPSG:4326", always_xy=True)
+    lon, lat = degrees.transform(*(local + offset)[:, :2].T)
+    known = Transformer.from_crs(crs, CRS(crs).geodetic_crs, always_xy=True).transform(*frame.to_crs(local)[:, :2].T)
+    assert np.abs(np.subtract((lon, lat), known)).max() * 111_000 < 0.01
+    np.testing.assert_allclose(local[:, 2] + offset[2], frame.to_crs(local)[:, 2] * unit)
+
+
+def test_without_paint_only_edges_are_told(tmp_path: Path) -> None:
+    done = run(tmp_path, STREET.inputs(tmp_path, paint=False))
+    (road,) = drawn(done)
+    assert road.reference == "middle" and not road.markings
+    assert [section.kinds for section in sections(road)] == [("bidirectional",)]
+    assert {f["properties"]["kind"] for f in features(done)} == {"reference", "edge"}
+    assert any("no painted line" in note for note in done.facts["roads"][0]["notes"])
+
+
+def test_without_a_texture_edges_are_told(tmp_path: Path) -> None:
+    inputs = STREET.inputs(tmp_path)
+    (inputs["textured"] / "mesh.npz").unlink()
+    (road,) = drawn(run(tmp_path, inputs))
+    s = np.linspace(0, road.line.length, 50)
+    assert np.abs(STREET.locate(road.line.places(s))[1]).max() < 0.05
+
+
+def test_without_a_kerb_the_road_ends_where_other_ground_begins(tmp_path: Path) -> None:
+    cloud = STREET.cloud()
+    _, t = STREET.locate(cloud.xyz[:, :2])
+    flat = cloud.xyz.copy()
+    flat[:, 2] -= np.where(np.abs(t) > STREET.edge, KERB, 0).astype(np.float32)
+    done = run(tmp_path, STREET.inputs(tmp_path, cloud=replace(cloud, xyz=flat)))
+    edges = [f for f in features(done) if f["properties"]["kind"] == "edge"]
+    assert {f["properties"]["border"] for f in edges} == {"other ground"}
+    for edge in edges:
+        _, t = STREET.locate(STREET.frame.to_local(edge["geometry"]["coordinates"])[:, :2])
+        assert np.abs(np.abs(t) - STREET.edge).max() < 0.15
+
+
+def test_where_another_road_begins_no_edge_is_told(tmp_path: Path) -> None:
+    cloud = STREET.cloud()
+    s, t = STREET.locate(cloud.xyz[:, :2])
+    assert cloud.classification is not None
+    mouth = (t > STREET.edge) & (np.abs(s) < 6)
+    xyz, code = cloud.xyz.copy(), np.where(mouth, CODE["road"], cloud.classification).astype(np.uint8)
+    xyz[mouth, 2] -= KERB
+    done = run(tmp_path, STREET.inputs(tmp_path, cloud=replace(cloud, xyz=xyz, classification=code)))
+    left = [f for f in features(done) if f["properties"].get("side") == "left"]
+    assert len(left) == 2
+    for part in left:
+        s, _ = STREET.locate(STREET.frame.to_local(part["geometry"]["coordinates"])[:, :2])
+        assert np.abs(s).min() > 5
+    assert any("left edge isn't told from" in note for note in done.facts["roads"][0]["notes"])
+
+
+def test_bad_input_says_why_there_is_no_road(tmp_path: Path) -> None:
+    cloud = STREET.cloud()
+    grass = replace(cloud, classification=np.full(len(cloud), CODE["terrain"], np.uint8))
+    nothing = run(tmp_path / "a", STREET.inputs(tmp_path / "a", cloud=grass))
+    assert nothing.facts["none"] == "no point is of a road's class" and features(nothing) == []
+    s, _ = STREET.locate(cloud.xyz[:, :2])
+    short = run(tmp_path / "b", STREET.inputs(tmp_path / "b", cloud=cloud.take(np.abs(s) < 0.5)))
+    assert "8 m" in short.facts["none"] and drawn(short) == []
+    empty = run(tmp_path / "c", STREET.inputs(tmp_path / "c", cloud=cloud.take(np.zeros(len(cloud), bool))))
+    assert features(empty) == [] and opendrive.write(tmp_path / "x.xodr", "x", STREET.frame, drawn(empty)) == 0
+    assert not (tmp_path / "x.xodr").exists()
+
+
+def test_a_road_over_two_tiles_is_one(tmp_path: Path) -> None:
+    inputs = STREET.inputs(tmp_path)
+    x, y, _ = STREET.frame.origin
+    seeds = {"east": (x + 14.0, y), "west": (x - 14.0, y)}
+    scene = worlds.scene(tmp_path / "town", STREET.frame)
+    halves = []
+    for tile, own, other in zip(scene.tiles, ("east", "west"), ("west", "east"), strict=True):
+        half = run(tmp_path / own, inputs, seed=seeds[own], neighbours={other: seeds[other]})
+        length = half.facts["roads"][0]["length_m"]
+        assert length == pytest.approx(STREET.length / 2, abs=3)
+        (tile.folder / SEEN).write_bytes(half.files["seen"].read_bytes())
+        halves.append(half)
+    scenes.write(scene, ["opendrive"], tmp_path / "export", SceneParams(), silent)
+    root = ET.parse(tmp_path / "export" / "town.xodr").getroot()
+    (road,) = root.findall("road")
+    assert float(road.attrib["length"]) == pytest.approx(STREET.length, abs=3)
+    lines = json.loads((tmp_path / "export" / "town_roads.geojson").read_text())["features"]
+    assert {f["properties"]["road"] for f in lines} == {1} and len(lines) == 6
+    for line in lines:
+        _, t = STREET.locate(STREET.frame.to_local(line["geometry"]["coordinates"])[:, :2])
+        assert np.ptp(t) < 0.1
+
+
+def test_a_world_without_lanes_has_no_opendrive(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="no road's lanes"):
+        scenes.write(worlds.scene(tmp_path), ["opendrive"], tmp_path / "export", SceneParams(), silent)
+
+
+def test_notes_name_what_is_missing(done: Done) -> None:
+    (road,) = drawn(done)
+    assert "left edge isn't told" in " ".join(listed.notes(replace(road, left=None)))
+    bare = replace(road, left=None, right=None, markings=(), reference="way", centre=None)
+    assert "no lanes" in " ".join(listed.notes(bare)) and sections(bare) == []
