@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.types import Frame
+from scan2sim.pipeline.types import F64, Frame
 
 if TYPE_CHECKING:
     from pyproj import CRS
@@ -88,6 +88,17 @@ def to_wgs84(frame: Frame, xyz: npt.ArrayLike = (0.0, 0.0, 0.0)) -> tuple[float,
     x, y, _ = frame.to_crs(local).tolist()
     lon, lat = Transformer.from_crs(_horizontal(frame.crs), "EPSG:4979", always_xy=True).transform(x, y)[:2]
     return float(lat), float(lon), float(local[2] + frame.origin[2])
+
+
+def to_ecef(frame: Frame, xyz: npt.ArrayLike) -> F64:
+    """Local points (N, 3) as earth-centred WGS 84 metres (N, 3), EPSG:4978; heights as `to_wgs84` takes them."""
+    from pyproj import Transformer
+
+    local = np.asarray(xyz, np.float64)
+    places = frame.to_crs(local)
+    lon, lat = Transformer.from_crs(_horizontal(frame.crs), "EPSG:4979", always_xy=True).transform(*places.T[:2])[:2]
+    to_centre = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
+    return np.stack(to_centre.transform(lon, lat, local[:, 2] + frame.origin[2]), axis=1)
 
 
 def convergence(frame: Frame) -> float:

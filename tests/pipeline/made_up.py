@@ -118,12 +118,12 @@ def collided(frame: Frame = UTM) -> Mesh:
     )
 
 
-def scene(folder: Path, frame: Frame = UTM, tiles: int = 2) -> Scene:
-    """Tiles in a row, eastwards, around the first one's origin: ground, a house whose roof is labelled as a sign."""
+def scene(folder: Path, frame: Frame = UTM, tiles: int = 2, apart: float = 25.0) -> Scene:
+    """Tiles in a row, so many metres apart, around the first one's origin: ground, a house with a sign for a roof."""
     world, names = folder / "world", []
     for i in range(tiles):
         x, y, z = frame.origin
-        here = replace(frame, origin=(x + 25.0 * i, y + 3.0 * i, z - i))
+        here = replace(frame, origin=(x + apart * i, y + 3.0 * i, z - i))
         roof = np.where(house().page == 1, CODE["road_sign"], 0).astype(np.uint8)
         meshes = {"terrain": ground(10, here), "building": replace(house(here), classification=roof)}
         sources = {group: textured(folder / f"tile{i}" / group, mesh) for group, mesh in meshes.items()}

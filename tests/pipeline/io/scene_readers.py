@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -139,5 +140,29 @@ def urdf(folder: Path, scene: Scene) -> Iterator[Shown]:
             yield Shown(int(name.split("/")[-1]), corners + places[name], uv, picture)
 
 
+def tiles3d(folder: Path, scene: Scene) -> Iterator[Shown]:
+    import trimesh
+    from pyproj import Transformer
+
+    tileset = json.loads((folder / "tileset.json").read_text())
+    x, y, z, *axes = tileset["root"]["boundingVolume"]["box"]
+    low, high = (np.array([x, y, z]) + sign * np.diag(np.reshape(axes, (3, 3))) for sign in (-1, 1))
+    for tile in tileset["root"]["children"]:
+        place = np.reshape(tile["transform"], (4, 4)).T
+        read = trimesh.load_scene(folder / tile["content"]["uri"], process=False)
+        for name, mesh in read.geometry.items():
+            v = mesh.vertices.astype(float)
+            world = np.stack([v[:, 0], -v[:, 2], v[:, 1]], axis=1) @ place[:3, :3].T + place[:3, 3]
+            assert (world > low - 0.01).all() and (world < high + 0.01).all(), name
+            if scene.frame.crs != "local":
+                lon, lat, up = Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True).transform(*world.T)
+                east, north = Transformer.from_crs("EPSG:4979", scene.frame.crs, always_xy=True).transform(lon, lat)[:2]
+                world = np.stack([east, north, up], axis=1) - scene.origin
+            picture = np.asarray(mesh.visual.material.baseColorTexture.convert("RGB"))
+            yield Shown(mesh.metadata["class"], world[mesh.faces], mesh.visual.uv[mesh.faces], picture)
+
+
 Reader = Callable[[Path, Scene], Iterator[Shown]]
-READERS: dict[str, Reader] = {"gazebo": gazebo, "glb": glb, "usd": usd, "mujoco": mujoco, "urdf": urdf}
+READERS: dict[str, Reader] = {
+    "gazebo": gazebo, "glb": glb, "usd": usd, "mujoco": mujoco, "urdf": urdf, "tiles3d": tiles3d,
+}  # fmt: skip
