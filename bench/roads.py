@@ -1,6 +1,7 @@
 """Roads as data against the synthetic streets' truth.
 
-`python -m bench.roads [--seeds 0 1] [--length 60 --points 3e6 --photos 24] [--out bench-out/roads] [--pictures]`
+`python -m bench.roads [--seeds 0 1] [--length 60 --points 3e6 --photos 24] [--tile 30] [--out bench-out/roads]
+[--pictures]`
 makes each street's world as `scan2sim run` does, with its photos, and reads the GeoJSON and the OpenDRIVE beside it.
 
 - `road_centre_p95_m`: metres from places on the reference line to the street's axis, where its centre line is painted;
@@ -10,6 +11,7 @@ makes each street's world as `scan2sim run` does, with its photos, and reads the
 - `told`: share of the street's lines (three painted ones, two kerbs) of whose length something is told.
 - `carla_lane_p95_m`, `carla_off_lane`: what `carla.Map` makes of the OpenDRIVE: waypoints a metre apart, metres from
   the middles of the true lanes, and how many are nearer to another lane's; null without the package `carla`.
+- with `--tile METRES` each street is cut into tiles so long and made as a survey: the same of its roads as one.
 
 `--pictures` draws what is told into an orthophoto, `roads.png` beside each world. Ends with `RESULT {json}`.
 """
@@ -43,6 +45,7 @@ def main() -> None:
     parser.add_argument("--length", type=float, default=60.0)
     parser.add_argument("--points", type=float, default=3e6)
     parser.add_argument("--photos", type=int, default=24)
+    parser.add_argument("--tile", type=float)
     parser.add_argument("--out", type=Path, default=ROOT / "bench-out" / "roads")
     parser.add_argument("--pictures", action="store_true")
     arguments = parser.parse_args()
@@ -53,20 +56,26 @@ def main() -> None:
         if not (street / "tile.toml").is_file():
             sizes = [f"--{k}={getattr(arguments, k):g}" for k in ("length", "points", "photos")]
             subprocess.run([scan2sim, "sample", *sizes, f"--seed={seed}", str(street)], check=True)
-        run = street.with_name(f"{street.name}_run")
-        subprocess.run([scan2sim, "run", str(street), "--out", str(run)], check=True, stdout=subprocess.DEVNULL)
+        run = street.with_name(f"{street.name}_run" if arguments.tile is None else f"{street.name}_survey")
+        made = [scan2sim, "run", str(street), "--out", str(run)]
+        if arguments.tile is not None:
+            cut = street.with_name(f"{street.name}_cut")
+            command = [scan2sim, "tile", str(street), "--out", str(cut), f"--length={arguments.tile}"]
+            subprocess.run([*command, "--overwrite"], check=True, stdout=subprocess.DEVNULL)
+            made = [scan2sim, "survey", str(cut), "--out", str(run)]
+        subprocess.run(made, check=True, stdout=subprocess.DEVNULL)
         errors = compared(run / "world", lay_out(arguments.length, seed))
         print(f"seed {seed}: " + json.dumps(summary(errors)), flush=True)
         for name, values in errors.items():
             found.setdefault(name, []).append(values)
-        if arguments.pictures:
+        if arguments.pictures and arguments.tile is None:
             draw(run)
     print("RESULT " + json.dumps(summary({name: np.concatenate(values) for name, values in found.items()})))
 
 
 def compared(world: Path, layout: Layout) -> dict[str, F64]:
     """Errors of all places on lines, metres, by the names of the module's docstring."""
-    features = json.loads((world / "roads.geojson").read_text())["features"]
+    features = json.loads(next(world.glob("*roads.geojson")).read_text())["features"]
     kinds = [f["properties"]["kind"] for f in features]
     lines = [layout_place(layout, f["geometry"]["coordinates"]) for f in features]
     painted = np.array([layout.lane - FROM_EDGE, 0.0, FROM_EDGE - layout.lane])
@@ -125,10 +134,12 @@ def driven(xodr: Path, layout: Layout) -> dict[str, F64]:
     places = np.array([(p.transform.location.x, -p.transform.location.y, p.transform.location.z) for p in points])
     place = layout_place(layout, places + origin)
     middles = np.array([1, -1]) * (layout.lane - FROM_EDGE) / 2
-    own = np.where([p.lane_id > 0 for p in points], 0, 1) if place[0, 0] < place[-1, 0] else None
     away = np.abs(place[:, 1:2] - middles)
-    off = np.zeros(len(place)) if own is None else away.argmin(axis=1) != own
-    return {"carla_lane": away.min(axis=1), "carla_off_lane": np.asarray(off, float)}
+    side = away.argmin(axis=1) == [int(p.lane_id > 0) for p in points]  # all alike, whichever way the line runs
+    return {
+        "carla_lane": away.min(axis=1),
+        "carla_off_lane": np.minimum(side.mean(), 1 - side.mean()) * np.ones(len(side)),
+    }
 
 
 def summary(errors: dict[str, F64]) -> dict[str, float | None]:

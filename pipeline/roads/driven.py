@@ -14,8 +14,8 @@ APART = 20.0
 """Metres along the way from which on it may come by again in the same direction; the other one it may take at once."""
 ALONG = 0.85
 """Cosine of the angle from which on two ways run along the same line."""
-SHORTEST = 8.0
-"""Metres of road that something can be told of."""
+SHORTEST = 2.0
+"""Metres of a way: in the next tile it may go on."""
 
 
 def ways(positions: F64, on: Bools) -> list[F64]:

@@ -22,6 +22,8 @@ REACH = 15.0
 """Metres to either side."""
 CELL = (1.0, 0.5)
 """Metres along and across that heights are means of."""
+BESIDE = 1.0
+"""Metres within which paint has points of a road beside it."""
 NEAR = 6.0
 """Metres between the ends of ways that go on in each other."""
 ALONG = 0.8
@@ -96,7 +98,18 @@ def observe(way: F64, xyz: F64, road: Bools, renderer: Renderer | None) -> Obser
     strokes = paint.Paint(np.zeros((0, 2)), np.zeros(0, np.int64), np.zeros(0))
     if renderer is not None and len(xyz):
         strokes = paint.strokes(renderer, line, REACH, float(xyz[:, 2].max()) + 5.0)
-    return Observed(way, strokes.place, strokes.stroke, strokes.width, edge, _means(xyz[on], s[on], t[on]))
+    seen = Observed(way, strokes.place, strokes.stroke, strokes.width, edge, _means(xyz[on], s[on], t[on]))
+    whole = (np.ones(len(part), bool) for part in (seen.edge, seen.ground))
+    return seen.kept(_on_road(seen.paint, xyz[road]), *whole)
+
+
+def _on_road(places: F64, road: F64) -> Bools:
+    """(N,) which places (N, 2) have points of a road (M, 3) beside them."""
+    from scipy.spatial import cKDTree
+
+    if not len(road) or not len(places):
+        return np.zeros(len(places), bool)
+    return np.asarray(np.isfinite(cKDTree(road[:, :2]).query(places, distance_upper_bound=BESIDE)[0]))
 
 
 def _near(xyz: F64, places: F64) -> Bools:

@@ -94,7 +94,7 @@ def _why_none(ways: Sequence[F64], on: Bools, drawn: Sequence[object]) -> dict[s
         return {}
     if not on.any():
         return {"none": "no point is of a road's class"}
-    return {"none": "no line of a road is seen" if ways else "the path runs on no road for 8 m or more"}
+    return {"none": "no line of a road is seen" if ways else "the path runs on no road"}
 
 
-ROADS = Step("roads", 1, roads, RoadsParams)
+ROADS = Step("roads", 2, roads, RoadsParams)

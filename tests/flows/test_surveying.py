@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,13 @@ def test_tiles_share_their_borders(made: Path) -> None:
     assert border["shared"] > 0.99
     assert border["one_sided_m"] < 0.02 * border["length_m"]
     assert border["colour_step"] < 2
+
+
+def test_the_road_over_both_tiles_is_one(made: Path) -> None:
+    (network,) = (made / "world").glob("*.xodr")
+    roads = ET.parse(network).getroot().findall("road")
+    assert [float(road.attrib["length"]) for road in roads] == [pytest.approx(12.0, abs=1.5)]
+    assert (made / "world" / f"{network.stem}_roads.geojson").is_file()
 
 
 def test_where_classes_meet_there_is_no_hole(made: Path, survey: Path) -> None:
