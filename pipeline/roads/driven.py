@@ -18,6 +18,10 @@ SHORTEST = 2.0
 """Metres of a way: in the next tile it may go on."""
 
 
+LONGEST = 1000.0
+"""Metres of one way: longer roads are told of in pieces, as what is solved grows with the square."""
+
+
 def ways(positions: F64, on: Bools) -> list[F64]:
     """Polylines (M, 2), `STEP` apart, of what was driven on a road.
 
@@ -28,7 +32,9 @@ def ways(positions: F64, on: Bools) -> list[F64]:
     found: list[F64] = []
     for piece in _pieces(positions[:, :2], on):
         way = _spaced(piece)
-        found += [part for part in _pieces(way, _first_time(way, found)) if _length(part) >= SHORTEST]
+        for part in _pieces(way, _first_time(way, found)):
+            pieces = np.array_split(part, int(np.ceil(length(part) / LONGEST)))
+            found += [piece for piece in pieces if length(piece) >= SHORTEST]
     return found
 
 
@@ -38,7 +44,8 @@ def _pieces(places: F64, held: Bools) -> list[F64]:
     return [places[a:b] for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a > 1]
 
 
-def _length(places: F64) -> float:
+def length(places: F64) -> float:
+    """Metres of a polyline (N, 2)."""
     return float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
 
 

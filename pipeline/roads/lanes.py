@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
-
 from scan2sim.pipeline.roads.model import Line, Road
 from scan2sim.pipeline.roads.profile import Profile
 
@@ -110,8 +108,3 @@ def _kind(borders: list[Border], i: int, at: float, parted: bool) -> Kind:
     if width < NARROW:
         return "restricted"
     return "driving" if parted else "bidirectional"
-
-
-def widths(section: Section) -> np.ndarray:
-    """(K,) metres of the lanes, from left to right, in the section's middle."""
-    return -np.diff([float(border.offset.at(section.middle)) for border in section.borders])

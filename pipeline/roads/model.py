@@ -94,7 +94,6 @@ class Road:
     Attributes:
         line: its reference, and
         reference: what that is: the painted centre line, the middle between the edges, or the way that was driven.
-        centre: index into `markings` of the painted centre line; None: there is none.
         height: of the reference line, metres above the frame's origin.
         falls: slope of the surface to the left and to the right, metres a metre outwards.
         markings: from left to right.
@@ -104,7 +103,6 @@ class Road:
 
     line: Clothoids
     reference: Reference
-    centre: int | None
     height: Profile
     falls: tuple[Profile, Profile]
     markings: tuple[Line, ...]
@@ -137,9 +135,8 @@ def drawn(seen: Observed) -> Road | None:
     line = line.part(first, last)
     markings, left, right = _lines(line, seen)
     height, falls = _surface(line, seen.ground)
-    nearest = int(np.argmin([abs(_mean(one)) for one in markings])) if reference == "marking" and markings else None
     _, t = line.locate(seen.way)
-    return Road(line, reference, nearest, height, falls, tuple(markings), left, right, bool(np.median(t) < 0.5))
+    return Road(line, reference, height, falls, tuple(markings), left, right, bool(np.median(t) < 0.5))
 
 
 def _lines(line: Clothoids, seen: Observed) -> tuple[list[Line], Line | None, Line | None]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from itertools import permutations
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
@@ -48,6 +47,11 @@ class Observed:
     width: F64
     edge: F64
     ground: F64
+
+    @property
+    def length(self) -> float:
+        """Metres of the way."""
+        return driven.length(self.way)
 
     def kept(self, paint: Bools, edge: Bools, ground: Bools) -> Self:
         """What masks say."""
@@ -128,27 +132,52 @@ def _means(xyz: F64, s: F64, t: F64) -> F64:
 
 
 def joined(parts: Sequence[Observed]) -> list[Observed]:
-    """Ways that go on in each other as one, as where tiles meet."""
-    ways = list(parts)
-    while True:
-        found = ((i, j, _follow(ways[i], ways[j])) for i, j in permutations(range(len(ways)), 2))
-        pair = next(((i, j, turned) for i, j, turned in found if turned), None)
-        if pair is None:
-            return ways
-        i, j, turned = pair
-        one, other = (ways[k].turned() if turn else ways[k] for k, turn in zip((i, j), turned, strict=True))
-        ways = [way for k, way in enumerate(ways) if k not in (i, j)] + [one.then(other)]
+    """Ways that go on in each other as one, as where tiles meet, up to `driven.LONGEST` metres."""
+    follows = _partners(parts)
+    ways, done = [], set[int]()
+    for first in range(len(parts)):
+        if first in done:
+            continue
+        i, entered = first, 0
+        while follows.get((i, entered)) is not None:  # back to where it begins, or once around
+            other, end = follows[i, entered]
+            i, entered = other, 1 - end
+            if i == first:
+                break
+        way = None
+        while i not in done:
+            done.add(i)
+            part = parts[i].turned() if entered else parts[i]
+            if way is not None and way.length + part.length > driven.LONGEST:
+                ways.append(way)
+                way = None
+            way = part if way is None else way.then(part)
+            after = follows.get((i, 1 - entered))
+            if after is not None:
+                i, entered = after
+        if way is not None:
+            ways.append(way)
+    return ways
 
 
-def _follow(one: Observed, other: Observed) -> tuple[bool, bool] | None:
-    """Which of the two to turn for the other way to go on where the first ends; None: it doesn't."""
-    for turned in ((False, False), (False, True), (True, False)):
-        a, b = (way.way[::-1] if turn else way.way for way, turn in zip((one, other), turned, strict=True))
-        ahead, on = a[-1] - a[-2], b[1] - b[0]
-        cosine = ahead @ on / max(float(np.linalg.norm(ahead) * np.linalg.norm(on)), 1e-9)
-        if np.linalg.norm(b[0] - a[-1]) < NEAR and cosine > ALONG:
-            return turned
-    return None
+def _partners(parts: Sequence[Observed]) -> dict[tuple[int, int], tuple[int, int]]:
+    """Ends of ways (which way; 0 its first end, 1 its last) and the ends that they go on in, nearest first."""
+    from scipy.spatial import cKDTree
+
+    ends = [(i, end) for i in range(len(parts)) for end in (0, 1)]
+    if not ends:
+        return {}
+    places = np.array([parts[i].way[-end] for i, end in ends])
+    inner = np.array([parts[i].way[-2 if end else 1] for i, end in ends])
+    outwards = (places - inner) / np.maximum(np.linalg.norm(places - inner, axis=1, keepdims=True), 1e-9)
+    pairs = cKDTree(places).query_pairs(NEAR, output_type="ndarray")
+    distance = np.linalg.norm(places[pairs[:, 0]] - places[pairs[:, 1]], axis=1)
+    partners: dict[tuple[int, int], tuple[int, int]] = {}
+    for a, b in pairs[np.lexsort((pairs[:, 1], pairs[:, 0], distance))].tolist():
+        one, other = ends[a], ends[b]
+        if one[0] != other[0] and outwards[a] @ outwards[b] < -ALONG and not {one, other} & partners.keys():
+            partners[one], partners[other] = other, one
+    return partners
 
 
 def save(path: Path, ways: Sequence[Observed], frame: Frame) -> None:

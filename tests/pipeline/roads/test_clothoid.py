@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from scan2sim.pipeline.roads import clothoid, driven, profile
+from scan2sim.pipeline.roads.observed import Observed, joined
 
 
 def arc(radius: float, length: float, step: float = 0.5) -> np.ndarray:
@@ -65,3 +66,32 @@ def test_what_is_driven_again_is_one_way() -> None:
     lengths = sorted(len(way) for way in driven.ways(path, on))
     assert len(lengths) == 2 and 59 <= lengths[1] <= 64 and lengths[0] > 35
     assert driven.ways(there[:2], np.ones(2, bool)) == [] == driven.ways(there, np.zeros(60, bool))
+
+
+def seen_along(way: np.ndarray) -> Observed:
+    one = np.ones(len(way))
+    edge = np.column_stack([way + [0, 3], one, one])
+    return Observed(way, way + [0, 1], np.zeros(len(way), np.int64), one, edge, np.zeros((0, 3)))
+
+
+def test_ways_that_go_on_are_joined_whichever_way_they_run() -> None:
+    line = np.column_stack([np.arange(0.0, 120.0), np.zeros(120)])
+    across = np.column_stack([np.full(30, 61.0), np.arange(5.0, 35.0)])
+    parts = [seen_along(p) for p in (line[80:], line[40:79][::-1], across, line[:39])]
+    ways = sorted(joined(parts), key=lambda way: len(way.way))
+    assert [len(way.way) for way in ways] == [30, 118]
+    assert np.all(np.abs(np.diff(ways[1].way[:, 0])) < 3) and len(np.unique(np.sign(np.diff(ways[1].way[:, 0])))) == 1
+    assert len(np.unique(ways[1].stroke)) == 3
+    sides = {float(x): side for x, _, side, _ in ways[1].edge}
+    assert len(set(sides.values())) == 2  # one of the three was driven the other way
+    assert joined([]) == []
+
+
+def test_a_ring_is_cut_open_and_long_roads_are_told_in_pieces() -> None:
+    angle = np.linspace(0, 2 * np.pi, 200)
+    ring = 30 * np.column_stack([np.cos(angle), np.sin(angle)])
+    assert [len(way.way) for way in joined([seen_along(ring[:100]), seen_along(ring[100:])])] == [200]
+    line = np.column_stack([np.arange(0.0, 2500.0), np.zeros(2500)])
+    pieces = driven.ways(line, np.ones(len(line), bool))
+    assert len(pieces) == 3 and max(map(driven.length, pieces)) <= driven.LONGEST
+    assert len(joined([seen_along(piece) for piece in pieces])) == 3

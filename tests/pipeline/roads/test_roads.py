@@ -221,5 +221,5 @@ def test_a_world_without_lanes_has_no_opendrive(tmp_path: Path) -> None:
 def test_notes_name_what_is_missing(done: Done) -> None:
     (road,) = drawn(done)
     assert "left edge isn't told" in " ".join(listed.notes(replace(road, left=None)))
-    bare = replace(road, left=None, right=None, markings=(), reference="way", centre=None)
+    bare = replace(road, left=None, right=None, markings=(), reference="way")
     assert "no lanes" in " ".join(listed.notes(bare)) and sections(bare) == []
