@@ -2,22 +2,47 @@
 
 from __future__ import annotations
 
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from scan2sim.flows.commands.app import App
+from scan2sim.flows.commands.budget import Budget, parse
 from scan2sim.flows.commands.display import console, progress, warn
 from scan2sim.flows.commands.options import options
 from scan2sim.pipeline.errors import SettingError
 from scan2sim.pipeline.io import scenes
 from scan2sim.pipeline.io.crs import LOCAL
 from scan2sim.pipeline.io.importing import tile_folder
-from scan2sim.pipeline.io.scene import read_scene
+from scan2sim.pipeline.io.scene import Scene, read_scene
 from scan2sim.pipeline.io.scenes import SceneParams
+from scan2sim.pipeline.step import Report
 
 app = App()
+
+
+@contextmanager
+def _within(scene: Scene, limits: Budget, report: Report) -> Iterator[Scene]:
+    """The scene within a budget, for as long as it is written."""
+    if limits == Budget():
+        yield scene
+        return
+    from scan2sim.texturing.reduce import reduced
+
+    with tempfile.TemporaryDirectory() as work:
+        yield reduced(scene, limits.triangles, limits.texels, Path(work), report)
+
+
+def _tell(scene: Scene, limits: Budget) -> None:
+    """Warn of tiles that are over the budget all the same."""
+    for tile in scene.tiles:
+        count = sum(figures["triangles"] for figures in tile.groups.values())
+        if limits.triangles is not None and count > 1.05 * limits.triangles:
+            warn(f"{tile.name} has {count:,} triangles: where its surfaces end they are kept, for tiles to meet")
 
 
 @app.command()
@@ -27,6 +52,10 @@ def export(
     world: Annotated[Path, typer.Argument(metavar="WORLD", help="The folder that run or survey was given as --out.")],
     to: Annotated[str, typer.Option("--to", metavar="FORMAT,...", help="Formats (docs/simulators.md).")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for what is written.")],
+    budget: Annotated[
+        str | None,
+        typer.Option("--budget", metavar="triangles=200k,texture=64MP", help="What each tile may have, at most."),
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an export that is there already.")] = False,
 ) -> None:
     """Write a finished world in other formats, for other simulators."""
@@ -34,9 +63,15 @@ def export(
     if not formats:
         raise SettingError("--to", "names no format", f"Choose of: {', '.join(scenes.known())}")
     scenes.check(formats, params, "--to")
+    limits = parse(budget)
     scene = read_scene(world)
-    with progress("export") as report, tile_folder(out, overwrite, "world") as folder:
-        scenes.write(scene, formats, folder, params, report)
+    with (
+        progress("export") as report,
+        tile_folder(out, overwrite, "world") as folder,
+        _within(scene, limits, report) as small,
+    ):
+        scenes.write(small, formats, folder, params, report)
+        _tell(small, limits)
     if scene.frame.crs == LOCAL:
         warn(f"{scene.name} has no CRS, so nothing says where on the earth it is")
     console.print(f"World:  {out}", highlight=False, soft_wrap=True)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
 from scan2sim.flows.cli import app
+from scan2sim.flows.commands.budget import parse
 from scan2sim.pipeline.errors import InputError, SettingError
 from scan2sim.pipeline.io import scenes
 from scan2sim.pipeline.types import Frame
@@ -60,3 +62,17 @@ def test_formats_that_there_are_not_are_told_with_those_that_there_are(tmp_path:
 def test_a_world_without_a_crs_is_told_of(tmp_path: Path) -> None:
     world = made_up.world(tmp_path, frame=Frame()).files["world"]
     assert "has no CRS" in run(world, "--to", "glb", "--out", tmp_path / "out")
+
+
+@pytest.mark.parametrize("text", ["triangles", "triangles=many", "triangles=10", "faces=20k", "texture=1.2.3MP"])
+def test_budgets_that_are_none_are_told(tmp_path: Path, text: str) -> None:
+    with pytest.raises(SettingError, match="--budget"):
+        run(tmp_path, "--to", "glb", "--out", tmp_path / "out", "--budget", text)
+
+
+def test_a_world_is_written_within_a_budget(tmp_path: Path) -> None:
+    world = made_up.world(tmp_path).files["world"]
+    run(world, "--to", "glb", "--out", tmp_path / "out", "--budget", "triangles=1k,texture=0.1MP")
+    groups = json.loads((tmp_path / "out" / "metadata.json").read_text())["groups"].values()
+    assert 500 < sum(group["triangles"] for group in groups) <= 1050
+    assert parse("triangles=200k, texture=64MP") == (200_000, 64e6) and parse(None) == (None, None)
