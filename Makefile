@@ -5,7 +5,7 @@ BIN := .venv/bin
 TILE ?= data_samples/tile
 OUT ?= demo-out
 
-.PHONY: demo test test-all lint bench sample-tile
+.PHONY: demo test test-all lint bench gate sample-tile
 
 demo: .venv/.installed
 	$(BIN)/scan2sim run $(TILE) --out $(OUT) --hold-out 8 --set segment.overwrite=true
@@ -23,6 +23,10 @@ lint: .venv/.installed-dev
 
 bench: .venv/.installed-dev
 	$(BIN)/python -m bench.tile
+
+# exports through those who use them: GATE="--worlds demo" for the committed tile alone
+gate: .venv/.installed-dev
+	$(BIN)/python -m bench.gate $(GATE)
 
 sample-tile: .venv/.installed
 	$(BIN)/python -m scan2sim.data_samples.make_tile

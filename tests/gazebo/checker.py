@@ -73,7 +73,7 @@ def check_world(world: Path, *bodies: Body) -> dict[str, Any]:
 
 
 def load_meshes(*files: Path) -> dict[str, float]:
-    """`seconds` and `megabytes` that ignition-common takes to load meshes.
+    """`seconds` of the processor and `megabytes` at most that ignition-common takes to load meshes.
 
     Raises:
         Refused: one can't be loaded.

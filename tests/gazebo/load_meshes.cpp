@@ -2,38 +2,38 @@
 //
 //   load_meshes FILE ...
 //
-// Prints one line of JSON: seconds, and the megabytes by which the process has grown.
+// Prints one line of JSON: the processor's seconds, and the megabytes by which the process grew at its largest.
 
-#include <chrono>
+#include <ctime>
 #include <fstream>
 #include <iostream>
 #include <string>
-
-#include <unistd.h>
 
 #include <ignition/common/Console.hh>
 #include <ignition/common/Mesh.hh>
 #include <ignition/common/MeshManager.hh>
 
+// The most memory that the process has had.
 double megabytes()
 {
-  long size = 0, resident = 0;
-  std::ifstream("/proc/self/statm") >> size >> resident;
-  return resident * sysconf(_SC_PAGESIZE) / 1e6;
+  std::ifstream status("/proc/self/status");
+  for (std::string line; std::getline(status, line);)
+    if (line.rfind("VmHWM:", 0) == 0) return std::stod(line.substr(6)) / 1e3;
+  return 0;
 }
 
 int main(int argc, char **argv)
 {
   ignition::common::Console::SetVerbosity(1);
   const double before = megabytes();
-  const auto began = std::chrono::steady_clock::now();
+  const auto began = std::clock();
   for (int i = 1; i < argc; ++i)
     if (ignition::common::MeshManager::Instance()->Load(argv[i]) == nullptr)
     {
       std::cerr << argv[i] << " can't be loaded" << std::endl;
       return 1;
     }
-  const std::chrono::duration<double> took = std::chrono::steady_clock::now() - began;
-  std::cout << "{\"seconds\": " << took.count() << ", \"megabytes\": " << megabytes() - before << "}" << std::endl;
+  const double took = double(std::clock() - began) / CLOCKS_PER_SEC;
+  std::cout << "{\"seconds\": " << took << ", \"megabytes\": " << megabytes() - before << "}" << std::endl;
   return 0;
 }

@@ -1,0 +1,36 @@
+"""What takes exports in: a file a consumer, found by name, run by `bench.gate`.
+
+Each module has `FORMAT`, the format that it reads; `missing()`, why it can't run here, or an empty text; and
+`check(export, places)`, which gives figures, or raises `Fault` with the first thing that it finds wrong.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Protocol
+
+from bench.gate_places import Places
+
+
+class Fault(Exception):
+    """A consumer refuses an export, or what happens in it is wrong; the text says which."""
+
+
+class Consumer(Protocol):
+    """What a consumer's module has."""
+
+    FORMAT: str
+
+    def missing(self) -> str:
+        """Why it can't run here, or an empty text."""
+
+    def check(self, export: Path, places: Places) -> dict[str, Any]:
+        """Figures of an exported world.
+
+        Args:
+            export: folder of the world in the consumer's format.
+            places: of the same world, to drop things at.
+
+        Raises:
+            Fault: something is wrong.
+        """

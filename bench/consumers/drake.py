@@ -1,0 +1,57 @@
+"""Drake's SDF parser, strict: an element that it doesn't know, or a file that isn't there, is an error.
+
+What only Gazebo has a use for (`GAZEBOS`) is taken out of a copy first: valid SDF that Drake has nothing for.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import shutil
+import tempfile
+import xml.etree.ElementTree as ET
+from pathlib import Path
+from typing import Any
+
+from bench.consumers import Fault
+from bench.gate_places import Places
+
+FORMAT = "gazebo"
+GAZEBOS = ("plugin", "cast_shadows")
+
+
+def missing() -> str:
+    """Why it can't run here, or an empty text."""
+    return "" if importlib.util.find_spec("pydrake") else "pydrake isn't installed (pip install drake)"
+
+
+def check(export: Path, places: Places) -> dict[str, Any]:
+    """Parse every model with warnings as errors, its meshes among them."""
+    from pydrake.multibody.parsing import Parser
+    from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
+    from pydrake.systems.framework import DiagramBuilder
+
+    with tempfile.TemporaryDirectory() as place:
+        models = Path(place) / "models"
+        shutil.copytree(export / "models", models, copy_function=lambda a, b: Path(b).symlink_to(Path(a).resolve()))
+        plant, _ = AddMultibodyPlantSceneGraph(DiagramBuilder(), time_step=0.001)
+        parser = Parser(plant)
+        parser.SetStrictParsing()
+        for model in sorted(models.iterdir()):
+            parser.package_map().Add(model.name, model)
+            _strip(model / "model.sdf")
+        try:
+            for model in sorted(models.iterdir()):
+                parser.AddModels(model / "model.sdf")
+        except RuntimeError as why:
+            raise Fault(str(why)) from None
+        return {"models": plant.num_model_instances() - 2, "bodies": plant.num_bodies() - 1}
+
+
+def _strip(path: Path) -> None:
+    """Write an SDF without what only Gazebo has a use for, in place of its link."""
+    tree = ET.parse(path)
+    for parent in tree.iter():
+        for child in [one for one in parent if one.tag in GAZEBOS]:
+            parent.remove(child)
+    path.unlink()
+    tree.write(path)

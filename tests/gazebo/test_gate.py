@@ -1,0 +1,47 @@
+"""The gate's Gazebo: it lets a good world through, and none whose ground lies elsewhere than the cloud's."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bench.consumers import Fault, gazebo
+from bench.gate_places import Places
+from tests.pipeline import made_up
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return made_up.world(tmp_path_factory.mktemp("gate"), friction=0.9).files["world"]
+
+
+def places(lift: float = 0.0) -> Places:
+    """On the made-up ground, as a cloud that is so much higher would have it."""
+    xy = np.random.default_rng(0).uniform(-9, 9, (60_000, 2))
+    ground = np.column_stack([xy, made_up.height(*xy.T) + lift])
+    return Places(ground[[np.argmin(np.hypot(*(xy - at).T)) for at in ((-6, -6), (1, -6))]], np.zeros((0, 3)), ground)
+
+
+def test_bodies_rest_on_the_clouds_surface(world: Path) -> None:
+    figures = gazebo.check(world, places())
+    assert figures["dropped"] == 4 and figures["drop_max_m"] <= gazebo.WITHIN and figures["fell_through"] == 0
+
+
+def test_a_ground_that_lies_5_cm_off_the_cloud_is_a_fault(world: Path) -> None:
+    with pytest.raises(Fault, match="don't come to rest"):
+        gazebo.check(world, places(0.05))
+
+
+def test_a_broken_world_is_a_fault(world: Path) -> None:
+    (world / "models/street/meshes/terrain_1.png").unlink()
+    with pytest.raises(Fault, match="terrain_1"):
+        gazebo.check(world, places())
+
+
+def test_the_surface_is_that_of_the_points_around() -> None:
+    some = places()
+    xy = np.array([[0.3, -2.0], [30, 30]])
+    heights = some.heights(xy)
+    assert heights[0] == pytest.approx(made_up.height(*xy[0]), abs=0.005) and np.isnan(heights[1])
