@@ -21,6 +21,7 @@ from scan2sim.data_samples.crossing_traffic import STANDS
 from scan2sim.services.toolboxes import sources
 from scan2sim.services.toolboxes.boxes import movement
 from scan2sim.services.toolboxes.frames import Frame
+from scan2sim.services.toolboxes.overlap import overlaps
 from scan2sim.services.toolboxes.results import Body, Moving
 
 VIEWS, FRAMES, SEED = 10, 1000, 0
@@ -99,22 +100,16 @@ def _detected(film: Path, model: Any, truth: Sequence[dict[str, Any]]) -> Iterat
 
 def _said(view: int, thing: dict[str, Any], past: list[tuple[float, float]], body: Body) -> Said:
     recent = [speed for time, speed in past if past[-1][0] - time <= HISTORY]
-    best = max(body.detections or (), key=lambda one: _overlap(one.box, thing["box"]), default=None)
-    found = best is not None and _overlap(best.box, thing["box"]) >= OVERLAP
-    said = best.moving if found and isinstance(best, Moving) else None
+    things = body.detections or ()
+    shares = overlaps([one.box for one in things], [thing["box"]])[:, 0]
+    found = bool((shares >= OVERLAP).any())
+    best = things[int(shares.argmax())] if found else None
+    said = best.moving if isinstance(best, Moving) else None
     return Said(view, thing["class"], sum(recent) / len(recent) >= STANDS, said, found)
 
 
 def _side(box: Sequence[float]) -> float:
     return min(box[2] - box[0], box[3] - box[1])
-
-
-def _overlap(a: Sequence[float], b: Sequence[float]) -> float:
-    width, height = min(a[2], b[2]) - max(a[0], b[0]), min(a[3], b[3]) - max(a[1], b[1])
-    if width <= 0 or height <= 0:
-        return 0.0
-    areas = [(one[2] - one[0]) * (one[3] - one[1]) for one in (a, b)]
-    return width * height / (sum(areas) - width * height)
 
 
 def movement_accuracy(out: Path, views: int = VIEWS, frames: int = FRAMES) -> dict[str, Any]:

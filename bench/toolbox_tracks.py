@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from scan2sim.pipeline.types import F64
+from scan2sim.services.toolboxes.boxes import movement
 from scan2sim.services.toolboxes.results import Detection
 from scan2sim.services.toolboxes.tracking import Tracker
 
@@ -64,7 +65,10 @@ def scored(boxes: Truth, found: Callable[[int], list[Detection]]) -> tuple[float
     setattr(np, "asfarray", partial(np.asarray, dtype=np.float64))  # noqa: B010 - of numpy 1, which motmetrics wants
     import motmetrics
 
-    tracker, account = Tracker(lost=1.0, rate=RATE), motmetrics.MOTAccumulator(auto_id=True)
+    tracker, account = (
+        Tracker(sure=movement.Params().threshold, lost=1.0, rate=RATE),
+        motmetrics.MOTAccumulator(auto_id=True),
+    )
     for frame in sorted(boxes):
         detections = found(frame)
         tracks = tracker.update(detections)

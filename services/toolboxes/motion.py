@@ -3,7 +3,8 @@
 Corners (Shi and Tomasi, 1994) are followed from image to image (Lucas and Kanade; pyramidal: Bouguet, 2000). A corner's
 step is what it does beyond what the background does, so that a mast in the wind makes nothing move; steps are summed
 over a second, in which shaking comes back to where it was and driving doesn't. A thing moves if enough of its corners
-do: others in its box may be of what lies behind it.
+do: others in its box may be of what lies behind it. How far one may drift that stands is as far as the background's
+do. A thing that wasn't detected for a moment is where its corners went.
 """
 
 from __future__ import annotations
@@ -23,12 +24,14 @@ WINDOW = 1.0
 """Seconds over which it is decided."""
 SOONEST = 0.25
 """Seconds that a corner was followed for before it counts."""
-STILL = 1.5
-"""Pixels of such an image by which a standing corner may drift in a second."""
-LEAST = 1.0
-"""Pixels that a corner must have gone, however short its history is."""
-ENOUGH = 0.3
-"""Share of a thing's corners that move, if it does."""
+STILL = (0.8, 3.0)
+"""Pixels of such an image by which a standing corner may drift in a second, whatever the background's do."""
+CALM = (75.0, 1.25)
+"""A percentile of the background's drifts, and by how much more a standing corner may drift."""
+LEAST = 0.7
+"""Share of that drift that a corner must have gone, however short its history is."""
+ENOUGH = ((0.5, 1.0), (0.3, 2.0))
+"""A thing moves if such a share of its corners drifts so many times as far as standing ones may."""
 CORNERS, BACKGROUND = 80, 200
 """Corners of a thing, and of the background, about: they are as far apart as that."""
 NEAREST = 2.0
@@ -66,13 +69,14 @@ class Motion:
 class _Corners:
     """Corners that are followed, and their steps: (N, 2) pixels, (N, T, 2) pixels, (T,) seconds that each step took.
 
-    Steps before a corner was found are NaN. Of their thing: `seen`, when it was last detected, and `path`, (seconds,
-    pixels across and down) of its boxes' middles over the last second.
+    Steps before a corner was found are NaN. Of their thing: `box`, where it is (pixels followed), `seen`, when it was
+    last detected, and `path`, (seconds, pixels across and down) of its detected boxes' middles over the last second.
     """
 
     at: F32 = field(default_factory=lambda: np.empty((0, 2), np.float32))
     steps: F32 = field(default_factory=lambda: np.empty((0, 0, 2), np.float32))
     took: F64 = field(default_factory=lambda: np.empty(0))
+    box: F64 = field(default_factory=lambda: np.zeros(4))
     seen: float = 0.0
     path: deque[tuple[float, float, float]] = field(default_factory=deque)
 
@@ -81,7 +85,9 @@ class _Corners:
         self.at, self.steps = self.at[which], self.steps[which]
 
     def step(self, at: F32, beyond: F32, seconds: float) -> None:
-        """All go to where they are now; what is older than the window is forgotten."""
+        """All go to where they are now, and their thing with them; what is older than the window is forgotten."""
+        if len(at):
+            self.box = self.box + np.tile(np.median(at - self.at, axis=0), 2)
         self.at = at
         self.steps = np.concatenate([self.steps, beyond[:, None]], axis=1)
         self.took = np.append(self.took, seconds)
@@ -90,7 +96,7 @@ class _Corners:
 
     def place(self, seconds: float, box: F64) -> None:
         """Their thing was detected in a box."""
-        self.seen = seconds
+        self.box, self.seen = box, seconds
         self.path.append((seconds, (box[0] + box[2]) / 2, (box[1] + box[3]) / 2))
         while seconds - self.path[0][0] > WINDOW:
             self.path.popleft()
@@ -100,17 +106,27 @@ class _Corners:
         never = np.full((len(found), len(self.took), 2), np.nan, np.float32)
         self.at, self.steps = np.concatenate([self.at, found]), np.concatenate([self.steps, never])
 
-    def motion(self, scale: float) -> Motion:
-        """Of their thing; `scale`: pixels followed by pixels of the image."""
+    def ways(self) -> tuple[F64, F64]:
+        """(K,) pixels that corners went beyond the background, and seconds that it took, of those that count."""
         known = np.isfinite(self.steps[..., 0])
         durations = known @ self.took if len(self.took) else np.zeros(len(self.at))
         counts = durations >= SOONEST
-        if counts.sum() < FEWEST:
+        return np.linalg.norm(np.nansum(self.steps[counts], axis=1), axis=1), durations[counts]
+
+    def motion(self, scale: float, still: float) -> Motion:
+        """Of their thing.
+
+        Args:
+            scale: pixels followed by pixels of the image.
+            still: pixels followed by which a standing corner may drift in a second.
+        """
+        ways, durations = self.ways()
+        if len(ways) < FEWEST:
             return self._drift(scale)
-        ways = np.linalg.norm(np.nansum(self.steps[counts], axis=1), axis=1)
-        speeds = ways / durations[counts]
-        moves = ways > np.maximum(LEAST, STILL * durations[counts])
-        moving = bool(moves.mean() >= ENOUGH)
+        speeds, drifts = ways / durations, ways / (still * np.maximum(LEAST, durations))
+        weights = durations / durations.sum()  # those of what passes by are in its box for a moment
+        moving = any(weights[drifts > times].sum() >= share for share, times in ENOUGH)
+        moves = drifts > 1
         return Motion(moving, round(float(np.median(speeds[moves] if moving else speeds)) / scale, 2))
 
     def _drift(self, scale: float) -> Motion:
@@ -125,14 +141,20 @@ class _Corners:
 class Flow:
     """Optical flow of one source's images; their camera stands."""
 
-    def __init__(self) -> None:
+    def __init__(self, kept: float = WINDOW) -> None:
+        """Begin.
+
+        Args:
+            kept: seconds for which a thing that isn't detected is followed by its corners alone.
+        """
+        self._kept = kept
         self._last: U8 | None = None
-        self._time = 0.0
+        self._time, self._scale = 0.0, 1.0
         self._things: dict[int, _Corners] = {}
         self._background = _Corners()
 
     def update(self, image: U8, seconds: float, boxes: Mapping[int, Box]) -> dict[int, Motion]:
-        """How things move, by their track.
+        """How things move, by their track: those in `boxes`, and those that are followed without (`box`).
 
         Args:
             image: (H, W, 3) RGB.
@@ -140,17 +162,30 @@ class Flow:
             boxes: tracks of the things in it, and where they are: left, top, right, bottom, pixels.
         """
         grey, scale = _grey(image)
+        self._scale = scale
         if self._last is not None and self._last.shape == grey.shape and 0 < seconds - self._time < WINDOW:
             self._step(self._last, grey, seconds)
         else:
             self._things, self._background = {}, _Corners()
         self._last, self._time = grey, seconds
-        self._renew(grey, seconds, {track: np.array(box) * scale for track, box in boxes.items()})
-        return {track: self._things[track].motion(scale) for track in boxes}
+        there = self._renew(grey, seconds, {track: np.array(box) * scale for track, box in boxes.items()})
+        still = self._still()
+        return {track: self._things[track].motion(scale, still) for track in there}
+
+    def box(self, track: int) -> Box:
+        """Where a thing is, as its corners went: left, top, right, bottom, pixels."""
+        left, top, right, bottom = (self._things[track].box / self._scale).tolist()
+        return left, top, right, bottom
+
+    def _still(self) -> float:
+        """Pixels followed by which a standing corner may drift in a second."""
+        ways, durations = self._background.ways()
+        percentile, more = CALM
+        drift = more * float(np.percentile(ways / durations, percentile)) if len(ways) >= FEWEST_BACKGROUND else 0.0
+        return float(np.clip(drift, *STILL))
 
     def _step(self, last: U8, grey: U8, seconds: float) -> None:
         """Follow all corners, and note how they went against the background."""
-        self._things = {track: one for track, one in self._things.items() if seconds - one.seen < WINDOW}
         groups = [self._background, *self._things.values()]
         now, sure = _followed(last, grey, np.concatenate([one.at for one in groups]))
         ends = np.cumsum([len(one.at) for one in groups])[:-1]
@@ -162,18 +197,28 @@ class Flow:
             expected = one.at @ shake[:, :2].T + shake[:, 2]
             one.step(after[good], np.asarray(after[good] - expected, np.float32), seconds - self._time)
 
-    def _renew(self, grey: U8, seconds: float, boxes: Mapping[int, F64]) -> None:
-        """Keep corners that are in their thing's box and in no nearer one's; find others where there are none."""
+    def _renew(self, grey: U8, seconds: float, boxes: Mapping[int, F64]) -> list[int]:
+        """Keep corners that are in their thing's box and in no nearer one's; find others where there are none.
+
+        Returns:
+            Tracks of the things that are there, the nearest first: lowest in the image.
+        """
         height, width = grey.shape
         free = np.full(grey.shape, 255, np.uint8)
-        for track, box in sorted(boxes.items(), key=lambda one: -one[1][3]):  # the nearest, lowest in the image, first
-            thing = self._things.setdefault(track, _Corners())
-            thing.place(seconds, box)
-            left, top, right, bottom = np.clip(box.round().astype(int), 0, (width, height, width, height))
-            place = np.s_[top:bottom, left:right]
-            _find(grey, free, place, thing, CORNERS)
+        for track, box in boxes.items():
+            self._things.setdefault(track, _Corners()).place(seconds, box)
+        self._things = {
+            track: one for track, one in self._things.items() if track in boxes or seconds - one.seen < self._kept
+        }
+        there = [track for track, one in self._things.items() if track in boxes or len(one.at) >= FEWEST]
+        there.sort(key=lambda track: -self._things[track].box[3])
+        for track in there:
+            thing = self._things[track]
+            left, top, right, bottom = np.clip(thing.box.round().astype(int), 0, (width, height, width, height))
+            _find(grey, free, np.s_[top:bottom, left:right], thing, CORNERS if track in boxes else 0)
             free[max(0, top - EDGE) : bottom + EDGE, max(0, left - EDGE) : right + EDGE] = 0
         _find(grey, free, np.s_[:, :], self._background, BACKGROUND)
+        return there
 
 
 def _grey(image: U8) -> tuple[U8, float]:
@@ -211,7 +256,7 @@ def _similarity(before: F32, after: F32) -> F64:
 
 
 def _find(grey: U8, free: U8, place: tuple[slice, slice], corners: _Corners, most: int) -> None:
-    """Drop corners out of a place of an image, or where it isn't free (0), and find others, apart from these."""
+    """Drop corners out of a place of an image, or where it isn't free (0), and find others, `most` with these."""
     import cv2
 
     top, left = place[0].start or 0, place[1].start or 0
@@ -223,6 +268,8 @@ def _find(grey: U8, free: U8, place: tuple[slice, slice], corners: _Corners, mos
     inside = (at >= 0).all(axis=1) & (at[:, 0] < mask.shape[1]) & (at[:, 1] < mask.shape[0])
     inside[inside] = mask[at[inside, 1], at[inside, 0]] > 0
     corners.keep(inside)
+    if not most:
+        return
     apart = max(NEAREST, math.sqrt(mask.size / most))
     for x, y in at[inside]:
         cv2.circle(mask, (int(x), int(y)), math.ceil(apart), 0, cv2.FILLED)

@@ -46,6 +46,7 @@ class Moving(Detection):
     track: int = Field(description="Number of the thing, of its source alone.")
     moving: bool | None = Field(description="Over the last second; null: it isn't known yet.")
     speed: float | None = Field(description="Pixels a second, of its corners against the background's.")
+    detected: bool = Field(True, description="false: missed in this image; the box is where the thing's corners went.")
 
 
 class Class(Told):

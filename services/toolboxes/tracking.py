@@ -1,4 +1,7 @@
-"""Detections of a source's images joined to tracks: SORT (Bewley et al., 2016), as the library `trackers` has it."""
+"""Detections of a source's images joined to tracks: ByteTrack (Zhang et al., 2022), as the library `trackers` has it.
+
+Tracks begin with detections that are sure, and go on with fainter ones.
+"""
 
 from __future__ import annotations
 
@@ -17,27 +20,30 @@ PROVEN = 2
 OVERLAP = 0.2
 """Intersection over union with where a thing was expected, from which a detection is of that thing."""
 REFERENCE_RATE = 30.0
-"""Images a second that the library counts lost tracks at."""
+"""Images a second at which the library's lost tracks are counted by images, whatever the source's rate."""
 
 
 class Tracker:
     """Follows things through the images of one source."""
 
-    def __init__(self, lost: float, rate: float) -> None:
+    def __init__(self, sure: float, lost: float, rate: float) -> None:
         """Begin.
 
         Args:
+            sure: score from which a detection begins a track; fainter ones go on with one.
             lost: seconds for which a track is kept that isn't detected.
             rate: images a second, about.
         """
         extras.need("following things", *NEEDS)
-        from trackers import SORTTracker
+        from trackers import ByteTrackTracker
 
-        self._sort: Any = SORTTracker(
-            lost_track_buffer=math.ceil(lost * REFERENCE_RATE),
-            frame_rate=rate,
+        self._tracker: Any = ByteTrackTracker(
+            lost_track_buffer=max(1, math.ceil(lost * rate)),
+            frame_rate=REFERENCE_RATE,
             minimum_consecutive_frames=PROVEN,
             minimum_iou_threshold=OVERLAP,
+            track_activation_threshold=sure,
+            high_conf_det_threshold=sure,
         )
         self._numbers: dict[int, int] = {}
 
@@ -45,7 +51,7 @@ class Tracker:
         """The track's number of each detection of the next image; None: it has none yet."""
         import supervision
 
-        found = self._sort.update(
+        found = self._tracker.update(
             supervision.Detections(
                 xyxy=np.array([one.box for one in detections], np.float64).reshape(-1, 4),
                 confidence=np.array([one.score for one in detections], np.float64),

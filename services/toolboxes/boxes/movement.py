@@ -1,5 +1,7 @@
 """Detection of things that move (D3.2, section 5.2): a detector, a tracker, and optical flow of corners.
 
+The detector's faint detections go on with what was found for sure, and what it misses is where its corners went.
+
 The camera must stand while it looks: of one that drives, nobody can say whether it or the thing moves. It is stopped
 (standby) and started again by the interface that serves it.
 """
@@ -15,11 +17,14 @@ from scan2sim.services.toolboxes import drawing, tracking
 from scan2sim.services.toolboxes.boxes import Follow, Model, detect
 from scan2sim.services.toolboxes.frames import Frame
 from scan2sim.services.toolboxes.motion import Flow
-from scan2sim.services.toolboxes.results import Body, Moving
+from scan2sim.services.toolboxes.overlap import overlaps
+from scan2sim.services.toolboxes.results import Body, Detection, Moving
 from scan2sim.services.toolboxes.settings import Batch, Deadline, Waiting
 from scan2sim.services.toolboxes.tracking import Tracker
 
 NEEDS = (*detect.NEEDS, *tracking.NEEDS)
+SAME = 0.3
+"""Intersection over union with a detection from which a thing that was missed is another track's now."""
 
 
 class Params(detect.Params):
@@ -29,6 +34,9 @@ class Params(detect.Params):
     waiting: Waiting = 8
     deadline: Deadline = 5.0
     rate: Annotated[float, Field(ge=0.1, le=1000, description="Images a second of a source, about.")] = 25.0
+    faint: Annotated[
+        float, Field(ge=0.01, le=1, description="Score from which a detection continues a track, below --threshold.")
+    ] = 0.1
     lost: Annotated[
         float, Field(ge=0, le=60, description="Seconds for which a thing that isn't detected keeps its track.")
     ] = 1.0
@@ -40,8 +48,8 @@ def check(params: Params) -> None:
 
 
 def load(params: Params) -> Model:
-    """The model (`boxes.Toolbox`): the detector's."""
-    return detect.load(params)
+    """The model (`boxes.Toolbox`): the detector's, with faint detections."""
+    return detect.load(params.model_copy(update={"threshold": min(params.faint, params.threshold)}))
 
 
 def follow(params: Params) -> Follow | None:
@@ -58,25 +66,36 @@ class _Follower:
     """Tracks one source's things, and says whether they move."""
 
     def __init__(self, params: Params) -> None:
-        self._tracker, self._flow = Tracker(params.lost, params.rate), Flow()
+        self._tracker, self._flow = Tracker(params.threshold, params.lost, params.rate), Flow(params.lost)
+        self._known: dict[int, Detection] = {}
 
     def __call__(self, frame: Frame, image: U8, body: Body) -> Body:
-        """Detections that have a track, with it."""
+        """Things that have a track, with it: those detected here, and those that were a moment ago."""
         found = body.detections or ()
         tracks = self._tracker.update(found)
         seconds = frame.received if frame.stamp is None else frame.stamp / 1e9
         followed = {track: one for track, one in zip(tracks, found, strict=True) if track is not None}
         motions = self._flow.update(image, seconds, {track: one.box for track, one in followed.items()})
+        self._known = {track: one for track, one in (self._known | followed).items() if track in motions}
+        missed = {track: self._missed(track, image) for track in motions if track not in followed}
+        here = [one.box for one in followed.values()]
+        followed |= {track: one for track, one in missed.items() if not (overlaps([one.box], here) > SAME).any()}
         return Body(
             detections=tuple(
                 Moving(
-                    label=one.label,
-                    score=one.score,
-                    box=one.box,
+                    **one.model_dump(),
                     track=track,
                     moving=motions[track].moving,
                     speed=motions[track].speed,
+                    detected=track not in missed,
                 )
                 for track, one in followed.items()
             )
         )
+
+    def _missed(self, track: int, image: U8) -> Detection:
+        """A thing that the detector missed, where its corners went."""
+        height, width = image.shape[:2]
+        left, top, right, bottom = self._flow.box(track)
+        box = (max(left, 0.0), max(top, 0.0), min(right, float(width)), min(bottom, float(height)))
+        return self._known[track].model_copy(update={"box": tuple(round(side, 1) for side in box)})

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scan2sim.pipeline.types import F32, F64, I32, Bools
+from scan2sim.pipeline.types import F32, I32, Bools
+from scan2sim.services.toolboxes.overlap import overlaps
 
 
 @dataclass(frozen=True)
@@ -26,14 +27,6 @@ class Found:
     corners: F32
     scores: F32
     labels: I32
-
-
-def overlaps(a: F32, b: F32) -> F64:
-    """(N, M) intersection over union of boxes (N, 4) and (M, 4) by corners."""
-    low, high = np.maximum(a[:, None, :2], b[None, :, :2]), np.minimum(a[:, None, 2:], b[None, :, 2:])
-    both = np.clip(high - low, 0, None).prod(axis=2).astype(np.float64)
-    areas = [(x[:, 2:] - x[:, :2]).prod(axis=1) for x in (a, b)]
-    return np.asarray(both / np.maximum(areas[0][:, None] + areas[1][None] - both, 1e-9), np.float64)
 
 
 def matched(found: Found, truth: Truth, iou: float = 0.5) -> tuple[I32, Bools]:

@@ -5,52 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.types import F32, U8
-from scan2sim.services.toolboxes.motion import Box, Flow
-
-RATE, SIZE = 25.0, (240, 400)
-
-
-def texture(seed: int, height: int, width: int) -> F32:
-    import cv2
-
-    noise = np.random.default_rng(seed).normal(size=(height, width, 3)).astype(np.float32)
-    smooth = cv2.GaussianBlur(noise, (0, 0), 2.0)
-    return np.asarray(128 + smooth / smooth.std() * 40, np.float32)
-
-
-def shown(image: F32, shift: tuple[float, float]) -> U8:
-    import cv2
-
-    moved = cv2.warpAffine(
-        image, np.array([[1, 0, shift[0]], [0, 1, shift[1]]]), SIZE[::-1], borderMode=cv2.BORDER_REFLECT
-    )
-    return np.clip(moved, 0, 255).astype(np.uint8)
-
-
-class Scene:
-    """Patches (left, top, width, height, pixels a second, growth a second); later ones are nearer."""
-
-    def __init__(self, *patches: tuple[float, float, int, int, float, float], shake: float = 0.0) -> None:
-        self._patches, self._shake = patches, shake
-        self._background = texture(0, *SIZE)
-        self._rng = np.random.default_rng(1)
-
-    def frame(self, seconds: float) -> tuple[U8, dict[int, Box]]:
-        import cv2
-
-        image, boxes = self._background.copy(), dict[int, Box]()
-        for i, (left, top, width, height, speed, growth) in enumerate(self._patches):
-            scale, at = 1 + growth * seconds, left + speed * seconds
-            patch = texture(10 + i, height, width)
-            place = np.array([[scale, 0, at - width * (scale - 1) / 2], [0, scale, top - height * (scale - 1) / 2]])
-            mask = cv2.warpAffine(np.ones((height, width), np.float32), place, SIZE[::-1])[..., None]
-            image = cv2.warpAffine(patch, place, SIZE[::-1]) * mask + image * (1 - mask)
-            x, y = place[:, 2]
-            boxes[i] = (x, y, x + width * scale, y + height * scale)
-        shift = tuple(self._rng.normal(scale=self._shake, size=2)) if self._shake else (0.0, 0.0)
-        boxes = {i: (a + shift[0], b + shift[1], c + shift[0], d + shift[1]) for i, (a, b, c, d) in boxes.items()}
-        return shown(image, (shift[0], shift[1])), boxes
+from scan2sim.services.toolboxes.motion import Flow
+from tests.services.toolboxes.moving_scene import RATE, SIZE, Scene
 
 
 def said(scene: Scene, seconds: float = 1.6) -> list[list[bool | None]]:
@@ -59,7 +15,7 @@ def said(scene: Scene, seconds: float = 1.6) -> list[list[bool | None]]:
     for i in range(int(seconds * RATE)):
         image, boxes = scene.frame(i / RATE)
         told.append({track: motion.moving for track, motion in flow.update(image, i / RATE, boxes).items()})
-    return [[one[track] for one in told] for track in told[0]]
+    return [[one[track] for one in told] for track in sorted(told[0])]
 
 
 @pytest.mark.parametrize("shake", [0.0, 1.5])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from scan2sim.pipeline.types import F32
-from scan2sim.services.toolboxes.networks.score import overlaps
+from scan2sim.services.toolboxes.overlap import overlaps
 from scan2sim.services.toolboxes.yolo import GREY, Transform, decode, letterbox
 
 
