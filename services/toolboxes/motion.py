@@ -11,12 +11,13 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from scan2sim.pipeline.types import F32, F64, U8, Bools
+from scan2sim.services.toolboxes.results import Detection
 
 WIDTH = 640
 """Pixels of the images that corners are followed in; larger ones are made smaller."""
@@ -40,6 +41,8 @@ FEWEST, FEWEST_BACKGROUND = 4, 8
 """Corners that say anything together."""
 DRIFT = 8.0
 """Pixels a second that the middle of a standing thing's boxes may go, where it has too few corners."""
+PART = 0.8
+"""Share of a box that lies in another thing's, from which it may be a part of it."""
 BACK = 0.5
 """Pixels that a corner may be off when it is followed there and back."""
 REACH = (15, 15)
@@ -48,8 +51,6 @@ EDGE = max(REACH) // 2
 """Pixels around a nearer thing in which it would draw corners along."""
 QUALITY = 0.02
 """Of corners: least strength as a share of the strongest."""
-
-Box = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
@@ -69,14 +70,16 @@ class Motion:
 class _Corners:
     """Corners that are followed, and their steps: (N, 2) pixels, (N, T, 2) pixels, (T,) seconds that each step took.
 
-    Steps before a corner was found are NaN. Of their thing: `box`, where it is (pixels followed), `seen`, when it was
-    last detected, and `path`, (seconds, pixels across and down) of its detected boxes' middles over the last second.
+    Steps before a corner was found are NaN. Of their thing: `box`, where it is (pixels followed), `score` and `seen`,
+    how sure and when it was last detected, and `path`, (seconds, pixels across and down) of its detected boxes' middles
+    over the last second.
     """
 
     at: F32 = field(default_factory=lambda: np.empty((0, 2), np.float32))
     steps: F32 = field(default_factory=lambda: np.empty((0, 0, 2), np.float32))
     took: F64 = field(default_factory=lambda: np.empty(0))
     box: F64 = field(default_factory=lambda: np.zeros(4))
+    score: float = 0.0
     seen: float = 0.0
     path: deque[tuple[float, float, float]] = field(default_factory=deque)
 
@@ -94,9 +97,9 @@ class _Corners:
         recent = np.cumsum(self.took[::-1])[::-1] <= WINDOW + seconds / 2
         self.steps, self.took = self.steps[:, recent], self.took[recent]
 
-    def place(self, seconds: float, box: F64) -> None:
+    def place(self, seconds: float, box: F64, score: float) -> None:
         """Their thing was detected in a box."""
-        self.box, self.seen = box, seconds
+        self.box, self.score, self.seen = box, score, seconds
         self.path.append((seconds, (box[0] + box[2]) / 2, (box[1] + box[3]) / 2))
         while seconds - self.path[0][0] > WINDOW:
             self.path.popleft()
@@ -153,13 +156,13 @@ class Flow:
         self._things: dict[int, _Corners] = {}
         self._background = _Corners()
 
-    def update(self, image: U8, seconds: float, boxes: Mapping[int, Box]) -> dict[int, Motion]:
-        """How things move, by their track: those in `boxes`, and those that are followed without (`box`).
+    def update(self, image: U8, seconds: float, found: Mapping[int, Detection]) -> dict[int, Motion]:
+        """How things move, by their track: those that were found, and those that are followed without (`box`).
 
         Args:
             image: (H, W, 3) RGB.
             seconds: when it was taken; after a gap of over a second, or a change of size, all begins anew.
-            boxes: tracks of the things in it, and where they are: left, top, right, bottom, pixels.
+            found: what was detected in it, by its track.
         """
         grey, scale = _grey(image)
         self._scale = scale
@@ -168,11 +171,11 @@ class Flow:
         else:
             self._things, self._background = {}, _Corners()
         self._last, self._time = grey, seconds
-        there = self._renew(grey, seconds, {track: np.array(box) * scale for track, box in boxes.items()})
+        there = self._renew(grey, seconds, found)
         still = self._still()
         return {track: self._things[track].motion(scale, still) for track in there}
 
-    def box(self, track: int) -> Box:
+    def box(self, track: int) -> tuple[float, float, float, float]:
         """Where a thing is, as its corners went: left, top, right, bottom, pixels."""
         left, top, right, bottom = (self._things[track].box / self._scale).tolist()
         return left, top, right, bottom
@@ -197,28 +200,51 @@ class Flow:
             expected = one.at @ shake[:, :2].T + shake[:, 2]
             one.step(after[good], np.asarray(after[good] - expected, np.float32), seconds - self._time)
 
-    def _renew(self, grey: U8, seconds: float, boxes: Mapping[int, F64]) -> list[int]:
+    def _renew(self, grey: U8, seconds: float, found: Mapping[int, Detection]) -> Iterable[int]:
         """Keep corners that are in their thing's box and in no nearer one's; find others where there are none.
 
+        Nearer: lower in the image. What is less sure, or lies all within a thing, may be a part of it, taken for
+        something else: its corners are the thing's, too.
+
         Returns:
-            Tracks of the things that are there, the nearest first: lowest in the image.
+            Tracks of the things that are there.
         """
-        height, width = grey.shape
-        free = np.full(grey.shape, 255, np.uint8)
-        for track, box in boxes.items():
-            self._things.setdefault(track, _Corners()).place(seconds, box)
+        for track, one in found.items():
+            self._things.setdefault(track, _Corners()).place(seconds, np.array(one.box) * self._scale, one.score)
         self._things = {
-            track: one for track, one in self._things.items() if track in boxes or seconds - one.seen < self._kept
+            track: one for track, one in self._things.items() if track in found or seconds - one.seen < self._kept
         }
-        there = [track for track, one in self._things.items() if track in boxes or len(one.at) >= FEWEST]
-        there.sort(key=lambda track: -self._things[track].box[3])
-        for track in there:
-            thing = self._things[track]
-            left, top, right, bottom = np.clip(thing.box.round().astype(int), 0, (width, height, width, height))
-            _find(grey, free, np.s_[top:bottom, left:right], thing, CORNERS if track in boxes else 0)
-            free[max(0, top - EDGE) : bottom + EDGE, max(0, left - EDGE) : right + EDGE] = 0
-        _find(grey, free, np.s_[:, :], self._background, BACKGROUND)
+        there = {track: one for track, one in self._things.items() if track in found or len(one.at) >= FEWEST}
+        things = list(there.values())
+        for track, own in there.items():
+            before = [
+                other.box
+                for other in things
+                if other.box[3] > own.box[3] and other.score >= own.score and _within(other.box, own.box) < PART
+            ]
+            _find(grey, _free(grey.shape, before), _place(own.box, grey.shape), own, CORNERS if track in found else 0)
+        _find(grey, _free(grey.shape, [one.box for one in things]), np.s_[:, :], self._background, BACKGROUND)
         return there
+
+
+def _place(box: F64, shape: tuple[int, ...], around: int = 0) -> tuple[slice, slice]:
+    """Rows and columns of a box, and of some pixels around it."""
+    left, top, right, bottom = box.round().astype(int) + (-around, -around, around, around)
+    return np.s_[max(0, top) : max(0, min(bottom, shape[0])), max(0, left) : max(0, min(right, shape[1]))]
+
+
+def _free(shape: tuple[int, ...], boxes: Sequence[F64]) -> U8:
+    """(H, W) 255 where none of the boxes is, nor near one, else 0."""
+    free = np.full(shape, 255, np.uint8)
+    for box in boxes:
+        free[_place(box, shape, EDGE)] = 0
+    return free
+
+
+def _within(box: F64, other: F64) -> float:
+    """Share of a box that lies in another one."""
+    sides = np.minimum(box[2:], other[2:]) - np.maximum(box[:2], other[:2])
+    return float(np.prod(np.maximum(sides, 0)) / max(np.prod(box[2:] - box[:2]), 1e-9))
 
 
 def _grey(image: U8) -> tuple[U8, float]:

@@ -8,6 +8,7 @@ The camera must stand while it looks: of one that drives, nobody can say whether
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated
 
 from pydantic import Field
@@ -23,6 +24,8 @@ from scan2sim.services.toolboxes.settings import Batch, Deadline, Waiting
 from scan2sim.services.toolboxes.tracking import Tracker
 
 NEEDS = (*detect.NEEDS, *tracking.NEEDS)
+TWICE = 0.5
+"""Intersection over union from which two detections are of one thing, of whatever class."""
 SAME = 0.3
 """Intersection over union with a detection from which a thing that was missed is another track's now."""
 
@@ -62,6 +65,15 @@ def draw(image: U8, body: Body) -> U8:
     return drawing.detections(image, body.detections or ())
 
 
+def _apart(things: Sequence[Detection]) -> list[Detection]:
+    """Of those whose boxes are nearly the same, whatever they are called, the surest one; the surest first."""
+    kept: list[Detection] = []
+    for one in sorted(things, key=lambda one: -one.score):
+        if not (overlaps([one.box], [other.box for other in kept]) > TWICE).any():
+            kept.append(one)
+    return kept
+
+
 class _Follower:
     """Tracks one source's things, and says whether they move."""
 
@@ -71,11 +83,11 @@ class _Follower:
 
     def __call__(self, frame: Frame, image: U8, body: Body) -> Body:
         """Things that have a track, with it: those detected here, and those that were a moment ago."""
-        found = body.detections or ()
+        found = _apart(body.detections or ())
         tracks = self._tracker.update(found)
         seconds = frame.received if frame.stamp is None else frame.stamp / 1e9
         followed = {track: one for track, one in zip(tracks, found, strict=True) if track is not None}
-        motions = self._flow.update(image, seconds, {track: one.box for track, one in followed.items()})
+        motions = self._flow.update(image, seconds, followed)
         self._known = {track: one for track, one in (self._known | followed).items() if track in motions}
         missed = {track: self._missed(track, image) for track in motions if track not in followed}
         here = [one.box for one in followed.values()]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from scan2sim.pipeline.types import F32, U8
-from scan2sim.services.toolboxes.motion import Box
+from scan2sim.services.toolboxes.results import Detection
 
 RATE, SIZE = 25.0, (240, 400)
 
@@ -27,6 +27,10 @@ def shown(image: F32, shift: tuple[float, float]) -> U8:
     return np.clip(moved, 0, 255).astype(np.uint8)
 
 
+def detected(box: tuple[float, float, float, float], score: float = 0.9) -> Detection:
+    return Detection(label="car", score=score, box=box)
+
+
 class Scene:
     """Patches (left, top, width, height, pixels a second, growth a second); later ones are nearer."""
 
@@ -35,10 +39,10 @@ class Scene:
         self._background = texture(0, *SIZE)
         self._rng = np.random.default_rng(1)
 
-    def frame(self, seconds: float) -> tuple[U8, dict[int, Box]]:
+    def frame(self, seconds: float) -> tuple[U8, dict[int, Detection]]:
         import cv2
 
-        image, boxes = self._background.copy(), dict[int, Box]()
+        image, boxes = self._background.copy(), dict[int, tuple[float, float, float, float]]()
         for i, (left, top, width, height, speed, growth) in enumerate(self._patches):
             scale, at = 1 + growth * seconds, left + speed * seconds
             patch = texture(10 + i, height, width)
@@ -48,5 +52,5 @@ class Scene:
             x, y = place[:, 2]
             boxes[i] = (x, y, x + width * scale, y + height * scale)
         shift = tuple(self._rng.normal(scale=self._shake, size=2)) if self._shake else (0.0, 0.0)
-        boxes = {i: (a + shift[0], b + shift[1], c + shift[0], d + shift[1]) for i, (a, b, c, d) in boxes.items()}
-        return shown(image, (shift[0], shift[1])), boxes
+        moved = {i: (a + shift[0], b + shift[1], c + shift[0], d + shift[1]) for i, (a, b, c, d) in boxes.items()}
+        return shown(image, (shift[0], shift[1])), {i: detected(box) for i, box in moved.items()}

@@ -8,8 +8,8 @@ import pytest
 
 from scan2sim.services.toolboxes.boxes import movement
 from scan2sim.services.toolboxes.frames import Frame
-from scan2sim.services.toolboxes.results import Body, Detection, Moving
-from tests.services.toolboxes.moving_scene import RATE, Scene
+from scan2sim.services.toolboxes.results import Body, Moving
+from tests.services.toolboxes.moving_scene import RATE, Scene, detected
 
 pytest.importorskip("trackers")
 
@@ -25,7 +25,7 @@ def followed(scene: Scene, score: Score, seconds: float = 3.0, lost: float = 1.0
     for i in range(int(seconds * RATE)):
         image, boxes = scene.frame(i / RATE)
         how_sure = score(i / RATE)
-        found = () if how_sure is None else (Detection(label="car", score=how_sure, box=boxes[0]),)
+        found = () if how_sure is None else (detected(boxes[0].box, how_sure),)
         body = follow(
             Frame(str(i), "film", round(1e9 * i / RATE), image, lambda _: None), image, Body(detections=found)
         )
@@ -40,7 +40,7 @@ def test_what_the_detector_misses_for_a_moment_is_where_it_went(speed: float) ->
     assert all(len(things) == 1 for things in told[3:]), "once each, all the time"
     missed = told[45][0]
     assert not missed.detected and missed.moving is (speed > 0)
-    assert missed.box == pytest.approx(scene.frame(45 / RATE)[1][0], abs=3)
+    assert missed.box == pytest.approx(scene.frame(45 / RATE)[1][0].box, abs=3)
     assert {thing.track for things in told for thing in things} == {1}
     assert told[-1][0].detected
 
