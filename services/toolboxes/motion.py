@@ -3,8 +3,8 @@
 Corners (Shi and Tomasi, 1994) are followed from image to image (Lucas and Kanade; pyramidal: Bouguet, 2000). A corner's
 step is what it does beyond what the background does, so that a mast in the wind makes nothing move; steps are summed
 over a second, in which shaking comes back to where it was and driving doesn't. A thing moves if enough of its corners
-do: others in its box may be of what lies behind it. How far one may drift that stands is as far as the background's
-do. A thing that wasn't detected for a moment is where its corners went.
+do: others in its box, at its rim mostly, may be of what lies behind it. One that stands may drift about as far as the
+background's do. A thing that wasn't detected for a moment is where its corners went.
 """
 
 from __future__ import annotations
@@ -39,10 +39,14 @@ NEAREST = 2.0
 """Pixels between two corners, at least."""
 FEWEST, FEWEST_BACKGROUND = 4, 8
 """Corners that say anything together."""
-DRIFT = 8.0
+DRIFT = 5.0
 """Pixels a second that the middle of a standing thing's boxes may go, where it has too few corners."""
 PART = 0.8
 """Share of a box that lies in another thing's, from which it may be a part of it."""
+RIM = 0.9
+"""By what share a corner at a box's rim counts less than one in its middle."""
+SURE = 2.0
+"""Standard errors of that speed that it exceeds if the thing moves."""
 BACK = 0.5
 """Pixels that a corner may be off when it is followed there and back."""
 REACH = (15, 15)
@@ -111,10 +115,26 @@ class _Corners:
 
     def ways(self) -> tuple[F64, F64]:
         """(K,) pixels that corners went beyond the background, and seconds that it took, of those that count."""
-        known = np.isfinite(self.steps[..., 0])
-        durations = known @ self.took if len(self.took) else np.zeros(len(self.at))
+        durations = self._durations()
         counts = durations >= SOONEST
         return np.linalg.norm(np.nansum(self.steps[counts], axis=1), axis=1), durations[counts]
+
+    def _durations(self) -> F64:
+        """(N,) seconds for which corners were followed."""
+        known = np.isfinite(self.steps[..., 0])
+        return np.asarray(known @ self.took if len(self.took) else np.zeros(len(self.at)))
+
+    def _weights(self) -> F64:
+        """(K,) share that each corner that counts has in what is said of the thing.
+
+        What passes by has its corners in the box for a moment, and what lies behind has them at its rim.
+        """
+        durations = self._durations()
+        counts = durations >= SOONEST
+        half = np.maximum((self.box[2:] - self.box[:2]) / 2, 1.0)
+        off = np.abs((self.at[counts] - (self.box[:2] + self.box[2:]) / 2) / half).max(axis=1).clip(0, 1)
+        weights = durations[counts] * (1 - RIM * off)
+        return np.asarray(weights / weights.sum())
 
     def motion(self, scale: float, still: float) -> Motion:
         """Of their thing.
@@ -127,7 +147,7 @@ class _Corners:
         if len(ways) < FEWEST:
             return self._drift(scale)
         speeds, drifts = ways / durations, ways / (still * np.maximum(LEAST, durations))
-        weights = durations / durations.sum()  # those of what passes by are in its box for a moment
+        weights = self._weights()
         moving = any(weights[drifts > times].sum() >= share for share, times in ENOUGH)
         moves = drifts > 1
         return Motion(moving, round(float(np.median(speeds[moves] if moving else speeds)) / scale, 2))
@@ -135,10 +155,13 @@ class _Corners:
     def _drift(self, scale: float) -> Motion:
         """By the boxes alone: a line through their middles."""
         seconds, *middle = np.array(self.path).T
-        if seconds[-1] - seconds[0] < SOONEST:
+        if seconds[-1] - seconds[0] < SOONEST or len(seconds) < FEWEST:
             return Motion()
-        speed = float(np.linalg.norm([np.polyfit(seconds - seconds[0], one, 1)[0] for one in middle]))
-        return Motion(speed > DRIFT, round(speed / scale, 2))
+        fits = [np.polyfit(seconds - seconds[0], one, 1, full=True)[:2] for one in middle]
+        speed = float(np.linalg.norm([line[0] for line, _ in fits]))
+        spread = sum(left.sum() for _, left in fits) / (len(seconds) - 2)  # of the middles about the lines, squared
+        unsure = math.sqrt(spread / (len(seconds) * seconds.var()))
+        return Motion(speed > max(DRIFT, SURE * unsure), round(speed / scale, 2))
 
 
 class Flow:
