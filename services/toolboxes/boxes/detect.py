@@ -115,7 +115,11 @@ class Detector:
         labels = self.facts.labels
         return Body(
             detections=tuple(
-                Detection(label=labels[label], score=round(float(score), 4), box=tuple(corners.round(1).tolist()))
+                Detection(
+                    label=labels[label],
+                    score=round(float(score), 4),
+                    box=tuple(corners.astype(np.float64).round(1).tolist()),
+                )
                 for corners, score, label in zip(boxes.corners, boxes.scores, boxes.labels, strict=True)
                 if labels[label] in self._wanted
             )

@@ -146,5 +146,5 @@ def test_the_trained_network_finds_vehicles_it_has_never_seen(made: Path) -> Non
         found.append(Found(got.corners, got.scores, got.labels))
         sides = (one.boxes[:, 2:] - one.boxes[:, :2]).max(axis=1, initial=0)
         truth.append(Truth(one.boxes, one.classes.astype(np.int32), (one.visible < 0.25) | (sides < 12)))
-    assert average_precision(found, truth, names.index("car")) > 0.4
-    assert average_precision(found, truth, names.index("train")) > 0.15
+    assert average_precision(found, truth, names.index("car")) > 0.6
+    assert average_precision(found, truth, names.index("train")) > 0.7
