@@ -12,8 +12,11 @@ import numpy as np
 import pytest
 
 from scan2sim.pipeline.errors import DataError, InputError
-from scan2sim.pipeline.io import sdf, worlds
+from scan2sim.pipeline.io import scenes, sdf, worlds
+from scan2sim.pipeline.io.scene import read_scene
+from scan2sim.pipeline.io.scenes import SceneParams
 from scan2sim.pipeline.io.worlds import TileWorld, assemble
+from scan2sim.pipeline.step import silent
 from scan2sim.pipeline.types import Frame
 from tests.pipeline import made_up
 
@@ -106,6 +109,16 @@ def test_what_users_edit_is_copied_and_the_rest_linked(tmp_path: Path, row: Sequ
             twin = folder / "models" / tile.name / path.relative_to(tile.model)
             assert path.samefile(twin) == (path.suffix not in worlds.EDITED), path.name
             assert path.read_bytes() == twin.read_bytes()
+
+
+def test_a_surveys_world_can_be_exported_whole(tmp_path: Path, row: Sequence[TileWorld]) -> None:
+    folder = assemble(tmp_path, "town", row).parent
+    scene = read_scene(tmp_path)
+    assert (scene.name, [tile.offset for tile in scene.tiles]) == ("town", [(-25, 0, 1), (0, 0, 0), (25, 0, -1)])
+    scenes.write(scene, ["gazebo"], tmp_path / "out", SceneParams(), silent)
+    assert (tmp_path / "out" / "town.sdf").read_text() == (folder / "town.sdf").read_text()
+    for path in (path for path in (folder / "models").rglob("*") if path.is_file()):
+        assert (tmp_path / "out" / path.relative_to(folder)).read_bytes() == path.read_bytes(), path.name
 
 
 def test_nothing_is_done_where_nothing_has_changed(tmp_path: Path) -> None:
