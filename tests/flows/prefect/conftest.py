@@ -143,6 +143,9 @@ class Server:
                 if error.code != 503:
                     raise
                 time.sleep(1)  # SQLite is busy
+            except TimeoutError:
+                if method != "GET":
+                    raise
         raise TimeoutError(f"{path}: the database is busy for good")
 
     def cli(self, *args: str, **env: str) -> subprocess.CompletedProcess[str]:
