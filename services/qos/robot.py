@@ -88,6 +88,18 @@ def ask(address: str, toolbox: str, images: list[bytes], rate: float, seconds: f
 
 
 def _state(connection: http.client.HTTPConnection, toolbox: str, image: bytes) -> str:
+    """How a request ends; asked again where the server closed a connection that lay idle."""
+    idle = connection.sock is not None
+    try:
+        return _asked(connection, toolbox, image)
+    except ConnectionError:
+        if not idle:
+            raise
+        connection.close()
+        return _asked(connection, toolbox, image)
+
+
+def _asked(connection: http.client.HTTPConnection, toolbox: str, image: bytes) -> str:
     headers = {"Content-Type": "image/jpeg", "Source": "robot", "Host": "localhost"}
     connection.request("POST", f"/v2/models/{toolbox}/infer", image, headers)
     return str(json.loads(connection.getresponse().read()).get("state", "refused"))
