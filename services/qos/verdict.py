@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from scan2sim.services.qos.measure import Measured
@@ -24,17 +25,27 @@ class Row:
 
 
 def rows(required: Requirements, measured: Measured) -> list[Row]:
-    """Of all metrics that are asked or measured. What is asked of a network that isn't there is met."""
+    """Of all metrics that are asked or measured.
+
+    What is asked of a network that isn't there is met; an answer that never came is too late, whatever is asked.
+    """
     values = measured.values()
     found = []
     for metric in (*NETWORK, *MACHINE):
         bound, value = getattr(required, metric), values[metric]
         if bound is None and value is None:
             continue
-        idle = value is None and metric.endswith("_usage")  # of a processor that isn't there
-        passed = None if bound is None or idle else value is not None and bound.met(value)
-        found.append(Row(metric, bound, value, passed))
+        found.append(Row(metric, bound, value, _met(metric, bound, value)))
     return found
+
+
+def _met(metric: str, bound: Bound | None, value: float | None) -> bool | None:
+    if value is None:
+        idle = metric.endswith("_usage")  # of a processor that isn't there
+        return None if bound is None or idle else False
+    if bound is None:
+        return False if math.isinf(value) else None
+    return bound.met(value)
 
 
 def passed(found: list[Row], metrics: tuple[str, ...]) -> bool:

@@ -6,7 +6,6 @@ import io
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 import urllib.request
@@ -23,6 +22,7 @@ from bench.containers import FOLDER, entry_point, image, requirements, stages
 from bench.third_party import closure
 from scan2sim.services.toolboxes import boxes
 from tests.conftest import ROOT
+from tests.ports import free_port
 
 FILES = sorted(FOLDER.glob("*.Dockerfile"))
 BOXES = boxes.names()
@@ -59,11 +59,6 @@ def healthy(address: str) -> int:
     """As an image's HEALTHCHECK asks, in a Python that has no packages."""
     command = [sys.executable, "-S", "-m", "scan2sim.services.ready", address]
     return subprocess.run(command, env={"PYTHONPATH": str(ROOT)}).returncode
-
-
-def free_port() -> int:
-    with socket.create_server(("", 0)) as one:
-        return int(one.getsockname()[1])
 
 
 def answer(address: str, box: str) -> str:

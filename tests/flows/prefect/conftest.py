@@ -21,6 +21,7 @@ from typing import Any
 import pytest
 
 from tests.conftest import ROOT
+from tests.ports import free_port
 
 pytest.importorskip("prefect")
 
@@ -40,13 +41,6 @@ def environment(home: Path) -> dict[str, str]:
     """Ours, with settings of Prefect's that are the test's alone; no server is named."""
     ours = {k: v for k, v in os.environ.items() if not k.startswith("PREFECT_")}
     return ours | QUIET | {"PREFECT_HOME": str(home)}
-
-
-def free_port() -> int:
-    """A port that nobody listens on."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def wait_for(what: str, found: Callable[[], Any], seconds: float = 60.0) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import threading
 from collections.abc import Iterator
@@ -71,6 +72,12 @@ def measured(seen: Seen | None, response: float = 100.0) -> Measured:
 
 
 SEEN = Seen(sent=1000, loss_rate=0.002, error_rate=0, delay=20, jitter=3, bytes=0)
+
+
+def test_a_robot_that_gets_no_answers_doesnt_pass_though_no_time_is_asked() -> None:
+    silent = rows(Requirements(), measured(None, response=math.inf))
+    assert not passed(silent, NETWORK)
+    assert passed(rows(Requirements(), measured(None)), NETWORK)
 
 
 def test_what_was_asked_is_held_against_what_was_measured() -> None:

@@ -1,0 +1,65 @@
+"""A real camera's link: H.264 by RTSP is read, its loss is noticed, and it is found again."""
+
+from __future__ import annotations
+
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from scan2sim.services.toolboxes import offline
+from scan2sim.services.toolboxes.engine import Engine
+from scan2sim.services.toolboxes.settings import ToolboxParams
+from scan2sim.services.toolboxes.sources import SILENT, Cameras
+from tests.ports import free_port
+from tests.services.toolboxes import shaky
+
+PYTHON = "/usr/bin/python3"
+"""Debian's, whose packages GStreamer's bindings come as."""
+CAMERA = Path(__file__).with_name("rtsp_camera.py")
+LOADS = "import gi; gi.require_version('GstRtspServer', '1.0'); from gi.repository import GstRtspServer"
+
+
+@contextmanager
+def camera(port: int, grey: int) -> Iterator[None]:
+    with subprocess.Popen([PYTHON, CAMERA, str(port), str(grey)], stdout=subprocess.PIPE) as served:
+        assert served.stdout and served.stdout.readline() == b"serves\n"
+        try:
+            yield
+        finally:
+            served.kill()
+
+
+def wait(done: Callable[[], bool], seconds: float) -> None:
+    deadline = time.monotonic() + seconds
+    while not done():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def test_a_camera_by_rtsp_is_read_missed_and_found_again() -> None:
+    if not Path(PYTHON).is_file() or subprocess.run([PYTHON, "-c", LOADS], capture_output=True).returncode:
+        pytest.skip("GStreamer's RTSP server isn't there (gir1.2-gst-rtsp-server-1.0)")
+    port = free_port()
+    address = f"rtsp://127.0.0.1:{port}/camera"
+    engine = Engine(shaky.__name__, ToolboxParams(deadline=offline.PATIENT))
+    cameras = Cameras(engine, [address])
+
+    def grey() -> int:
+        return shaky.level_of(cameras.last()[0].body) if cameras.last() else -1
+
+    try:
+        with camera(port, 120):
+            cameras.start()
+            wait(lambda: abs(grey() - 120) < 5, 30)
+            assert cameras.states()[address]["there"]
+        wait(lambda: not cameras.states()[address]["there"], SILENT + 10)
+        with camera(port, 60):
+            wait(lambda: abs(grey() - 60) < 5, 30)
+            assert cameras.states()[address]["there"]
+    finally:
+        cameras.stop()
+        engine.close()
