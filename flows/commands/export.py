@@ -26,15 +26,18 @@ app = App()
 
 
 @contextmanager
-def _within(scene: Scene, limits: Budget, report: Report) -> Iterator[Scene]:
-    """The scene within a budget, for as long as it is written."""
-    if limits == Budget():
-        yield scene
-        return
-    from scan2sim.texturing.reduce import reduced
-
+def _within(scene: Scene, limits: Budget, levels: int, report: Report) -> Iterator[Scene]:
+    """The scene within a budget and in levels of detail, for as long as it is written."""
     with tempfile.TemporaryDirectory() as work:
-        yield reduced(scene, limits.triangles, limits.texels, Path(work), report)
+        if limits != Budget():
+            from scan2sim.texturing.reduce import reduced
+
+            scene = reduced(scene, limits.triangles, limits.texels, Path(work) / "within", report)
+        if levels > 1:
+            from scan2sim.texturing.levels import detailed
+
+            scene = detailed(scene, levels, Path(work) / "levels", report)
+        yield scene
 
 
 def _tell(scene: Scene, limits: Budget) -> None:
@@ -56,6 +59,10 @@ def export(
         str | None,
         typer.Option("--budget", metavar="triangles=200k,texture=64MP", help="What each tile may have, at most."),
     ] = None,
+    levels: Annotated[
+        int | None,
+        typer.Option("--levels", help="Levels of detail of each tile, from 1 to 6. Default: 3 for tiles3d, else 1."),
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an export that is there already.")] = False,
 ) -> None:
     """Write a finished world in other formats, for other simulators."""
@@ -68,7 +75,7 @@ def export(
     with (
         progress("export") as report,
         tile_folder(out, overwrite, "world") as folder,
-        _within(scene, limits, report) as small,
+        _within(scene, limits, levels or scenes.levels(formats), report) as small,
     ):
         scenes.write(small, formats, folder, params, report)
         _tell(small, limits)

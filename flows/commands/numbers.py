@@ -26,6 +26,7 @@ class Numbers(Params):
     steps: Annotated[int, Field(ge=1, le=10_000_000)] | None = None
     segment: Annotated[float, Field(ge=1, le=1e7)] | None = None
     max_range: Range | None = None
+    levels: Annotated[int, Field(ge=1, le=6)] | None = None
     scale: Annotated[float, Field(ge=1e-6, le=1e6)] | None = None
 
 

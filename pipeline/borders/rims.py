@@ -36,15 +36,18 @@ def on_border(mesh: Mesh, cell: Cell | None) -> Bools:
     return on
 
 
-def thinned(mesh: Mesh, target: int, cell: Cell | None) -> Mesh:
-    """A mesh with at most `target` faces, those at the cell's borders as they are; attributes are dropped.
+def thinned(mesh: Mesh, target: int, on: Bools) -> Mesh:
+    """A mesh with at most `target` faces, its borders as they are; attributes are dropped.
 
-    It has more where its borders need them. Without a cell no open edge is a border. A surface all in crumbs keeps its
-    rims as well, where there is a cell.
+    It has more where its borders need them. A surface all in crumbs keeps its rims as well, where it has borders.
+
+    Args:
+        mesh, target: what is thinned, and how many faces it may have.
+        on: (V,) which vertices lie on borders (`on_border`): open edges between them are those that stay.
     """
     if len(mesh) <= target:
         return Mesh(mesh.frame, mesh.vertices, mesh.faces)
-    tips, cones = _cones(mesh, _rims(mesh, on_border(mesh, cell)))
+    tips, cones = _cones(mesh, _rims(mesh, on))
     vertices = np.concatenate([mesh.vertices, tips]).astype(np.float32)
     closed = Mesh(mesh.frame, vertices, np.concatenate([mesh.faces, cones]).astype(np.int32))
     best, wanted = _opened(simplify(closed, target)), target
@@ -57,7 +60,7 @@ def thinned(mesh: Mesh, target: int, cell: Cell | None) -> Mesh:
             break
         best = more
     if len(best) < target / 2:  # crumbs, which cones would swallow
-        return simplify(mesh, target, keep_border=cell is not None)
+        return simplify(mesh, target, keep_border=bool(on.any()))
     return best
 
 

@@ -138,6 +138,25 @@ class SceneTile:
 
 
 @dataclass(frozen=True)
+class Level:
+    """A level of detail: what is shown from afar in place of finer levels.
+
+    Attributes:
+        tile: what is shown, a tile made smaller or several as one; where there is nothing finer, the scene's own.
+        height: levels below it.
+        error: metres from what the scene's own tiles show, p95 (`texturing.levels`).
+        texel: metres that one of its texels spans.
+        finer: what it stands for.
+    """
+
+    tile: SceneTile
+    height: int = 0
+    error: float = 0.0
+    texel: float = 0.0
+    finer: tuple[Level, ...] = ()
+
+
+@dataclass(frozen=True)
 class Scene:
     """A finished world.
 
@@ -145,11 +164,13 @@ class Scene:
         name: a name for files everywhere.
         frame: CRS, and the scene's origin in it.
         tiles: in the order of their names.
+        coarse: levels of detail of all tiles, the coarsest, where they were made.
     """
 
     name: str
     frame: Frame
     tiles: tuple[SceneTile, ...]
+    coarse: Level | None = None
 
     @property
     def origin(self) -> Vector:
@@ -222,7 +243,7 @@ def keep(
         "version": VERSION,
         **_frame_as_json(frame),
         "friction": friction,
-        "groups": {group: _figures(shape) for group, shape in shapes.items()},
+        "groups": {group: figures(shape) for group, shape in shapes.items()},
     }
     _write(folder / TILE, about)
     describe(world, name, Frame(frame.crs, origin or frame.origin, frame.unit), [name])
@@ -272,7 +293,8 @@ def _tile(folder: Path, frame: Frame) -> SceneTile:
     return SceneTile(folder.name, own, (x, y, z), about["friction"], about["groups"], folder)
 
 
-def _figures(shape: Textured) -> dict[str, Any]:
+def figures(shape: Textured) -> dict[str, Any]:
+    """Of a group, as `SceneTile.groups` has them."""
     return {
         "triangles": len(shape),
         "vertices": len(shape.mesh.vertices),

@@ -133,7 +133,7 @@ def _ground(terrain: Mesh, points: PointCloud | None, params: CollisionParams, c
     from scan2sim.pipeline.borders.rims import on_border, thinned
     from scan2sim.pipeline.fit import fitted
 
-    ground = thinned(terrain, min(round(GROUND * params.triangles), _enough(terrain)), cell)
+    ground = thinned(terrain, min(round(GROUND * params.triangles), _enough(terrain)), on_border(terrain, cell))
     if points is not None:
         ground = fitted(ground, points.xyz, on_border(ground, cell))
     return replace(ground, classification=_classes(ground, points))
@@ -141,11 +141,11 @@ def _ground(terrain: Mesh, points: PointCloud | None, params: CollisionParams, c
 
 def _walls(surfaces: Sequence[Mesh], budget: int, cell: Cell | None) -> list[Mesh]:
     """What stands, thinned, the triangles shared out by area; each of one class."""
-    from scan2sim.pipeline.borders.rims import thinned
+    from scan2sim.pipeline.borders.rims import on_border, thinned
 
     wanted = [(mesh, _enough(mesh)) for mesh in surfaces if len(mesh)]
     share = min(1.0, max(0, budget) / max(1, sum(count for _, count in wanted)))
-    return [_of_class(thinned(mesh, int(share * count), cell), _code(mesh)) for mesh, count in wanted]
+    return [_of_class(thinned(mesh, int(share * count), on_border(mesh, cell)), _code(mesh)) for mesh, count in wanted]
 
 
 def _enough(mesh: Mesh) -> int:

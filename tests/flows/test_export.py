@@ -76,3 +76,14 @@ def test_a_world_is_written_within_a_budget(tmp_path: Path) -> None:
     groups = json.loads((tmp_path / "out" / "metadata.json").read_text())["groups"].values()
     assert 500 < sum(group["triangles"] for group in groups) <= 1050
     assert parse("triangles=200k, texture=64MP") == (200_000, 64e6) and parse(None) == (None, None)
+
+
+def test_3d_tiles_come_in_levels_of_detail(tmp_path: Path) -> None:
+    world = made_up.world(tmp_path).files["world"]
+    run(world, "--to", "tiles3d", "--out", tmp_path / "out", "--levels", 2)
+    tileset = json.loads((tmp_path / "out" / "tileset.json").read_text())
+    coarse, (fine,) = tileset["root"], tileset["root"]["children"]
+    assert (coarse["refine"], coarse["content"]["uri"]) == ("REPLACE", "tiles3d/level1/street.glb")
+    assert tileset["geometricError"] > coarse["geometricError"] > fine["geometricError"] == 0
+    files = json.loads((tmp_path / "out" / "metadata.json").read_text())["triangles_by_file"]
+    assert files[coarse["content"]["uri"]] < files[fine["content"]["uri"]] / 2

@@ -1,6 +1,8 @@
 """Formats that worlds are exported in: a file a format (`pipeline.backends`), named in `export.formats` and `--to`.
 
-A format's module has `write`. All files and folders that it makes have ASCII names, and name each other relatively.
+A format's module has `write`; one that holds levels of detail (`Scene.coarse`) tells by `LEVELS` how many of each tile
+are made where nobody asks for a number. All files and folders that it makes have ASCII names, and name each other
+relatively.
 """
 
 from __future__ import annotations
@@ -61,6 +63,11 @@ class Format(Protocol):
 def known() -> list[str]:
     """Names of all formats."""
     return names(PACKAGE)
+
+
+def levels(formats: Sequence[str]) -> int:
+    """Levels of detail that some formats want of each tile."""
+    return max((getattr(find(PACKAGE, name, "export.formats"), "LEVELS", 1) for name in formats), default=1)
 
 
 def check(formats: Sequence[str], params: SceneParams, setting: str) -> None:

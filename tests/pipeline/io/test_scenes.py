@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from scan2sim.pipeline import backends
 from scan2sim.pipeline.classes import CODE
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.io import scenes
-from scan2sim.pipeline.io.scene import Scene, read_scene
+from scan2sim.pipeline.io.scene import Level, Scene, read_scene
 from scan2sim.pipeline.io.scenes import SceneParams
 from scan2sim.pipeline.step import silent
 from scan2sim.pipeline.types import Frame
@@ -132,3 +133,27 @@ def test_worlds_that_keep_no_scene_are_told_of(tmp_path: Path) -> None:
     about.write_text("{")
     with pytest.raises(InputError, match=r"can't be read.*run.*again"):
         read_scene(world)
+
+
+def test_boxes_of_levels_hold_what_they_show_and_finer_ones(tmp_path: Path) -> None:
+    import trimesh
+
+    town = made_up.scene(tmp_path)
+    fine = tuple(Level(tile) for tile in town.tiles)
+    written(replace(town, coarse=Level(town.tiles[0], 1, 0.5, 0.1, fine)), "tiles3d", tmp_path / "out")
+    root = json.loads((tmp_path / "out" / "tileset.json").read_text())["root"]
+    assert root["geometricError"] == 1.6 and root["extras"] == {"error_m": 0.5, "texel_m": 0.1}  # 16 texels
+
+    def check(node: dict[str, Any]) -> np.ndarray:
+        """Corners of all that is shown at and below a node, in its metres."""
+        read = trimesh.load_scene(tmp_path / "out" / node["content"]["uri"], process=False)
+        shown = [v[:, [0, 2, 1]] * (1, -1, 1) for v in (mesh.vertices for mesh in read.geometry.values())]
+        for child in node.get("children", ()):
+            place = np.reshape(child["transform"], (4, 4)).T
+            shown.append(check(child) @ place[:3, :3].T + place[:3, 3])
+        every, box = np.concatenate(shown), np.array(node["boundingVolume"]["box"])
+        assert (np.abs(every - box[:3]) < np.diag(box[3:].reshape(3, 3)) + 1e-3).all()
+        return every
+
+    apart = np.ptp(check(root), axis=0)
+    assert apart[0] == pytest.approx(45, abs=0.1)  # two tiles of 20 m, 25 m apart
