@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import functools
 import importlib.util
 import json
-import shutil
 import subprocess
-import threading
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +15,8 @@ from scan2sim.pipeline.io import crs, scenes
 from scan2sim.pipeline.io.scene import Scene
 from scan2sim.pipeline.io.scenes import SceneParams
 from scan2sim.pipeline.step import silent
-from tests import browser
-from tests.conftest import ROOT
+from scan2sim.texturing.levels import detailed
+from tests import cesium
 from tests.pipeline import made_up
 from tests.present import present
 
@@ -36,17 +32,6 @@ def town(tmp_path_factory: pytest.TempPathFactory) -> Scene:
 
 def module(name: str) -> Any:
     return pytest.importorskip(name, reason=f"{name} is not installed")
-
-
-def node_module(name: str) -> Path:
-    """Of npm: installed for all, or in the project's folder."""
-    if shutil.which("npm") is None:
-        pytest.skip("npm is not installed")
-    everywhere = subprocess.run(["npm", "root", "-g"], capture_output=True, text=True).stdout.strip()
-    for folder in (Path(everywhere), ROOT / "node_modules"):
-        if (folder / name).is_dir():
-            return folder / name
-    pytest.skip(f"{name} is not installed (npm install -g {name})")
 
 
 def export(scene: Scene, name: str, folder: Path) -> Path:
@@ -162,43 +147,42 @@ validateBytes(new Uint8Array(fs.readFileSync(process.argv[2]))).then((r) => cons
 
 
 def test_khronos_validator_finds_nothing_in_glbs(town: Scene, tmp_path: Path) -> None:
-    validator = node_module("gltf-validator")
+    validator = cesium.node_module("gltf-validator")
+    if validator is None:
+        pytest.skip("gltf-validator is not installed (npm install -g gltf-validator)")
     for path in export(town, "glb", tmp_path).glob("*.glb"):
         done = subprocess.run(["node", "-e", VALIDATE, validator, path], capture_output=True, text=True)
         issues = json.loads(done.stdout)
         assert (issues["numErrors"], issues["numWarnings"]) == (0, 0), issues["messages"]
 
 
-PAGE = """<!DOCTYPE html><body style="margin: 0"><div id="globe" style="height: 100vh"></div>
-<script>window.CESIUM_BASE_URL = "cesium/Build/Cesium/"</script><script src="cesium/Build/Cesium/Cesium.js"></script>
-<script>
-(async () => {
-  const viewer = new Cesium.Viewer("globe", {baseLayer: false, baseLayerPicker: false, geocoder: false, skyBox: false});
-  viewer.scene.globe.show = false;
-  window.tiles = await Cesium.Cesium3DTileset.fromUrl("tileset.json");
-  viewer.scene.primitives.add(tiles);
-  tiles.allTilesLoaded.addEventListener(() => { window.state = "loaded" });
-  await viewer.zoomTo(tiles, new Cesium.HeadingPitchRange(0, -1.2, 60));
-})().catch((error) => { window.state = String(error) });
-</script>"""
-
-
 def test_cesium_shows_all_tiles_where_they_are_on_the_earth(town: Scene, tmp_path: Path) -> None:
     folder = export(town, "tiles3d", tmp_path / "out")
-    (folder / "cesium").symlink_to(node_module("cesium"))
-    (folder / "page.html").write_text(PAGE)
-    handler = functools.partial(SimpleHTTPRequestHandler, directory=str(folder))
-    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server, browser.chromium(tmp_path) as page:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        try:
-            page.do("Page.navigate", url=f"http://127.0.0.1:{server.server_port}/page.html")
-            page.until("window.state !== undefined")
-            assert page.value("window.state") == "loaded" and not page.errors
-            triangles = sum(len(surface.shape) for tile in town.tiles for surface in tile.surfaces())
-            assert page.value("tiles.statistics.numberOfTrianglesSelected") == triangles
-            place = "Cesium.Cartographic.fromCartesian(tiles.boundingSphere.center)"
-            latitude, longitude = page.value(f"(p => [p.latitude, p.longitude])({place})")
-            here = present(crs.to_wgs84(town.frame))
-            assert np.degrees([latitude, longitude]) == pytest.approx(here[:2], abs=5e-4)
-        finally:
-            server.shutdown()
+    with cesium.viewer(folder, tmp_path / "view", (320, 240)) as view:
+        shown = view.look(*above(town, 60), focal=200)
+        assert shown == [f"tiles3d/{tile.name}.glb" for tile in town.tiles]
+        triangles = sum(len(surface.shape) for tile in town.tiles for surface in tile.surfaces())
+        assert view.page.value("tiles.statistics.numberOfTrianglesSelected") == triangles
+        place = "Cesium.Cartographic.fromCartesian(tiles.boundingSphere.center)"
+        latitude, longitude = view.page.value(f"(p => [p.latitude, p.longitude])({place})")
+        here = present(crs.to_wgs84(town.frame))
+        assert np.degrees([latitude, longitude]) == pytest.approx(here[:2], abs=5e-4)
+
+
+def test_cesium_loads_finer_levels_as_it_comes_nearer(town: Scene, tmp_path: Path) -> None:
+    levels = detailed(town, 2, tmp_path / "levels", silent)
+    folder = export(levels, "tiles3d", tmp_path / "out")
+    with cesium.viewer(folder, tmp_path / "view", (320, 240)) as view:
+        far = view.look(*above(town, 400), focal=200)
+        assert far == ["tiles3d/level2/tile0.glb"]
+        near = view.look(*above(town, 40), focal=480)
+        assert near == ["tiles3d/tile0.glb", "tiles3d/tile1.glb"]
+        picture = view.picture()
+        assert (picture[120, 160] != cesium.SKY).any() and (picture[0, 0] == cesium.SKY).all()
+
+
+def above(scene: Scene, height: float) -> np.ndarray:
+    """Where an eye is so many metres above a scene, where it looks, and what is up in its picture; earth-centred."""
+    middle = np.mean([tile.offset for tile in scene.tiles], axis=0) + (0, 0, height)
+    places = crs.to_ecef(scene.frame, middle + np.array([(0, 0, 0), (0, 0, -1), (0, 1, 0)]))
+    return places - np.array([[0, 0, 0], places[0], places[0]])

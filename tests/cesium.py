@@ -1,0 +1,153 @@
+"""Cesium in headless Chromium: a tileset is shown as whoever streams it would see it."""
+
+from __future__ import annotations
+
+import base64
+import functools
+import json
+import shutil
+import subprocess
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tests import browser
+from tests.browser import Page
+from tests.conftest import ROOT
+
+NAME = "cesium"
+NEAR = 0.1
+"""Metres from the eye where a picture begins."""
+SKY = (255, 0, 255)
+"""The colour where nothing is."""
+PAGE = """<!DOCTYPE html><meta charset="utf-8"><body style="margin: 0"><div id="view"></div>
+<script>window.CESIUM_BASE_URL = "cesium/Build/Cesium/"</script><script src="cesium/Build/Cesium/Cesium.js"></script>
+<script>
+const visible = new Set(), wait = (ms) => new Promise((done) => setTimeout(done, ms));
+async function open(width, height) {
+  Object.assign(document.getElementById("view").style, {width: width + "px", height: height + "px"});
+  window.widget = new Cesium.CesiumWidget("view", {baseLayer: false, globe: false, skyBox: false, skyAtmosphere: false,
+    useDefaultRenderLoop: false, msaaSamples: 1, contextOptions: {webgl: {preserveDrawingBuffer: true}}});
+  widget.scene.backgroundColor = Cesium.Color.MAGENTA;
+  widget.scene.highDynamicRange = false;
+  window.tiles = await Cesium.Cesium3DTileset.fromUrl("world/tileset.json");
+  tiles.tileVisible.addEventListener((tile) => visible.add(tile.content.url.split("/world/")[1]));
+  tiles.tileFailed.addEventListener((failure) => { throw new Error(failure.message) });
+  widget.scene.primitives.add(tiles);
+}
+async function look(position, direction, up, frustum) {
+  const camera = widget.camera, vector = (v) => Cesium.Cartesian3.fromArray(v);
+  Object.assign(camera.frustum, frustum);
+  camera.position = vector(position);
+  camera.direction = Cesium.Cartesian3.normalize(vector(direction), new Cesium.Cartesian3());
+  camera.right = Cesium.Cartesian3.cross(camera.direction, vector(up), new Cesium.Cartesian3());
+  Cesium.Cartesian3.normalize(camera.right, camera.right);
+  camera.up = Cesium.Cartesian3.cross(camera.right, camera.direction, new Cesium.Cartesian3());
+  for (let still = 0; still < 10; still = tiles.tilesLoaded ? still + 1 : 0) {
+    visible.clear();
+    widget.resize();
+    widget.render();
+    await wait(20);
+  }
+  return [...visible].sort();
+}
+</script>"""
+
+
+def missing() -> str:
+    """Why it can't run here, or an empty text."""
+    if not any(map(shutil.which, browser.NAMES)):
+        return "Chromium isn't installed (apt-get install chromium)"
+    return "" if node_module(NAME) else f"{NAME} isn't installed (npm install -g {NAME})"
+
+
+def node_module(name: str) -> Path | None:
+    """The folder of a package of npm: installed for all, or in the project's folder."""
+    if shutil.which("npm") is None:
+        return None
+    everywhere = subprocess.run(["npm", "root", "-g"], capture_output=True, text=True).stdout.strip()
+    found = (folder / name for folder in (Path(everywhere), ROOT / "node_modules"))
+    return next((folder for folder in found if folder.is_dir()), None)
+
+
+@contextmanager
+def viewer(world: Path, work: Path, size: tuple[int, int]) -> Iterator[Viewer]:
+    """A tileset's folder in Cesium; the test is skipped where it isn't installed.
+
+    Args:
+        world: holds `tileset.json`.
+        work: an empty folder, or none yet.
+        size: of pictures, pixels.
+    """
+    package = node_module(NAME)
+    if package is None:
+        pytest.skip(missing())
+    work.mkdir(exist_ok=True)
+    (work / "cesium").symlink_to(package)
+    (work / "world").symlink_to(world.resolve())
+    (work / "page.html").write_text(PAGE)
+    handler = functools.partial(_Quiet, directory=str(work))
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server, browser.chromium(work) as page:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        try:
+            page.do("Page.navigate", url=f"http://127.0.0.1:{server.server_port}/page.html")
+            page.until("document.readyState === 'complete' && window.Cesium !== undefined")
+            page.value(f"open({size[0]}, {size[1]})")
+            yield Viewer(page, size)
+        finally:
+            server.shutdown()
+
+
+class Viewer:
+    """Cesium with a tileset in it."""
+
+    def __init__(self, page: Page, size: tuple[int, int]) -> None:
+        self.page, self._size = page, size
+
+    def look(
+        self,
+        position: Sequence[float],
+        direction: Sequence[float],
+        up: Sequence[float],
+        *,
+        focal: float,
+        centre: tuple[float, float] | None = None,
+    ) -> list[str]:
+        """Look from somewhere until nothing more is loaded; returns the contents that are shown, by their paths.
+
+        Args:
+            position, direction, up: earth-centred; metres.
+            focal: pixels.
+            centre: of the picture, pixels, as `Camera` has it; default: its middle.
+        """
+        width, height = self._size
+        x, y = centre or (width / 2 - 0.5, height / 2 - 0.5)
+        frustum = {
+            "fov": float(2 * np.arctan(max(self._size) / (2 * focal))),
+            "aspectRatio": width / height,
+            "near": NEAR,
+            "xOffset": NEAR * (width / 2 - x - 0.5) / focal,
+            "yOffset": NEAR * (y + 0.5 - height / 2) / focal,
+        }
+        told = ", ".join(map(json.dumps, (list(position), list(direction), list(up), frustum)))
+        shown: list[str] = self.page.value(f"look({told})")
+        assert not self.page.errors, self.page.errors
+        return shown
+
+    def picture(self) -> np.ndarray:
+        """(H, W, 3) RGB of what was looked at; `SKY` where nothing is."""
+        data = self.page.value("widget.canvas.toDataURL('image/png')").partition(",")[2]
+        image = cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)
+        assert image is not None
+        return np.asarray(image[..., ::-1])
+
+
+class _Quiet(SimpleHTTPRequestHandler):
+    def log_message(self, format: str, *args: object) -> None:
+        """Nothing is told of requests."""
