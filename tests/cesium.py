@@ -27,6 +27,7 @@ NEAR = 0.1
 SKY = (255, 0, 255)
 """The colour where nothing is."""
 PAGE = """<!DOCTYPE html><meta charset="utf-8"><body style="margin: 0"><div id="view"></div>
+<style>.cesium-widget, canvas { display: block; width: 100%; height: 100% }</style>
 <script>window.CESIUM_BASE_URL = "cesium/Build/Cesium/"</script><script src="cesium/Build/Cesium/Cesium.js"></script>
 <script>
 const visible = new Set(), wait = (ms) => new Promise((done) => setTimeout(done, ms));
@@ -36,7 +37,7 @@ async function open(width, height) {
     useDefaultRenderLoop: false, msaaSamples: 1, contextOptions: {webgl: {preserveDrawingBuffer: true}}});
   widget.scene.backgroundColor = Cesium.Color.MAGENTA;
   widget.scene.highDynamicRange = false;
-  window.tiles = await Cesium.Cesium3DTileset.fromUrl("world/tileset.json");
+  window.tiles = await Cesium.Cesium3DTileset.fromUrl("world/tileset.json", {foveatedScreenSpaceError: false});
   tiles.tileVisible.addEventListener((tile) => visible.add(tile.content.url.split("/world/")[1]));
   tiles.tileFailed.addEventListener((failure) => { throw new Error(failure.message) });
   widget.scene.primitives.add(tiles);
