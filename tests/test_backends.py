@@ -19,7 +19,7 @@ import pytest
 from scan2sim.pipeline import backends, decimation
 from scan2sim.pipeline.errors import SettingError, UnavailableError
 from scan2sim.pipeline.extras import EXTRA_OF
-from scan2sim.pipeline.io import clouds, decoders, gps, meshes, models, scenes
+from scan2sim.pipeline.io import clouds, decoders, gps, meshes, models, robots, scenes
 from scan2sim.pipeline.types import Camera
 from scan2sim.segmentation import backends as networks
 from scan2sim.services.qos import links
@@ -39,6 +39,7 @@ PROTOCOLS: dict[ModuleType, tuple[type, ...]] = {
     decoders: (decoders.Decoder,),
     meshes: (meshes.ModelFormat,),
     scenes: (scenes.Format,),
+    robots: (robots.Format,),
     decimation: (decimation.Backend,),
     links: (links.Backend,),
 }

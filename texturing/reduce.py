@@ -70,7 +70,7 @@ def reduced(scene: Scene, triangles: int | None, texels: float | None, folder: P
             if min(share) < 1:
                 sources[group] = folder / tile.name / group
                 shrink(group, shape, tile.folder / group, share, None, sources[group])
-        scenes.keep(world, tile.name, sources, tile.folder / scenes.SOLID, tile.lists, tile.friction)
+        scenes.keep(world, tile.name, sources, tile.folder / scenes.SOLID, tile.known, tile.friction)
     scenes.describe(world, scene.name, scene.frame, [tile.name for tile in scene.tiles])
     return scenes.read_scene(world)
 

@@ -63,13 +63,17 @@ def export(
         int | None,
         typer.Option("--levels", help="Levels of detail of each tile, from 1 to 6. Default: 3 for tiles3d, else 1."),
     ] = None,
+    robot: Annotated[
+        bool,
+        typer.Option("--robot", help="Put a small robot with camera and lidar on the road (docs/robot.md)."),
+    ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an export that is there already.")] = False,
 ) -> None:
     """Write a finished world in other formats, for other simulators."""
     formats = list(dict.fromkeys(filter(None, map(str.strip, to.split(",")))))
     if not formats:
         raise SettingError("--to", "names no format", f"Choose of: {', '.join(scenes.known())}")
-    scenes.check(formats, params, "--to")
+    scenes.check(formats, params, "--to", robot)
     limits = parse(budget)
     scene = read_scene(world)
     with (
@@ -77,7 +81,7 @@ def export(
         tile_folder(out, overwrite, "world") as folder,
         _within(scene, limits, levels or scenes.levels(formats), report) as small,
     ):
-        scenes.write(small, formats, folder, params, report)
+        scenes.write(small, formats, folder, params, report, robot)
         _tell(small, limits)
     if scene.frame.crs == LOCAL:
         warn(f"{scene.name} has no CRS, so nothing says where on the earth it is")

@@ -335,12 +335,12 @@ class _Graph:
         return {group: at(last, "textured", group) for group in self.groups}
 
     def roads(self, textured: Sources) -> Sources:
-        """Roads as data, for the export."""
+        """Roads as data, and the path, for the export."""
         if not self.scanner or self.settings.params(ROADS).when == "never":
-            return {}
+            return self.scanner
         ground = {"cloud": self.at(SPLIT, "terrain"), "textured": textured["terrain"]}
         self.add(ROADS, ground | self.scanner, **self.cell)
-        return {"roads": self.at(ROADS, "geojson"), "roads_seen": self.at(ROADS, "seen")}
+        return self.scanner | {"roads": self.at(ROADS, "geojson"), "roads_seen": self.at(ROADS, "seen")}
 
     def results(
         self, surfaces: Sources, textured: Sources, seen: Sources, lists: Sources, made: Mapping[str, Sources]

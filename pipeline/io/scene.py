@@ -9,6 +9,7 @@ in the world's folder, `scene/` (files of earlier steps as hard links, so it tak
     scene/<tile>/collision.npz      what bodies collide with
     scene/<tile>/*.geojson, *.csv   lists of what stands where
     scene/<tile>/roads.npz          what was seen of roads (`pipeline.roads.observed`), where the step `roads` was run
+    scene/<tile>/path.npz           where the recording device went, local metres, where that is known
 """
 
 from __future__ import annotations
@@ -26,9 +27,11 @@ from scan2sim.pipeline.errors import DataError, InputError
 from scan2sim.pipeline.io import image, textured
 from scan2sim.pipeline.io.files import make_folder, pass_on
 from scan2sim.pipeline.io.textured import Textured
+from scan2sim.pipeline.robot import Start
 from scan2sim.pipeline.types import U8, Frame, Mesh
 
-FOLDER, ABOUT, TILE, SOLID, ROADS = "scene", "scene.json", "tile.json", "collision.npz", "roads.npz"
+FOLDER, ABOUT, TILE, SOLID = "scene", "scene.json", "tile.json", "collision.npz"
+ROADS, PATH = "roads.npz", "path.npz"
 VERSION = 1
 """Of what is kept."""
 Vector = tuple[float, float, float]
@@ -125,6 +128,11 @@ class SceneTile:
         return {path.name: path for path in sorted(self.folder.iterdir()) if path.suffix in (".geojson", ".csv")}
 
     @property
+    def known(self) -> dict[str, Path]:
+        """All that is kept beside its meshes, by the files' names: lists, roads, the path."""
+        return self.lists | {name: self.folder / name for name in (ROADS, PATH) if (self.folder / name).is_file()}
+
+    @property
     def low(self) -> Vector:
         """Lowest corner of the box around all surfaces, local metres."""
         x, y, z = np.min([group["low_m"] for group in self.groups.values()], axis=0).tolist()
@@ -155,10 +163,6 @@ class Level:
     texel: float = 0.0
     finer: tuple[Level, ...] = ()
 
-    def stands_for(self) -> list[SceneTile]:
-        """The scene's own tiles."""
-        return [tile for finer in self.finer for tile in finer.stands_for()] or [self.tile]
-
 
 @dataclass(frozen=True)
 class Scene:
@@ -169,22 +173,14 @@ class Scene:
         frame: CRS, and the scene's origin in it.
         tiles: in the order of their names.
         coarse: levels of detail of all tiles, the coarsest, where they were made.
+        start: of a robot, where it is exported with one.
     """
 
     name: str
     frame: Frame
     tiles: tuple[SceneTile, ...]
     coarse: Level | None = None
-
-    def levels(self, tile: SceneTile) -> list[Level]:
-        """A tile at all levels that are of itself alone, the finest first."""
-        found, above = [Level(tile)], [self.coarse] if self.coarse else []
-        while above:
-            level = above.pop()
-            if {one.name for one in level.stands_for()} == {tile.name} and level.finer:
-                found.insert(1, level)
-            above += level.finer
-        return found
+    start: Start | None = None
 
     @property
     def origin(self) -> Vector:
@@ -225,7 +221,7 @@ def keep(
         name: of the tile and the scene.
         surfaces: folders of textured meshes, by group; empty ones are left out.
         solid: the collision mesh.
-        lists: files of lists, by the names that they get.
+        lists: files of all that is kept beside the meshes, by the names that they get.
         friction: of the ground.
         origin: of the scene, metres in the CRS; default: the tile's own.
 

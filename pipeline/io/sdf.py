@@ -27,6 +27,7 @@ from xml.sax.saxutils import escape
 
 from scan2sim.pipeline.cylinders import Cylinder
 from scan2sim.pipeline.io import crs
+from scan2sim.pipeline.robot import ROBOT, Start
 from scan2sim.pipeline.solids import Solid
 from scan2sim.pipeline.types import Frame
 
@@ -34,7 +35,7 @@ HEADROOM = 500.0
 """Metres that a level reaches above and below its tile: whatever flies over it sees it."""
 BUFFER = 20.0
 """Metres around a tile within which a performer has it loaded."""
-PERFORMER = "robot"
+PERFORMER = ROBOT.name
 """Name of the model that levels are loaded for."""
 Vector = tuple[float, float, float]
 
@@ -87,7 +88,7 @@ class Georeference:
         }
 
 
-def write_world(path: Path, name: str, place: Georeference | None, offset: Vector) -> None:
+def write_world(path: Path, name: str, place: Georeference | None, offset: Vector, start: Start | None = None) -> None:
     """Write a world that includes `model://<name>`.
 
     Args:
@@ -95,12 +96,19 @@ def write_world(path: Path, name: str, place: Georeference | None, offset: Vecto
         name: of the world and its model.
         place: of the world's origin, or None.
         offset: metres from the world's origin to the model's.
+        start: of the robot, `model://robot`, where there is one.
     """
-    path.write_text(_world(path, name, place, _include(name, offset)), encoding="utf-8")
+    path.write_text(_world(path, name, place, _include(name, offset) + _robot(start)), encoding="utf-8")
 
 
 def write_levels(
-    path: Path, name: str, place: Georeference | None, tiles: Sequence[Placed], buffer: float, performer: str
+    path: Path,
+    name: str,
+    place: Georeference | None,
+    tiles: Sequence[Placed],
+    buffer: float,
+    performer: str,
+    start: Start | None = None,
 ) -> None:
     """Write a world of many models, each in a level of its own, so that Gazebo can load those near a robot only.
 
@@ -113,13 +121,16 @@ def write_levels(
         tiles: models, found as `model://<name>`.
         buffer: metres around a tile within which a performer has it loaded; it is unloaded twice as far away.
         performer: name of the model that levels are loaded for. It need not be there: Gazebo says so, and goes on.
+        start: of the robot, `model://robot`, where there is one.
     """
     path.write_text(
         _world(
             path,
             name,
             place,
-            "".join(_include(tile.name, tile.offset) for tile in tiles) + _levels(tiles, buffer, performer),
+            "".join(_include(tile.name, tile.offset) for tile in tiles)
+            + _robot(start)
+            + _levels(tiles, buffer, performer),
             f"""
      All tiles are loaded then. With the option "levels" (two dashes before it, which XML forbids here) only those
      near a performer are: the model that <performer> names below, if it is in this file when Gazebo starts, and
@@ -153,6 +164,11 @@ def write_model(folder: Path, name: str, visuals: Mapping[str, int], solids: Seq
 """,
         encoding="utf-8",
     )
+    write_config(folder, name, "A street scanned by lidar and photos: textured surfaces, and what bodies collide with.")
+
+
+def write_config(folder: Path, name: str, about: str) -> None:
+    """Write what Gazebo finds a model by, `model.config`, beside its `model.sdf`."""
     (folder / "model.config").write_text(
         f"""<?xml version="1.0"?>
 <model>
@@ -162,7 +178,7 @@ def write_model(folder: Path, name: str, visuals: Mapping[str, int], solids: Seq
   <author>
     <name>scan2sim</name>
   </author>
-  <description>A street scanned by lidar and photos: textured surfaces, and what bodies collide with.</description>
+  <description>{about}</description>
 </model>
 """,
         encoding="utf-8",
@@ -207,12 +223,16 @@ def _world(path: Path, name: str, place: Georeference | None, content: str, note
 """
 
 
-def _include(name: str, offset: Vector) -> str:
+def _include(name: str, offset: Vector, angles: Vector = (0.0, 0.0, 0.0)) -> str:
     return f"""    <include>
       <uri>model://{name}</uri>
-      <pose>{numbers(offset)} 0 0 0</pose>
+      <pose>{numbers(offset)} {numbers(angles)}</pose>
     </include>
 """
+
+
+def _robot(start: Start | None) -> str:
+    return _include(ROBOT.name, start.position, start.angles) if start else ""
 
 
 def _levels(tiles: Sequence[Placed], buffer: float, performer: str) -> str:

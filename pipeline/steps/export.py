@@ -10,7 +10,7 @@ from pydantic import AfterValidator, Field
 from scan2sim.pipeline.classes import SURFACES
 from scan2sim.pipeline.extras import need
 from scan2sim.pipeline.io import scenes
-from scan2sim.pipeline.io.scene import ROADS, keep
+from scan2sim.pipeline.io.scene import PATH, ROADS, keep
 from scan2sim.pipeline.io.scenes import SceneParams, opendrive
 from scan2sim.pipeline.ranges import Coordinate, Name
 from scan2sim.pipeline.step import Done, Inputs, Report, Step
@@ -18,7 +18,7 @@ from scan2sim.pipeline.step import Done, Inputs, Report, Step
 LISTS = {
     "plants": "plants.geojson", "plants_csv": "plants.csv",
     "furniture": "furniture.geojson", "furniture_csv": "furniture.csv", "things": "things.geojson",
-    "roads": "roads.geojson", "roads_seen": ROADS,
+    "roads": "roads.geojson", "roads_seen": ROADS, "path": PATH,
 }  # fmt: skip  # input to file in the world's folder
 
 
@@ -93,4 +93,4 @@ def can_export(params: ExportParams) -> None:
         need("export.rasters", "rasterio")
 
 
-EXPORT = Step("export", 4, export, ExportParams, check=can_export)
+EXPORT = Step("export", 5, export, ExportParams, check=can_export)

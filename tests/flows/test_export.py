@@ -14,6 +14,7 @@ from scan2sim.pipeline.errors import InputError, SettingError
 from scan2sim.pipeline.io import scenes
 from scan2sim.pipeline.types import Frame
 from tests.pipeline import made_up
+from tests.pipeline.io.test_robots import driven
 
 
 def run(*words: object) -> str:
@@ -76,6 +77,13 @@ def test_a_world_is_written_within_a_budget(tmp_path: Path) -> None:
     groups = json.loads((tmp_path / "out" / "metadata.json").read_text())["groups"].values()
     assert 500 < sum(group["triangles"] for group in groups) <= 1050
     assert parse("triangles=200k, texture=64MP") == (200_000, 64e6) and parse(None) == (None, None)
+
+
+def test_a_robot_is_put_into_a_world_within_a_budget(tmp_path: Path) -> None:
+    driven(made_up.scene(tmp_path, tiles=1))
+    run(tmp_path, "--to", "urdf", "--out", tmp_path / "out", "--robot", "--budget", "triangles=1k")
+    assert json.loads((tmp_path / "out" / "metadata.json").read_text())["robot"]["on"] == "path"
+    assert (tmp_path / "out" / "robot.urdf").is_file()
 
 
 def test_3d_tiles_come_in_levels_of_detail(tmp_path: Path) -> None:

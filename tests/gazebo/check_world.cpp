@@ -331,6 +331,7 @@ std::string run(const fs::path &file, const std::vector<Body> &bodies, std::map<
   for (std::size_t m = 0; m < sdf.ModelCount(); ++m)
   {
     const auto &model = *sdf.ModelByIndex(m);
+    if (!model.Static()) continue;  // the robot, which isn't what bodies are dropped on
     for (std::size_t l = 0; l < model.LinkCount(); ++l)
     {
       const auto &link = *model.LinkByIndex(l);

@@ -9,10 +9,13 @@ import pytest
 
 from scan2sim.pipeline import primitives
 from scan2sim.pipeline.classes import CODE
-from scan2sim.pipeline.io import crs
+from scan2sim.pipeline.io import crs, scenes
+from scan2sim.pipeline.io.scenes import SceneParams
+from scan2sim.pipeline.step import silent
 from scan2sim.pipeline.types import Frame, Mesh
 from tests.gazebo.checker import Refused, check_world
 from tests.pipeline import made_up
+from tests.pipeline.io.test_robots import driven
 from tests.present import present
 
 BOX = 0.2  # half the edge of the dropped box, metres
@@ -141,3 +144,9 @@ def test_a_collision_mesh_that_physics_would_ignore_is_refused(world: Path) -> N
     path.write_text("\n".join(" ".join(p.split("//")[0] for p in line.split(" ")) for line in lines) + "\n")
     with pytest.raises(Refused, match="normal count"):
         check_world(world)
+
+
+def test_the_robot_is_read_without_a_warning(tmp_path: Path) -> None:
+    town = driven(made_up.scene(tmp_path))
+    scenes.write(town, ["gazebo"], tmp_path / "out", SceneParams(), silent, robot=True)
+    assert check_world(tmp_path / "out" / "town.sdf")["solids"] == 6  # its own are none that bodies are dropped on

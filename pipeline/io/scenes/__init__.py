@@ -10,19 +10,21 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
 from pydantic import Field
 
-from scan2sim.pipeline.backends import find, names
-from scan2sim.pipeline.errors import SettingError
-from scan2sim.pipeline.io import image, sdf
+from scan2sim.pipeline.backends import find, module, names
+from scan2sim.pipeline.errors import DataError, SettingError
+from scan2sim.pipeline.io import image, robots, sdf
 from scan2sim.pipeline.io.files import make_folder
 from scan2sim.pipeline.io.meshes import PageNames, obj
 from scan2sim.pipeline.io.scene import Scene, SceneTile, by_class
+from scan2sim.pipeline.io.start import find as find_start
 from scan2sim.pipeline.io.textured import Textured
+from scan2sim.pipeline.robot import ROBOT
 from scan2sim.pipeline.solids import Solid, solids
 from scan2sim.pipeline.step import Params, Report
 from scan2sim.pipeline.types import Mesh
@@ -70,11 +72,12 @@ def levels(formats: Sequence[str]) -> int:
     return max((getattr(find(PACKAGE, name, "export.formats"), "LEVELS", 1) for name in formats), default=1)
 
 
-def check(formats: Sequence[str], params: SceneParams, setting: str) -> None:
-    """Refuse formats that there aren't, or that can't be written here.
+def check(formats: Sequence[str], params: SceneParams, setting: str, robot: bool = False) -> None:
+    """Refuse formats that there aren't, or that can't be written here, and a robot that none of them holds.
 
     Raises:
-        SettingError: there is no such format, or nothing that Gazebo shows. UnavailableError: a package is missing.
+        SettingError: there is no such format, or nothing that Gazebo shows; or they hold no robot.
+        UnavailableError: a package is missing.
     """
     for name in formats:
         find(PACKAGE, name, setting)
@@ -82,15 +85,25 @@ def check(formats: Sequence[str], params: SceneParams, setting: str) -> None:
         find("scan2sim.pipeline.io.meshes", name, "export.meshes")
     if "gazebo" in formats and not set(SHOWN) & set(params.meshes):
         raise SettingError("export.meshes", f"has nothing that Gazebo shows ({' or '.join(SHOWN)})", "Name one, too")
+    driven = names(robots.PACKAGE)
+    if robot and not set(formats) & set(driven):
+        raise SettingError("--robot", f"is held by none of {', '.join(formats)}", f"Name one of: {', '.join(driven)}")
 
 
-def write(scene: Scene, formats: Sequence[str], folder: Path, params: SceneParams, report: Report) -> None:
+def write(
+    scene: Scene, formats: Sequence[str], folder: Path, params: SceneParams, report: Report, robot: bool = False
+) -> None:
     """Write a scene in some formats below `folder`, its lists and `metadata.json` beside them.
 
+    With `robot`, a small one (`pipeline.robot`) stands on the road, in those formats that hold one.
+
     Raises:
-        ScanError: as `check`, before anything is written.
+        ScanError: as `check`, or there is no place for the robot, before anything is written.
     """
-    check(formats, params, "export.formats")
+    check(formats, params, "export.formats", robot)
+    if robot:
+        _check_names(scene)
+        scene = replace(scene, start=find_start(scene))
     make_folder(folder)
     triangles: dict[str, int] = {}
     for i, name in enumerate(formats):
@@ -99,6 +112,8 @@ def write(scene: Scene, formats: Sequence[str], folder: Path, params: SceneParam
             report((begun + fraction) / len(formats), f"{what} {message}".strip())
 
         triangles |= find(PACKAGE, name, "export.formats").write(scene, folder, params, part)
+        if scene.start and name in names(robots.PACKAGE):
+            module(robots.PACKAGE, name).write(ROBOT, scene.start, folder)
     for tile in scene.tiles:
         for file, path in tile.lists.items():
             shutil.copyfile(path, folder / (file if len(scene.tiles) == 1 else f"{tile.name}_{file}"))
@@ -106,16 +121,27 @@ def write(scene: Scene, formats: Sequence[str], folder: Path, params: SceneParam
     (folder / "metadata.json").write_text(text + "\n", encoding="utf-8")
 
 
+def _check_names(scene: Scene) -> None:
+    """Refuse a tile, or a world, that is called as the robot is."""
+    if ROBOT.name in {scene.name, *(tile.name for tile in scene.tiles)}:
+        raise DataError(
+            ROBOT.name, "is a tile's or the world's name, and the robot's", "Name it otherwise: export.name"
+        )
+
+
 def metadata(scene: Scene, triangles: dict[str, int]) -> dict[str, Any]:
     """What a reader needs to put a scene back on the map, and to check that it is whole."""
     place = sdf.Georeference.of(scene.frame)
     about = {"name": scene.name, "crs": scene.frame.crs, "unit_m": scene.frame.unit}
-    whole = {
+    whole: dict[str, Any] = {
         "world_origin_m": list(scene.origin),
         "wgs84": place and place.facts(),
         "friction": scene.tiles[0].friction,
         "triangles_by_file": triangles,
     }
+    if scene.start:
+        start = {"position_m": list(scene.start.position), "angles_rad": list(scene.start.angles), "on": scene.start.by}
+        whole["robot"] = {"name": ROBOT.name, **start}
     if len(scene.tiles) == 1:
         tile = scene.tiles[0]
         here = "crs = (local + origin_m) / unit_m; OBJ and Collada are local, z-up; GLB is local, y-up (x, z, -y)"

@@ -25,10 +25,10 @@ def write(scene: Scene, folder: Path, params: SceneParams, report: Report) -> di
         triangles |= {f"models/{tile.name}/meshes/{file}": count for file, count in written.items()}
     world, place = folder / f"{scene.name}.sdf", sdf.Georeference.of(scene.frame)
     if len(scene.tiles) == 1:
-        sdf.write_world(world, scene.tiles[0].name, place, scene.tiles[0].offset)
+        sdf.write_world(world, scene.tiles[0].name, place, scene.tiles[0].offset, scene.start)
     else:
         placed = [sdf.Placed(tile.name, tile.offset, tile.low, tile.high) for tile in scene.tiles]
-        sdf.write_levels(world, scene.name, place, placed, sdf.BUFFER, sdf.PERFORMER)
+        sdf.write_levels(world, scene.name, place, placed, sdf.BUFFER, sdf.PERFORMER, scene.start)
     return triangles
 
 

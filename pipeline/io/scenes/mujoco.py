@@ -21,6 +21,7 @@ from scan2sim.pipeline.io import scenes, sdf
 from scan2sim.pipeline.io.files import make_folder
 from scan2sim.pipeline.io.scene import Scene, SceneTile
 from scan2sim.pipeline.io.scenes import SceneParams
+from scan2sim.pipeline.robot import ROBOT
 from scan2sim.pipeline.solids import Solid, solids
 from scan2sim.pipeline.step import Report
 from scan2sim.pipeline.types import F64, Mesh
@@ -61,6 +62,7 @@ def _model(scene: Scene, assets: list[str], bodies: list[str]) -> str:
     georeference = "".join(
         f"    <text name={quoteattr(name)} data={quoteattr(json.dumps(value))}/>\n" for name, value in about.items()
     )
+    robot = f'  <include file="{ROBOT.name}.xml"/>\n' if scene.start else ""
     return f"""<mujoco model="{scene.name}">
   <compiler angle="radian" meshdir="{FOLDER}" texturedir="{FOLDER}"/>
   <size nuser_geom="1"/>
@@ -77,7 +79,7 @@ def _model(scene: Scene, assets: list[str], bodies: list[str]) -> str:
 {"".join(assets)}  </asset>
   <worldbody>
 {"".join(bodies)}  </worldbody>
-</mujoco>
+{robot}</mujoco>
 """
 
 

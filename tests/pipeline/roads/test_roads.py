@@ -17,6 +17,7 @@ from scan2sim.pipeline.io import opendrive, scenes
 from scan2sim.pipeline.io.scene import ROADS as SEEN
 from scan2sim.pipeline.io.scenes import SceneParams
 from scan2sim.pipeline.roads import listed, model, observed
+from scan2sim.pipeline.roads.course import course
 from scan2sim.pipeline.roads.lanes import sections
 from scan2sim.pipeline.roads.model import Road
 from scan2sim.pipeline.step import Done, silent
@@ -223,3 +224,15 @@ def test_notes_name_what_is_missing(done: Done) -> None:
     assert "left edge isn't told" in " ".join(listed.notes(replace(road, left=None)))
     bare = replace(road, left=None, right=None, markings=(), reference="way")
     assert "no lanes" in " ".join(listed.notes(bare)) and sections(bare) == []
+
+
+def test_one_drives_in_the_middle_of_the_lane_on_ones_own_side(done: Done) -> None:
+    (road,) = drawn(done)
+    for keeps_right, side in ((True, -1), (False, 1)):
+        way = course(replace(road, keeps_right=keeps_right))
+        s, t = STREET.locate(way.places[:, :2])
+        assert way.by == "lane"
+        np.testing.assert_allclose(t, side * STREET.lane / 2, atol=0.06)
+        np.testing.assert_allclose(way.places[:, 2], STREET.height(s, t), atol=0.03)
+    unmarked = course(replace(road, reference="middle", markings=()))
+    assert unmarked.by == "road" and np.abs(STREET.locate(unmarked.places[:, :2])[1]).max() < 0.06

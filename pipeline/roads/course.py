@@ -1,0 +1,53 @@
+"""The course that a vehicle takes along a road: its lane's middle where lanes are told, else the reference line."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from scan2sim.pipeline.roads.lanes import Section, sections
+from scan2sim.pipeline.roads.listed import surface
+from scan2sim.pipeline.roads.model import Road
+from scan2sim.pipeline.types import F64
+
+STEP = 0.5
+"""Metres between places of a course."""
+
+
+@dataclass(frozen=True)
+class Course:
+    """Places to drive over, in order.
+
+    Attributes:
+        places: (N, 3) metres, in the road's frame.
+        by: "lane", "road" (its reference line) or "path" (of whoever recorded it).
+    """
+
+    places: F64
+    by: str
+
+    @property
+    def headings(self) -> F64:
+        """(N,) radians from the x axis."""
+        x, y = np.gradient(self.places[:, :2], axis=0).T
+        return np.arctan2(y, x)
+
+
+def course(road: Road) -> Course:
+    """The course of a road, the way that it was driven."""
+    s = np.linspace(0.0, road.line.length, max(2, round(road.line.length / STEP) + 1))
+    t, by = np.zeros(len(s)), "road"
+    for section in sections(road):
+        lane = _lane(section, road.keeps_right)
+        if lane is not None:
+            here = (s >= section.first) & (s <= section.last)
+            left, right = (section.borders[k].offset.at(s[here]) for k in (lane, lane + 1))
+            t[here], by = (left + right) / 2, "lane"
+    return Course(surface(road, s, t), by)
+
+
+def _lane(section: Section, keeps_right: bool) -> int | None:
+    """The lane beside the centre line in which traffic runs along the road; None where directions aren't told."""
+    lane = section.centre if keeps_right else section.centre - 1
+    return lane if 0 <= lane < len(section.kinds) and section.kinds[lane] == "driving" else None
