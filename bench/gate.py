@@ -27,6 +27,7 @@ from bench.gate_load import load
 from bench.gate_places import find
 from bench.gate_worlds import ROOT, WORLDS, Absent, Subject, scan2sim
 from scan2sim.pipeline import backends
+from scan2sim.pipeline.io import robots
 from scan2sim.pipeline.io.scene import read_scene
 
 WORST = ("drop_max_m", "border_step_max_m")
@@ -72,7 +73,8 @@ def _through(subject: Subject, able: dict[str, Any], result: dict[str, Any]) -> 
     for form in formats:
         folder = subject.run.parent / "exports" / form
         shutil.rmtree(folder, ignore_errors=True)
-        scan2sim("export", subject.run, "--to", form, "--out", folder)
+        driven = ["--robot"] if form in backends.names(robots.PACKAGE) else []
+        scan2sim("export", subject.run, "--to", form, "--out", folder, *driven)
     for name, module in able.items():
         try:
             _tell(subject, name, module.check(subject.run.parent / "exports" / module.FORMAT, places), result)

@@ -1,10 +1,12 @@
-"""Where the gate drops things: places on a world's road, and how high the cloud's surface is there."""
+"""What the gate knows of a world beside its export: its road, the cloud's surface, ways to drive, photos."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,8 +14,12 @@ from scan2sim.pipeline.cells import Cell
 from scan2sim.pipeline.classes import CODE
 from scan2sim.pipeline.heightfield import Raster, grown
 from scan2sim.pipeline.io.scene import Scene
+from scan2sim.pipeline.io.start import courses
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.pipeline.types import F64, Bools, PointCloud
+from scan2sim.pipeline.types import F64, Bools, PointCloud, View
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 COUNT = 20
 """Places on the road."""
@@ -32,24 +38,28 @@ CELL = 0.25
 
 @dataclass(frozen=True)
 class Places:
-    """Where things are dropped; coordinates are the world's, metres.
+    """Of a world; coordinates are the world's, metres.
 
     Attributes:
-        road: (N, 3) on the road, far from each other.
-        borders: (M, 3) on borders of tiles.
+        road: (N, 3) on the road, far from each other: things are dropped there.
+        borders: (M, 3) on borders of tiles, likewise.
         ground: (K, 3) points of the ground, as scanned.
+        paved: (K,) which of them are of a road; all, where no road is told from other ground.
+        ways: (W, 3) each, along roads, the longest first.
+        views: photos, posed in the world.
     """
 
     road: F64
     borders: F64
     ground: F64
+    paved: Bools
+    ways: tuple[F64, ...] = ()
+    views: tuple[View, ...] = ()
 
     def heights(self, xy: F64) -> F64:
         """(N,) heights of the cloud's surface at places (N, 2): of a plane through the points around; NaN without."""
-        from scipy.spatial import cKDTree
-
         out = np.full(len(xy), np.nan)
-        for i, near in enumerate(cKDTree(self.ground[:, :2]).query_ball_point(xy, AROUND)):
+        for i, near in enumerate(self._near(xy)):
             if len(near) >= 10:
                 part = self.ground[near]
                 part = part[np.abs(part[:, 2] - np.median(part[:, 2])) < 0.1]
@@ -57,6 +67,20 @@ class Places:
                 if np.linalg.norm(away.mean(axis=0)) < AROUND / 3:  # else all points lie to one side
                     out[i] = np.linalg.lstsq(np.column_stack([away, np.ones(len(part))]), part[:, 2], rcond=None)[0][2]
         return out
+
+    def on_road(self, xy: F64) -> Bools:
+        """(N,) whether most points around places (N, 2) are of a road."""
+        return np.array([len(near) > 0 and self.paved[near].mean() > 0.5 for near in self._near(xy)])
+
+    def _near(self, xy: F64) -> Sequence[list[int]]:
+        """Indices of the ground's points around each of the places (N, 2)."""
+        return self._tree.query_ball_point(xy, AROUND)
+
+    @cached_property
+    def _tree(self) -> cKDTree:
+        from scipy.spatial import cKDTree
+
+        return cKDTree(self.ground[:, :2])
 
 
 def find(scene: Scene, run: Path, tiles: Sequence[Path]) -> Places:
@@ -88,7 +112,27 @@ def find(scene: Scene, run: Path, tiles: Sequence[Path]) -> Places:
     raster, free = _free(points, standing, points[~road])
     on_road = road & free[raster.at(points)]
     borders = [_on_border(points[on_road], scene, *pair) for pair in _pairs(cells)]
-    return Places(_spread(points[on_road], COUNT), np.concatenate([np.zeros((0, 3)), *borders]), points)
+    return Places(
+        _spread(points[on_road], COUNT),
+        np.concatenate([np.zeros((0, 3)), *borders]),
+        points,
+        road,
+        tuple(way.places for way in courses(scene)),
+        tuple(_views(scene, tiles)),
+    )
+
+
+def _views(scene: Scene, tiles: Sequence[Path]) -> Iterator[View]:
+    """The photos of all tiles, each once, posed in the world."""
+    known = set()
+    for tile in map(read_tile, tiles):
+        shift = np.asarray(tile.frame.origin) - np.asarray(scene.origin)
+        for view in tile.views:
+            if view.photo.name not in known:
+                known.add(view.photo.name)
+                pose = np.array(view.T_world_cam, np.float64)
+                pose[:3, 3] += shift
+                yield replace(view, T_world_cam=pose)
 
 
 def _inside(cloud: PointCloud, cell: Cell) -> Bools:

@@ -29,7 +29,7 @@ class Consumer(Protocol):
 
         Args:
             export: folder of the world in the consumer's format.
-            places: of the same world, to drop things at.
+            places: what is known of the same world: where to drop things, ways to drive, photos.
 
         Raises:
             Fault: something is wrong.

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bench import gate_drops
 from bench.consumers import Fault, gazebo
 from bench.gate_places import Places
 from tests.pipeline import made_up
@@ -21,12 +22,17 @@ def places(lift: float = 0.0) -> Places:
     """On the made-up ground, as a cloud that is so much higher would have it."""
     xy = np.random.default_rng(0).uniform(-9, 9, (60_000, 2))
     ground = np.column_stack([xy, made_up.height(*xy.T) + lift])
-    return Places(ground[[np.argmin(np.hypot(*(xy - at).T)) for at in ((-6, -6), (1, -6))]], np.zeros((0, 3)), ground)
+    return Places(
+        ground[[np.argmin(np.hypot(*(xy - at).T)) for at in ((-6, -6), (1, -6))]],
+        np.zeros((0, 3)),
+        ground,
+        np.ones(len(ground), bool),
+    )
 
 
 def test_bodies_rest_on_the_clouds_surface(world: Path) -> None:
     figures = gazebo.check(world, places())
-    assert figures["dropped"] == 4 and figures["drop_max_m"] <= gazebo.WITHIN and figures["fell_through"] == 0
+    assert figures["dropped"] == 4 and figures["drop_max_m"] <= gate_drops.WITHIN and figures["fell_through"] == 0
 
 
 def test_a_ground_that_lies_5_cm_off_the_cloud_is_a_fault(world: Path) -> None:
