@@ -84,7 +84,7 @@ class _Making:
         first = finer[0].tile
         height = 1 + max(level.height for level in finer)
         place = self._folder / f"level{height}" / first.name
-        below = {tile.name for level in finer for tile in _tiles(level)}
+        below = {tile.name for level in finer for tile in level.stands_for()}
         self._made += 1
         self._report(1 - 1 / (1 + self._made / self._all), f"level {height} of {first.name}")
         shapes, errors = {}, []
@@ -109,11 +109,6 @@ class _Making:
         """(K, 3) where tiles of these names meet others, metres from the scene's origin."""
         ends = [m.places for m in self._meetings if m.group == group and m.tile in below and m.other not in below]
         return np.concatenate([np.zeros((0, 3)), *ends])
-
-
-def _tiles(level: Level) -> list[SceneTile]:
-    """The scene's own tiles that a level stands for."""
-    return [tile for finer in level.finer for tile in _tiles(finer)] or [level.tile]
 
 
 def _halves(levels: Sequence[Level]) -> list[Sequence[Level]]:

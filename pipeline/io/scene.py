@@ -163,6 +163,10 @@ class Level:
     texel: float = 0.0
     finer: tuple[Level, ...] = ()
 
+    def stands_for(self) -> list[SceneTile]:
+        """The scene's own tiles."""
+        return [tile for finer in self.finer for tile in finer.stands_for()] or [self.tile]
+
 
 @dataclass(frozen=True)
 class Scene:
@@ -181,6 +185,16 @@ class Scene:
     tiles: tuple[SceneTile, ...]
     coarse: Level | None = None
     start: Start | None = None
+
+    def levels(self, tile: SceneTile) -> list[Level]:
+        """A tile at all levels that are of itself alone, the finest first."""
+        found, above = [Level(tile)], [self.coarse] if self.coarse else []
+        while above:
+            level = above.pop()
+            if {one.name for one in level.stands_for()} == {tile.name} and level.finer:
+                found.insert(1, level)
+            above += level.finer
+        return found
 
     @property
     def origin(self) -> Vector:

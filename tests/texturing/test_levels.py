@@ -5,25 +5,38 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from bench.consumers import Fault, seams
+from bench.gate_places import Places
 from scan2sim.pipeline import render
+from scan2sim.pipeline.io import scenes
 from scan2sim.pipeline.io.scene import Level, Scene, describe, keep, read_scene
+from scan2sim.pipeline.io.scenes import SceneParams
 from scan2sim.pipeline.step import silent
 from scan2sim.pipeline.types import Mesh
+from scan2sim.texturing import levels as texturing_levels
 from scan2sim.texturing.levels import detailed, meetings
 from tests.pipeline import made_up
 
 TILES, SIDE = 3, 20.0
+NOWHERE = Places(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, bool))
 
 
 @pytest.fixture(scope="module")
 def strip(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    """Tiles of bumpy ground in a row, cut out of one, in three levels and one for all."""
-    folder, names = tmp_path_factory.mktemp("strip"), []
-    for i in range(TILES):
+    """Tiles of bumpy ground in three levels, and one for all."""
+    folder = tmp_path_factory.mktemp("strip")
+    return detailed(row(folder, TILES), 3, folder / "levels", silent)
+
+
+def row(folder: Path, tiles: int) -> Scene:
+    """Tiles in a row, cut out of one bumpy ground."""
+    names = []
+    for i in range(tiles):
         x, y, z = made_up.UTM.origin
         frame = replace(made_up.UTM, origin=(x + SIDE * i, y, z))
         mesh = made_up.ground(80, frame)
@@ -34,7 +47,7 @@ def strip(tmp_path_factory: pytest.TempPathFactory) -> Scene:
         keep(folder / "world", f"tile{i}", {"terrain": source}, folder / f"solid{i}.npz", {}, 0.8)
         names.append(f"tile{i}")
     describe(folder / "world", "strip", made_up.UTM, names)
-    return detailed(read_scene(folder), 3, folder / "levels", silent)
+    return read_scene(folder)
 
 
 def every(level: Level) -> Iterator[Level]:
@@ -119,3 +132,16 @@ def test_colours_stay_where_they_are(strip: Scene) -> None:
         pictures.append(scene.above((-10, -10, -1), (10, 10, 1), width=100).rgb.astype(float))
     for coarse in pictures[:-1]:
         assert np.median(np.abs(coarse - pictures[-1])) < 3 and np.abs(coarse - pictures[-1]).mean() < 12
+
+
+def test_the_gate_measures_cracks_in_what_is_exported(
+    strip: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scenes.write(strip, ["tiles3d"], tmp_path / "closed", SceneParams(), silent)
+    figures = seams.check(tmp_path / "closed", NOWHERE)
+    assert (figures["tiles"], figures["finest"]) == (10, 3) and figures["borders_m"] == pytest.approx(40, abs=1)
+    monkeypatch.setattr(texturing_levels, "meetings", lambda scene: [])
+    cracked = detailed(row(tmp_path, 2), 2, tmp_path / "levels", silent)
+    scenes.write(cracked, ["tiles3d"], tmp_path / "open", SceneParams(), silent)
+    with pytest.raises(Fault, match="cracks open"):
+        seams.check(tmp_path / "open", NOWHERE)

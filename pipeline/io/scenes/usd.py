@@ -1,8 +1,9 @@
 """OpenUSD: crate files, Z-up, metres; a payload a tile, so that large worlds load by parts.
 
 Layout: `<name>.usdc` places the tiles; `usd/<tile>.usdc` is a tile (`Looks`, `Visual`, `Collision`), with its texture
-pages in `usd/<tile>/`. Labels are `UsdSemanticsLabelsAPI:class`. Where the world is on the map stands in the custom
-data of the root layer and of `/World`: USD has no schema for it.
+pages in `usd/<tile>/`. Where a scene has levels of detail, coarser ones of a tile are variants of it (`levelOfDetail`):
+`usd/level<n>/<tile>.usdc`, with the same that bodies collide with. Labels are `UsdSemanticsLabelsAPI:class`. Where the
+world is on the map stands in the custom data of the root layer and of `/World`: USD has no schema for it.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from scan2sim.pipeline.types import F32, Mesh
 
 NEEDS = ("pxr",)
 FOLDER = "usd"
+VARIANTS, FINEST = "levelOfDetail", "finest"
 SKY = 1000.0
 """Nits of an even sky: the photos hold the light of their day."""
 
@@ -45,17 +47,42 @@ def write(scene: Scene, folder: Path, params: SceneParams, report: Report) -> di
     UsdLux.DomeLight.Define(stage, "/World/Sky").CreateIntensityAttr(SKY)
     for i, tile in enumerate(scene.tiles):
         report(i / len(scene.tiles), tile.name)
-        file = f"{FOLDER}/{tile.name}.usdc"
-        triangles[file] = _write_tile(folder / file, tile, params)
         placed = UsdGeom.Xform.Define(stage, f"/World/{_prim(tile.name)}")
         placed.AddTranslateOp().Set(Gf.Vec3d(*tile.offset))
-        placed.GetPrim().GetPayloads().AddPayload(f"./{file}")
+        files = {}
+        for level in scene.levels(tile):
+            file = f"{FOLDER}/{f'level{level.height}/' if level.height else ''}{tile.name}.usdc"
+            make_folder((folder / file).parent)
+            triangles[file] = _write_tile(folder / file, level.tile, tile, params)
+            files[f"level{level.height}" if level.height else FINEST] = f"./{file}"
+        _load(placed.GetPrim(), files)
     stage.GetRootLayer().Save()
     return triangles
 
 
-def _write_tile(path: Path, tile: SceneTile, params: SceneParams) -> int:
-    """Write a tile's layer, local metres; how many triangles it shows."""
+def _load(prim: Any, files: dict[str, str]) -> None:
+    """Give a tile its payload; several are variants, of which the first is chosen."""
+    if len(files) == 1:
+        prim.GetPayloads().AddPayload(*files.values())
+        return
+    variants = prim.GetVariantSets().AddVariantSet(VARIANTS)
+    for name, file in files.items():
+        variants.AddVariant(name)
+        variants.SetVariantSelection(name)
+        with variants.GetVariantEditContext():
+            prim.GetPayloads().AddPayload(file)
+    variants.SetVariantSelection(next(iter(files)))
+
+
+def _write_tile(path: Path, tile: SceneTile, own: SceneTile, params: SceneParams) -> int:
+    """Write a tile's layer, local metres; how many triangles it shows.
+
+    Args:
+        path: of the layer.
+        tile: what is shown, at one of its levels.
+        own: the scene's own, which bodies collide with.
+        params: how it is written.
+    """
     from pxr import Kind, Usd, UsdGeom
 
     stage = _stage(path)
@@ -75,7 +102,7 @@ def _write_tile(path: Path, tile: SceneTile, params: SceneParams) -> int:
             for part in surface.parts(params.max_visual_triangles):
                 _show(stage, root, part, looks)
                 triangles += len(part.shape)
-    for solid in solids(tile.solid(), tile.friction):
+    for solid in solids(own.solid(), own.friction):
         _collide(stage, root, solid)
     stage.GetRootLayer().Save()
     return triangles

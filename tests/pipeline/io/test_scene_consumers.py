@@ -130,6 +130,26 @@ def test_usd_has_no_fault(town: Scene, tmp_path: Path) -> None:
     assert place["crs"] == "EPSG:32632" and tuple(place["worldOriginMetres"]) == made_up.UTM.origin
 
 
+def test_usd_tiles_have_their_coarser_levels_as_variants(town: Scene, tmp_path: Path) -> None:
+    module("pxr")
+    from pxr import Usd, UsdGeom, UsdValidation
+
+    levels = detailed(town, 2, tmp_path / "levels", silent)
+    stage = Usd.Stage.Open(str(export(levels, "usd", tmp_path / "out") / "town.usdc"))
+    every = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    assert not [fault.GetErrorAsString() for fault in UsdValidation.ValidationContext(every).Validate(stage)]
+
+    def triangles(kind: str) -> int:
+        meshes = [UsdGeom.Mesh(prim) for prim in stage.GetPrimAtPath(f"/World/tile0/{kind}").GetChildren()]
+        return sum(len(mesh.GetFaceVertexCountsAttr().Get() or ()) for mesh in meshes)
+
+    fine, solid = triangles("Visual"), triangles("Collision")
+    choice = stage.GetPrimAtPath("/World/tile0").GetVariantSet("levelOfDetail")
+    assert choice.GetVariantNames() == ["finest", "level1"] and choice.GetVariantSelection() == "finest"
+    choice.SetVariantSelection("level1")
+    assert 0 < triangles("Visual") < 0.5 * fine and triangles("Collision") == solid
+
+
 def test_omniverses_validator_finds_nothing_that_fails(town: Scene, tmp_path: Path) -> None:
     module("pxr")
     if importlib.util.find_spec("omni") is None:
