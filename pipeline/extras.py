@@ -24,6 +24,8 @@ EXTRA_OF = {
     "s3fs": "s3",
     "rasterio": "rasters",
     "pxr": "usd",
+    "meshopt": "gltf",
+    "DracoPy": "gltf",
     "cyclonedds": "bus",
     "rosbags": "bus",
     "confluent_kafka": "bus",

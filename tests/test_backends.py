@@ -20,6 +20,7 @@ from scan2sim.pipeline import backends, decimation
 from scan2sim.pipeline.errors import SettingError, UnavailableError
 from scan2sim.pipeline.extras import EXTRA_OF
 from scan2sim.pipeline.io import clouds, decoders, gps, meshes, models, robots, scenes
+from scan2sim.pipeline.io.gltf import geometry, textures
 from scan2sim.pipeline.types import Camera
 from scan2sim.segmentation import backends as networks
 from scan2sim.services.qos import links
@@ -40,6 +41,8 @@ PROTOCOLS: dict[ModuleType, tuple[type, ...]] = {
     meshes: (meshes.ModelFormat,),
     scenes: (scenes.Format,),
     robots: (robots.Format,),
+    textures: (textures.Texture,),
+    geometry: (geometry.Codec,),
     decimation: (decimation.Backend,),
     links: (links.Backend,),
 }

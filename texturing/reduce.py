@@ -16,7 +16,7 @@ import numpy as np
 from scan2sim.pipeline.io import scene as scenes
 from scan2sim.pipeline.io.scene import Scene, Surface
 from scan2sim.pipeline.step import Report, silent
-from scan2sim.pipeline.types import F64, U8, Bools, Frame, Mesh
+from scan2sim.pipeline.types import F64, I64, U8, Bools, Frame, Mesh
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.io.textured import Textured
@@ -64,19 +64,23 @@ def reduced(scene: Scene, triangles: int | None, texels: float | None, folder: P
             min(1.0, (triangles or np.inf) / sum(map(len, shapes.values()))),
             min(1.0, (texels or np.inf) / sum(map(texels_of, shapes.values()))),
         )
-        sources = {}
-        for group, shape in shapes.items():
-            sources[group] = tile.folder / group
-            if min(share) < 1:
-                sources[group] = folder / tile.name / group
-                shrink(group, shape, tile.folder / group, share, None, sources[group])
-        scenes.keep(world, tile.name, sources, tile.folder / scenes.SOLID, tile.known, tile.friction)
+        sources = {group: tile.folder / group for group in shapes}
+        photos = {group: shape.photo for group, shape in shapes.items() if shape.photo is not None}
+        for group, shape in shapes.items() if min(share) < 1 else ():
+            sources[group] = folder / tile.name / group
+            small = shrink(group, shape, tile.folder / group, share, None, sources[group])
+            if group in photos:
+                photos[group] = photos[group][_nearest(shape.mesh, small)]
+        scenes.keep(
+            world, tile.name, sources, tile.folder / scenes.SOLID, tile.known, tile.friction,
+            views=tile.views(), photos=photos,
+        )  # fmt: skip
     scenes.describe(world, scene.name, scene.frame, [tile.name for tile in scene.tiles])
     return scenes.read_scene(world)
 
 
-def shrink(group: str, shape: Textured, source: Path, share: Share, borders: F64 | None, out: Path) -> None:
-    """Write a group with shares of its triangles and texels as a textured mesh.
+def shrink(group: str, shape: Textured, source: Path, share: Share, borders: F64 | None, out: Path) -> Mesh:
+    """Write a group with shares of its triangles and texels as a textured mesh; returns it.
 
     Args:
         group: its name.
@@ -105,6 +109,14 @@ def shrink(group: str, shape: Textured, source: Path, share: Share, borders: F64
             break
         wide *= 1.05 * np.sqrt(found / most)
     _paint(flat, pages, source, out, int(np.clip(np.rint(share.texels**-0.5), 1, FINE)))
+    return flat
+
+
+def _nearest(mesh: Mesh, small: Mesh) -> I64:
+    """(F,) of each face of `small`, the face of `mesh` whose middle is nearest to its own."""
+    from scipy.spatial import cKDTree
+
+    return np.asarray(cKDTree(mesh.corners.mean(axis=1)).query(small.corners.mean(axis=1))[1], np.int64)
 
 
 def _simplified(mesh: Mesh, share: float, borders: F64 | None) -> Mesh:

@@ -349,7 +349,9 @@ class _Graph:
         at, add, tile = self.at, self.add, self.tile
         cell = {"place": self.cell["seed"], "neighbours": self.cell["neighbours"]} if self.cell else {}
         add(COLLISION, {**surfaces, "cloud": at(SPLIT, "terrain")}, **cell)
-        add(EXPORT, textured | lists | self.listed | {"collision": at(COLLISION, "mesh")}, name=tile.name)
+        choice = {f"choice.{g}": at(CHOOSE, "choice", g) for g in self.groups}
+        shown = {"views": seen["views"], "collision": at(COLLISION, "mesh")}
+        add(EXPORT, textured | choice | lists | self.listed | shown, name=tile.name)
         if self.settings.params(EXPORT).rasters:
             add(RASTERS, textured, name=tile.name, **_fineness(self.settings))
         truth: Sources = {}

@@ -5,7 +5,9 @@ in the world's folder, `scene/` (files of earlier steps as hard links, so it tak
 
     scene/scene.json                name, origin and tiles
     scene/<tile>/tile.json          frame, friction, and figures of each surface
-    scene/<tile>/<group>/           a textured mesh, as `pipeline.io.textured` reads it
+    scene/<tile>/<group>/           a textured mesh, as `pipeline.io.textured` reads it; `photo.npy` tells which photo
+                                    gives each face its detail, by its number among
+    scene/<tile>/views.json         the photos' poses, where there are photos
     scene/<tile>/collision.npz      what bodies collide with
     scene/<tile>/*.geojson, *.csv   lists of what stands where
     scene/<tile>/roads.npz          what was seen of roads (`pipeline.roads.observed`), where the step `roads` was run
@@ -15,7 +17,7 @@ in the world's folder, `scene/` (files of earlier steps as hard links, so it tak
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -25,13 +27,14 @@ import numpy as np
 from scan2sim.pipeline.classes import CODE_OF_SURFACE, SURFACES, name_of
 from scan2sim.pipeline.errors import DataError, InputError
 from scan2sim.pipeline.io import image, textured
+from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.files import make_folder, pass_on
 from scan2sim.pipeline.io.textured import Textured
 from scan2sim.pipeline.robot import Start
-from scan2sim.pipeline.types import U8, Frame, Mesh
+from scan2sim.pipeline.types import I32, U8, Frame, Mesh, View
 
 FOLDER, ABOUT, TILE, SOLID = "scene", "scene.json", "tile.json", "collision.npz"
-ROADS, PATH = "roads.npz", "path.npz"
+ROADS, PATH, VIEWS = "roads.npz", "path.npz", "views.json"
 VERSION = 1
 """Of what is kept."""
 Vector = tuple[float, float, float]
@@ -121,6 +124,10 @@ class SceneTile:
     def solid(self) -> Mesh:
         """What bodies collide with."""
         return Mesh.load(self.folder / SOLID)
+
+    def views(self) -> tuple[View, ...]:
+        """Its photos' poses, local metres, their files as names alone; empty in worlds of earlier versions."""
+        return views_io.load(self.folder / VIEWS) if (self.folder / VIEWS).is_file() else ()
 
     @property
     def lists(self) -> dict[str, Path]:
@@ -227,6 +234,8 @@ def keep(
     lists: Mapping[str, Path],
     friction: float,
     origin: Vector | None = None,
+    views: Sequence[View] = (),
+    photos: Mapping[str, I32] | None = None,
 ) -> Scene:
     """Keep a tile's results as a scene below `world`.
 
@@ -238,6 +247,8 @@ def keep(
         lists: files of all that is kept beside the meshes, by the names that they get.
         friction: of the ground.
         origin: of the scene, metres in the CRS; default: the tile's own.
+        views: the tile's photos.
+        photos: of groups, (F,) which of them gives each face its detail, -1: none.
 
     Raises:
         DataError: no group has a face.
@@ -260,6 +271,10 @@ def keep(
         make_folder(folder / group)
         for file in ("mesh.npz", *(page.name for page in shape.pages), *(page.name for page in shape.seen)):
             pass_on(surfaces[group] / file, folder / group / file)
+        if photos is not None and group in photos:
+            np.save(folder / group / textured.PHOTO, photos[group])
+    if views:
+        views_io.save(folder / VIEWS, [replace(view, photo=Path(view.photo.name), mask=None) for view in views])
     pass_on(solid, folder / SOLID)
     for file, path in lists.items():
         pass_on(path, folder / file)

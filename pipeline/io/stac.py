@@ -13,7 +13,7 @@ import os
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +24,7 @@ from scan2sim.pipeline.errors import DataError, from_os_error
 from scan2sim.pipeline.io import geotiff
 from scan2sim.pipeline.io.clouds import Header, las
 from scan2sim.pipeline.io.crs import LOCAL, _horizontal, _parsed
+from scan2sim.pipeline.io.gps_time import from_gps
 from scan2sim.pipeline.io.worlds import swap
 from scan2sim.pipeline.types import F64, Frame
 
@@ -51,9 +52,6 @@ MEDIA_TYPES = {
 }
 ENCODINGS = {".laz": "laszip", ".las": "las", ".ply": "ply"}
 PDAL_NAMES = {"scan_angle": "ScanAngleRank", "scanner_channel": "ScanChannel", "nir": "Infrared"}
-WEEK, ADJUSTED = 604_800.0, 1e9  # seconds: of a GPS week; by which "adjusted" GPS times are less
-EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
-LEAP = 18.0  # seconds that GPS time is ahead of UTC since 2017
 
 
 @dataclass(frozen=True)
@@ -153,17 +151,6 @@ def write_vpc(path: Path, tiles: Sequence[TileItem]) -> Path:
     except OSError as error:
         raise from_os_error(error, path) from None
     return path
-
-
-def from_gps(seconds: float) -> datetime | None:
-    """UTC of an "adjusted" GPS time (LAS: seconds since 1980, less a billion); None where it can't be one.
-
-    Times that count from the beginning of a week don't tell which week. Exact since 2017; before, leap seconds that
-    weren't yet there put it some seconds off.
-    """
-    if 0 <= seconds <= WEEK or not -ADJUSTED < seconds < ADJUSTED:
-        return None
-    return EPOCH + timedelta(seconds=seconds + ADJUSTED - LEAP)
 
 
 def _collection(name: str, description: str, tiles: Sequence[TileItem]) -> pystac.Collection:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +10,8 @@ import numpy.typing as npt
 
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.types import F32, I32, Bools, Mesh
+
+PHOTO = "photo.npy"
 
 
 @dataclass(frozen=True)
@@ -20,11 +22,13 @@ class Textured:
         mesh: with `uv` and `page`.
         normal: (V, 3) float32, unit vertex normals.
         pages: image file of every page, indexed by `mesh.page`.
+        photo: (F,) int32 the view that gives each face's detail, -1 where none does; None: not known.
     """
 
     mesh: Mesh
     normal: F32
     pages: tuple[Path, ...]
+    photo: I32 | None = None
 
     def __len__(self) -> int:
         return len(self.mesh)
@@ -49,7 +53,8 @@ class Textured:
     def keep(self, mask: Bools) -> Textured:
         """The faces that `mask` (F,) selects; normals stay those of the whole, so no seam shows between parts."""
         used = np.unique(self.mesh.faces[mask])
-        return Textured(self.mesh.keep(mask), self.normal[used], self.pages)
+        photo = None if self.photo is None else self.photo[mask]
+        return replace(self, mesh=self.mesh.keep(mask), normal=self.normal[used], photo=photo)
 
     def parts(self, limit: int) -> list[Textured]:
         """Spatially compact parts of at most `limit` triangles: halved across the longest side until small enough."""
@@ -87,7 +92,16 @@ def read(folder: Path) -> Textured | None:
     for page in pages:
         if not page.is_file():
             raise InputError(page, "is missing, and faces of mesh.npz lie on it", "Texture the mesh again")
-    return Textured(mesh, vertex_normals(mesh), pages)
+    return Textured(mesh, vertex_normals(mesh), pages, _photo(folder / PHOTO, len(mesh)))
+
+
+def _photo(path: Path, count: int) -> I32 | None:
+    if not path.is_file():
+        return None
+    photo = np.load(path)
+    if photo.shape != (count,):
+        raise InputError(path, f"is of {photo.shape} faces, mesh.npz has {count}", "Export the world again")
+    return np.asarray(photo, np.int32)
 
 
 def vertex_normals(mesh: Mesh) -> F32:

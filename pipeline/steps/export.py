@@ -5,15 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 from pydantic import AfterValidator, Field
 
 from scan2sim.pipeline.classes import SURFACES
 from scan2sim.pipeline.extras import need
 from scan2sim.pipeline.io import scenes
+from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.scene import PATH, ROADS, keep
 from scan2sim.pipeline.io.scenes import SceneParams, opendrive
 from scan2sim.pipeline.ranges import Coordinate, Name
 from scan2sim.pipeline.step import Done, Inputs, Report, Step
+from scan2sim.pipeline.types import I32
 
 LISTS = {
     "plants": "plants.geojson", "plants_csv": "plants.csv",
@@ -56,7 +59,8 @@ def export(inputs: Inputs, params: ExportParams, out: Path, report: Report) -> D
     Below `world/` is what `pipeline.io.scenes` writes of each of the formats, `metadata.json`, the lists that are
     given, and `scene/`, from which other formats can be written later (`pipeline.io.scene`). Meshes are in the tile's
     local metres; its place is in poses, nodes and the georeference alone. OpenDRIVE is written wherever lanes are told
-    (`roads_seen`, which the step `roads` made).
+    (`roads_seen`, which the step `roads` made). With `views` and `choice.*` the scene tells of each face which photo
+    gives its detail.
 
     Raises:
         DataError: no group has a face.
@@ -66,9 +70,13 @@ def export(inputs: Inputs, params: ExportParams, out: Path, report: Report) -> D
     """
     scenes.check(params.formats, params, "export.formats")
     world = out / "world"
+    views = views_io.load(inputs["views"]) if "views" in inputs else ()
+    photos = {str(group): _details(inputs[f"choice.{group}"]) for group in SURFACES if f"choice.{group}" in inputs}
     surfaces = {str(group): inputs[group] for group in SURFACES if group in inputs}
     lists = {file: inputs[key] for key, file in LISTS.items() if key in inputs}
-    scene = keep(world, params.name, surfaces, inputs["collision"], lists, params.friction, params.world_origin)
+    scene = keep(
+        world, params.name, surfaces, inputs["collision"], lists, params.friction, params.world_origin, views, photos
+    )
     formats = dict.fromkeys([*params.formats, *(["opendrive"] if opendrive.has_lanes(scene) else [])])
     scenes.write(scene, list(formats), world, params, report)
     tile = scene.tiles[0]
@@ -79,6 +87,12 @@ def export(inputs: Inputs, params: ExportParams, out: Path, report: Report) -> D
         "bytes": sum({s.st_ino: s.st_size for s in (f.stat() for f in world.rglob("*") if f.is_file())}.values()),
     }
     return Done({"world": world}, facts)
+
+
+def _details(path: Path) -> I32:
+    """(F,) of a choice (`texturing.choose`), which view gives each face its detail."""
+    with np.load(path) as choice:
+        return np.asarray(choice["label"], np.int32)
 
 
 def can_export(params: ExportParams) -> None:

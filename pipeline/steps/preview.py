@@ -43,6 +43,7 @@ def preview(inputs: Inputs, params: PreviewParams, out: Path, report: Report) ->
     """
     from scan2sim.pipeline import render
     from scan2sim.pipeline.io import glb, textured
+    from scan2sim.pipeline.io.glb import GlbParams
     from scan2sim.pipeline.io.scene import whole
 
     read = {group: textured.read(inputs[group]) for group in SURFACES if group in inputs}
@@ -55,7 +56,7 @@ def preview(inputs: Inputs, params: PreviewParams, out: Path, report: Report) ->
     folder.mkdir()
     packed = out / "world.glb"
     shown = [whole(group, surface) for group, surface in surfaces.items()]
-    glb.write(packed, shown, params.jpeg_quality, scale=scale, normals=False)
+    glb.write(packed, shown, GlbParams(jpeg_quality=params.jpeg_quality, glb_bare=True), scale=scale)
     report(0.7, "eyes")
     script = folder / "world.js"
     script.write_bytes(CALL + b'("' + base64.b64encode(packed.read_bytes()) + b'");\n')
@@ -96,4 +97,4 @@ def _eye(pose: F64, low: F64) -> list[list[float]]:
     return [eye.round(3).tolist(), (eye + ahead * reach).round(3).tolist()]
 
 
-PREVIEW = Step("preview", 2, preview, PreviewParams)
+PREVIEW = Step("preview", 3, preview, PreviewParams)

@@ -13,11 +13,12 @@ from scan2sim.pipeline.classes import CODE
 from scan2sim.pipeline.io import geojson
 from scan2sim.pipeline.io.scene import Scene, describe, keep, read_scene
 from scan2sim.pipeline.primitives import tube
+from scan2sim.pipeline.render import look_at, pinhole
 from scan2sim.pipeline.step import Done, silent
 from scan2sim.pipeline.steps.collision import COLLISION, CollisionParams
 from scan2sim.pipeline.steps.decimate import with_things
 from scan2sim.pipeline.steps.export import EXPORT, ExportParams
-from scan2sim.pipeline.types import Frame, Mesh
+from scan2sim.pipeline.types import Frame, Mesh, View
 
 UTM = Frame("EPSG:32632", (690_000.0, 5_335_000.0, 500.0))
 HOUSE = (4.0, 2.0)  # its corner of least x and y; it measures 3 x 2 x 5 m
@@ -118,6 +119,11 @@ def collided(frame: Frame = UTM) -> Mesh:
     )
 
 
+def view() -> View:
+    """A photo from the south west, at eye height, that sees the house and the ground before it."""
+    return View("front", pinhole(640, 480), look_at((-8, -9, 2), (0, 0, 1)), Path("front.jpg"), time=211_846_418.0)
+
+
 def scene(folder: Path, frame: Frame = UTM, tiles: int = 2, apart: float = 25.0) -> Scene:
     """Tiles in a row, so many metres apart, around the first one's origin: ground, a house with a sign for a roof."""
     world, names = folder / "world", []
@@ -131,7 +137,8 @@ def scene(folder: Path, frame: Frame = UTM, tiles: int = 2, apart: float = 25.0)
         collided(here).save(solid)
         lists = folder / f"tile{i}" / "plants.geojson"
         geojson.write_points(lists, frame.crs, [(here.to_crs((-5.0, -5.0, 0.0)).tolist(), {"height_m": 4.0})])
-        keep(world, f"tile{i}", sources, solid, {"plants.geojson": lists}, 0.8)
+        photos = {group: np.zeros(len(mesh), np.int32) for group, mesh in meshes.items()}
+        keep(world, f"tile{i}", sources, solid, {"plants.geojson": lists}, 0.8, views=[view()], photos=photos)
         names.append(f"tile{i}")
     describe(world, "town", frame, names)
     return read_scene(world)

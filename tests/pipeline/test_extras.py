@@ -102,6 +102,8 @@ USES = {
     "s3fs": ["survey s3://bucket/survey"],
     "rasterio": ["run TILE --set export.rasters=0.1"],
     "pxr": ["export world --to usd", "run TILE --set export.formats=[\"usd\"]"],
+    "meshopt": ["export world --to glb --glb-mesh meshopt", "run TILE --set export.glb_mesh=meshopt"],
+    "DracoPy": ["export world --to glb --glb-mesh draco"],
     "cyclonedds": ["monitor talker chatter"],
     "rosbags": ["monitor listener chatter"],
     "psutil": ["monitor topic chatter"],

@@ -23,6 +23,7 @@ def test_a_smaller_scene_looks_as_before(tmp_path: Path) -> None:
     pages = [page for shape in new.textured().values() for page in shape.pages]
     assert sum(np.prod(cv2.imread(str(page)).shape[:2]) for page in pages) <= TEXELS
     assert {surface.code for surface in new.surfaces()} == {surface.code for surface in old.surfaces()}
+    assert all(not np.any(shape.photo) for shape in new.textured().values()) and len(new.views()) == 1
     assert new.low == old.low and new.high[:2] == old.high[:2]
     eye = render.look_at((-12, -9, 12), (0, 0, 0))
     pictures = [

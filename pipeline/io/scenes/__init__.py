@@ -20,13 +20,14 @@ from scan2sim.pipeline.backends import find, module, names
 from scan2sim.pipeline.errors import DataError, SettingError
 from scan2sim.pipeline.io import image, robots, sdf
 from scan2sim.pipeline.io.files import make_folder
+from scan2sim.pipeline.io.glb import GlbParams, ways
 from scan2sim.pipeline.io.meshes import PageNames, obj
 from scan2sim.pipeline.io.scene import Scene, SceneTile, by_class
 from scan2sim.pipeline.io.start import find as find_start
 from scan2sim.pipeline.io.textured import Textured
 from scan2sim.pipeline.robot import ROBOT
 from scan2sim.pipeline.solids import Solid, solids
-from scan2sim.pipeline.step import Params, Report
+from scan2sim.pipeline.step import Report
 from scan2sim.pipeline.types import Mesh
 
 PACKAGE = "scan2sim.pipeline.io.scenes"
@@ -34,7 +35,7 @@ SHOWN = ("obj", "collada")
 """Formats that Gazebo's model shows, the better one first."""
 
 
-class SceneParams(Params):
+class SceneParams(GlbParams):
     """How a scene is written.
 
     Attributes:
@@ -42,7 +43,8 @@ class SceneParams(Params):
             reads several times faster than Collada, or Collada where there is no OBJ.
         max_visual_triangles: of one mesh that is shown; larger surfaces are written in parts.
         pages: "png", lossless, or "jpeg", a sixth or so of its size, for texture pages that are files of their own.
-        jpeg_quality: of the GLB's textures, and of JPEG pages.
+        source_pages: beside each of these, a page that says where each texel's colour is from: 255 a photo, 128 the
+            cloud's points, 64 filled, 0 no surface.
     """
 
     meshes: tuple[str, ...] = Field(
@@ -52,7 +54,7 @@ class SceneParams(Params):
         200_000, ge=1_000, le=10_000_000, description="Of one mesh that is shown; larger surfaces come in parts."
     )
     pages: Literal["png", "jpeg"] = Field("png", description="Texture pages that are files: lossless, or a sixth.")
-    jpeg_quality: int = Field(90, ge=1, le=100, description="Of the GLB's textures, and of JPEG pages.")
+    source_pages: bool = Field(False, description="Beside texture pages, pages that say where colours are from.")
 
 
 class Format(Protocol):
@@ -83,6 +85,7 @@ def check(formats: Sequence[str], params: SceneParams, setting: str, robot: bool
         find(PACKAGE, name, setting)
     for name in params.meshes:
         find("scan2sim.pipeline.io.meshes", name, "export.meshes")
+    ways(params)
     if "gazebo" in formats and not set(SHOWN) & set(params.meshes):
         raise SettingError("export.meshes", f"has nothing that Gazebo shows ({' or '.join(SHOWN)})", "Name one, too")
     driven = names(robots.PACKAGE)
@@ -169,6 +172,8 @@ def write_pages(folder: Path, group: str, shape: Textured, params: SceneParams) 
             shutil.copyfile(shape.pages[page], folder / images[page])  # may be edited freely
         else:
             image.write(folder / images[page], image.read_rgb(shape.pages[page]), quality=params.jpeg_quality)
+        if params.source_pages and len(shape.seen) == len(shape.pages):
+            shutil.copyfile(shape.seen[page], folder / f"{materials[page]}_seen.png")
     return PageNames(group, materials, images, tuple(shape.used_pages))
 
 

@@ -1,4 +1,4 @@
-"""glTF: a GLB for each tile, in its place in the world, y-up, textures within; meshes tell their class as `extras`."""
+"""glTF: a GLB for each tile, in its place in the world, y-up, textures within; see `pipeline/io/glb.py`."""
 
 from __future__ import annotations
 
@@ -16,6 +16,6 @@ def write(scene: Scene, folder: Path, params: SceneParams, report: Report) -> di
     for i, tile in enumerate(scene.tiles):
         report(i / len(scene.tiles), tile.name)
         surfaces = tile.surfaces()
-        glb.write(folder / f"{tile.name}.glb", surfaces, params.jpeg_quality, offset=tile.offset)
+        glb.write(folder / f"{tile.name}.glb", surfaces, params, views=tile.views(), offset=tile.offset)
         triangles[f"{tile.name}.glb"] = sum(len(surface.shape) for surface in surfaces)
     return triangles

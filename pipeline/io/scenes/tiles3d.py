@@ -109,7 +109,7 @@ class _Made:
 
         surfaces = [placed(surface) for surface in tile.surfaces()]
         make_folder((self._folder / file).parent)
-        glb.write(self._folder / file, surfaces, self._params.jpeg_quality)
+        glb.write(self._folder / file, surfaces, self._params, views=tile.views())
         self.triangles[file] = sum(len(surface.shape) for surface in surfaces)
         every = np.concatenate([surface.shape.mesh.vertices for surface in surfaces]).astype(np.float64)
         return every.min(axis=0), every.max(axis=0)

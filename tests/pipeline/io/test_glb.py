@@ -1,36 +1,104 @@
-"""GLB: y-up, matt, textures embedded and the right way up."""
+"""GLB: y-up, matt, textures embedded and the right way up, however packed; where each face has its colour from."""
 
 from __future__ import annotations
 
 import json
 import struct
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+import pytest
+from scipy.spatial import cKDTree
 
-from scan2sim.pipeline.io import glb, textured
-from scan2sim.pipeline.io.scene import whole
+from scan2sim.pipeline.errors import SettingError, UnavailableError
+from scan2sim.pipeline.io import glb, provenance, textured
+from scan2sim.pipeline.io.glb import GlbParams
+from scan2sim.pipeline.io.scene import Surface, whole
+from scan2sim.pipeline.types import Camera, View
 from tests.pipeline import made_up
 from tests.present import present
 
+GROUPS = {"terrain": made_up.ground(), "building": made_up.house()}
+DTYPE: dict[int, Any] = {5120: np.int8, 5121: np.uint8, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
+COLUMNS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3}
+EXTENSION = {"meshopt": "EXT_meshopt_compression", "draco": "KHR_draco_mesh_compression"}
 
-def _write(folder: Path) -> Path:
-    surfaces = [
-        whole(group, present(textured.read(made_up.textured(folder / group, mesh))))
-        for group, mesh in {"terrain": made_up.ground(), "building": made_up.house()}.items()
+
+def surfaces(folder: Path) -> list[Surface]:
+    return [
+        whole(group, present(textured.read(made_up.textured(folder / group, mesh)))) for group, mesh in GROUPS.items()
     ]
-    glb.write(folder / "a.glb", surfaces)
+
+
+def written(folder: Path, **params: Any) -> Path:
+    glb.write(folder / "a.glb", surfaces(folder), GlbParams(**params))
     return folder / "a.glb"
+
+
+class File:
+    """What a reader of the specification sees."""
+
+    def __init__(self, path: Path) -> None:
+        data = path.read_bytes()
+        assert struct.unpack("<I", data[8:12])[0] == len(data)
+        length = struct.unpack("<I", data[12:16])[0]
+        self.tree, self.body = json.loads(data[20 : 20 + length]), data[28 + length :]
+
+    def view(self, index: int) -> bytes:
+        view = self.tree["bufferViews"][index]
+        packed = view.get("extensions", {}).get(EXTENSION["meshopt"])
+        if packed is None:
+            return self.body[view.get("byteOffset", 0) :][: view["byteLength"]]
+        import meshopt
+
+        data = self.body[packed["byteOffset"] :][: packed["byteLength"]]
+        how = packed["mode"], packed.get("filter", "NONE")
+        return bytes(meshopt.decode_gltf_buffer(data, packed["count"], packed["byteStride"], *how))
+
+    def array(self, index: int) -> np.ndarray:
+        about = self.tree["accessors"][index]
+        dtype, columns = np.dtype(DTYPE[about["componentType"]]), COLUMNS[about["type"]]
+        stride = self.tree["bufferViews"][about["bufferView"]].get("byteStride", dtype.itemsize * columns)
+        rows = np.frombuffer(self.view(about["bufferView"]), np.uint8)[: about["count"] * stride].reshape(-1, stride)
+        values = np.ascontiguousarray(rows[:, : dtype.itemsize * columns]).view(dtype)
+        return values / np.iinfo(dtype).max if about.get("normalized") else values
+
+    def mesh(self, name: str) -> dict[str, np.ndarray]:
+        """Attributes and `faces` of a mesh."""
+        one = next(mesh for mesh in self.tree["meshes"] if mesh["name"] == name)["primitives"][0]
+        packed = one.get("extensions", {}).get(EXTENSION["draco"])
+        if packed is None:
+            found = {key: self.array(index) for key, index in one["attributes"].items()}
+            return {**found, "faces": self.array(one["indices"]).reshape(-1, 3)}
+        import DracoPy
+
+        read = DracoPy.decode(self.view(packed["bufferView"]))
+        of = {attribute["unique_id"]: attribute["data"] for attribute in read.attributes}
+        found = {key: of[packed["attributes"][key]] for key in one["attributes"]}
+        for key, index in one["attributes"].items():
+            assert self.tree["accessors"][index]["count"] == len(found[key])
+        return {**found, "faces": read.faces}
+
+    def page(self, name: str) -> np.ndarray:
+        """RGB of a mesh's texture."""
+        one = next(mesh for mesh in self.tree["meshes"] if mesh["name"] == name)["primitives"][0]
+        material = self.tree["materials"][one["material"]]["pbrMetallicRoughness"]
+        texture = self.tree["textures"][material["baseColorTexture"]["index"]]
+        source = texture.get("source", next((e["source"] for e in texture.get("extensions", {}).values()), None))
+        data = self.view(self.tree["images"][source]["bufferView"])
+        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[:, :, ::-1]
 
 
 def test_a_reader_gets_all_triangles_y_up(tmp_path: Path) -> None:
     import trimesh
 
-    scene = trimesh.load_scene(_write(tmp_path), process=False)
+    scene = trimesh.load_scene(written(tmp_path), process=False)
     assert set(scene.geometry) == {"terrain_0", "terrain_1", "building_0", "building_1"}
     np.testing.assert_allclose(scene.bounds, [[-10, -0.5, -10], [10, 4.5, 10]], atol=1e-4)
-    for group, mesh in {"terrain": made_up.ground(), "building": made_up.house()}.items():
+    for group, mesh in GROUPS.items():
         for page, (corners, uv) in made_up.by_page(mesh).items():
             part = scene.geometry[f"{group}_{page}"]
             y_up = np.stack([corners[..., 0], corners[..., 2], -corners[..., 1]], axis=-1)
@@ -40,28 +108,37 @@ def test_a_reader_gets_all_triangles_y_up(tmp_path: Path) -> None:
             assert part.visual.material.baseColorTexture.size == (256, 256)
 
 
-def test_pictures_are_the_right_way_up_by_the_specification(tmp_path: Path) -> None:
-    data = _write(tmp_path).read_bytes()
-    assert struct.unpack("<I", data[8:12])[0] == len(data)
-    length = struct.unpack("<I", data[12:16])[0]
-    tree, body = json.loads(data[20 : 20 + length]), data[28 + length :]
+@pytest.mark.parametrize("codec", ["plain", "meshopt", "draco"])
+def test_packed_geometry_is_the_same_to_a_millimetre(tmp_path: Path, codec: str) -> None:
+    if codec != "plain":
+        pytest.importorskip({"meshopt": "meshopt", "draco": "DracoPy"}[codec], reason="scan2sim[gltf] isn't installed")
+    file = File(written(tmp_path, glb_mesh=codec, glb_lit=True))
+    assert file.tree.get("extensionsRequired", []) == {
+        "plain": [], "meshopt": [EXTENSION["meshopt"], "KHR_mesh_quantization"], "draco": [EXTENSION["draco"]],
+    }[codec]  # fmt: skip
+    for group, mesh in GROUPS.items():
+        for page, (corners, uv) in made_up.by_page(mesh).items():
+            part = file.mesh(f"{group}_{page}")
+            y_up = np.stack([corners[..., 0], corners[..., 2], -corners[..., 1]], axis=-1)
+            wanted = np.concatenate([y_up, uv[..., :1], 1 - uv[..., 1:]], axis=-1)
+            got = np.concatenate([part["POSITION"], part["TEXCOORD_0"]], axis=-1)[part["faces"]]
+            assert furthest(got, wanted) < (0.0006 if codec != "plain" else 1e-6)
+            assert np.abs(np.linalg.norm(part["NORMAL"], axis=1) - 1).max() < 0.02
 
-    def view(index: int) -> bytes:
-        v = tree["bufferViews"][index]
-        return body[v.get("byteOffset", 0) :][: v["byteLength"]]
 
-    def array(index: int, dtype: type, width: int) -> np.ndarray:
-        a = tree["accessors"][index]
-        return np.frombuffer(view(a["bufferView"])[a.get("byteOffset", 0) :], dtype)[: a["count"] * width]
+def furthest(got: np.ndarray, wanted: np.ndarray) -> float:
+    """How far the corners of triangles (F, 3, k) are at most from those that are wanted, each of which is there."""
+    turns = np.concatenate([np.roll(wanted, turn, axis=1) for turn in range(3)])  # whichever corner comes first
+    far, which = cKDTree(turns.reshape(len(turns), -1)).query(got.reshape(len(got), -1), p=np.inf)
+    assert len(np.unique(which % len(wanted))) == len(wanted) == len(got)
+    return float(far.max())
 
-    mesh = next(m for m in tree["meshes"] if m["name"] == "building_0")["primitives"][0]
-    xyz = array(mesh["attributes"]["POSITION"], np.float32, 3).reshape(-1, 3)
-    uv = array(mesh["attributes"]["TEXCOORD_0"], np.float32, 2).reshape(-1, 2)
-    faces = array(mesh["indices"], np.uint32, 1).reshape(-1, 3)
-    assert "NORMAL" in mesh["attributes"]
-    texture = tree["materials"][mesh["material"]]["pbrMetallicRoughness"]["baseColorTexture"]["index"]
-    jpeg = view(tree["images"][tree["textures"][texture]["source"]]["bufferView"])
-    image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)[:, :, ::-1]
+
+@pytest.mark.parametrize("texture", ["jpeg", "webp"])
+def test_pictures_are_the_right_way_up_by_the_specification(tmp_path: Path, texture: str) -> None:
+    file = File(written(tmp_path, glb_texture=texture))
+    part, image = file.mesh("building_0"), file.page("building_0")
+    xyz, uv, faces = part["POSITION"], part["TEXCOORD_0"], part["faces"]
     low = uv[faces[0]].mean(axis=0), xyz[faces[0]].mean(axis=0)[1]  # lower triangle of the south wall
     high = uv[faces[1]].mean(axis=0), xyz[faces[1]].mean(axis=0)[1]
     assert low[1] < high[1]
@@ -69,3 +146,48 @@ def test_pictures_are_the_right_way_up_by_the_specification(tmp_path: Path) -> N
     assert np.abs(image[v, u].astype(int) - (40, 40, 220)).max() < 20  # blue: the picture's lower left
     u, v = (high[0] * 256).astype(int)
     assert np.abs(image[v, u].astype(int) - (220, 40, 40)).max() < 20  # red: its upper left
+
+
+def test_photos_colours_are_shown_as_they_are_unless_it_is_to_be_lit(tmp_path: Path) -> None:
+    shown = File(written(tmp_path / "shown"))
+    lit = File(written(tmp_path / "lit", glb_lit=True))
+    assert all(material["extensions"] == {"KHR_materials_unlit": {}} for material in shown.tree["materials"])
+    assert "extensions" not in lit.tree["materials"][0] and "NORMAL" in lit.mesh("terrain_0")
+    assert "NORMAL" not in shown.mesh("terrain_0")
+
+
+def test_each_face_tells_its_photo_and_how_far_that_was(tmp_path: Path) -> None:
+    ground, house = surfaces(tmp_path)
+    photo = np.where(np.arange(len(ground.shape)) % 2, 0, -1).astype(np.int32)  # every other face was seen by the first
+    ground = replace(ground, shape=replace(ground.shape, photo=photo))
+    filled = np.full((256, 256), 64, np.uint8)
+    cv2.imwrite(str(house.shape.seen[1]), filled)
+    pose = np.eye(4)
+    pose[:3, 3] = 1, 2, 30
+    camera = Camera("pinhole", 640, 480, 500, 500, 320, 240)
+    views = [View("first", camera, pose, tmp_path / "first.jpg", time=211_846_418.0)]
+    glb.write(tmp_path / "a.glb", [ground, house], GlbParams(), views=views)
+    file = File(tmp_path / "a.glb")
+    table = file.tree["extensions"]["EXT_structural_metadata"]["propertyTables"][0]
+    assert table["count"] == 4 and provenance.table(views)[3] == provenance.Row(
+        "photo", "first", "2018-06-01T00:00:00+00:00"
+    )
+    assert file.view(table["properties"]["photo"]["values"]) == b"first"
+    assert file.view(table["properties"]["taken"]["values"]) == b"2018-06-01T00:00:00+00:00"
+    part = file.mesh("terrain_0")
+    row, far = part["_FEATURE_ID_0"][part["faces"]][..., 0], part["_DISTANCE"][part["faces"]][..., 0]
+    assert (row == row[:, :1]).all() and set(row.ravel()) == {provenance.PHOTO, provenance.FIRST}
+    x, y, z = np.moveaxis(part["POSITION"][part["faces"]], -1, 0)
+    true = np.linalg.norm([x - 1, -z - 2, y - 30], axis=0)
+    np.testing.assert_allclose(far[row == 3], true[row == 3], atol=1e-3)
+    assert (far[row != 3] == provenance.UNKNOWN).all()
+    assert (file.mesh("building_1")["_FEATURE_ID_0"] == provenance.FILLED).all()
+
+
+def test_what_cannot_be_written_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for setting in ({"glb_texture": "bmp"}, {"glb_mesh": "zip"}):
+        with pytest.raises(SettingError, match=r"export\.glb_"):
+            glb.ways(GlbParams(**setting))
+    monkeypatch.setattr("shutil.which", lambda name: None)
+    with pytest.raises(UnavailableError, match="basisu or toktx"):
+        glb.ways(GlbParams(glb_texture="ktx2"))

@@ -1,0 +1,1 @@
+"""What glTF files are made of, which `pipeline/io/glb.py` writes: buffers, textures, geometry, metadata."""
