@@ -15,13 +15,13 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import Field
 
+from scan2sim.pipeline.poses import interpolate
 from scan2sim.pipeline.ranges import Seed
 from scan2sim.pipeline.types import F64, U8, Camera, GpsTrack
-from scan2sim.slam import solvers
 from scan2sim.slam.facets import Facets
-from scan2sim.slam.geometry import angles, exp_so3, inverse, log_so3, relative_pose, rigid
-from scan2sim.slam.graph import Graph
+from scan2sim.slam.geometry import exp_so3, inverse, log_so3, relative_pose, rigid
 from scan2sim.slam.localmap import Keyframe, LocalMap, MapParams, gps_distance
+from scan2sim.slam.locate import Located, locate
 from scan2sim.slam.relocalise import Remembered, describe, relocalise
 from scan2sim.slam.trackers import Tracker, Tracks
 from scan2sim.slam.trackers import named as tracker_named
@@ -101,13 +101,13 @@ class Odometry:
         self.tracker = tracker or tracker_named("corners", self.facets, mask, params.count)
         self.map = LocalMap(camera, params, self.facets.pixel, gps=gps, backend=backend, keep=keep)
         self.placed: list[Placed] = []
-        self._backend, self._rng = backend, np.random.default_rng(params.seed)
+        self._rng = np.random.default_rng(params.seed)
         self._masks = None if mask is None else self.facets.pictures(mask)
         self._pose, self._time = np.eye(4), 0.0
         self._velocity = np.zeros(6)
         self._started = self._blind = False
         self._parallax = math.radians(params.parallax or (1.0 if self.facets.whole else 3.0))
-        self._waiting = 0  # frames since the first keyframe of a map, or since the car moved
+        self._waiting: list[Tracks] = []  # of frames since the first keyframe of a map, or since the car moved
         self._settled = 0
         self._lost_at: float | None = None
         self._memory: list[tuple[list[U8], F64]] = []  # facets and poses of the last good keyframes
@@ -165,38 +165,21 @@ class Odometry:
         self.placed.append(Placed(time, last, inverse(self.map.keyframes[last].T_world_cam) @ pose, unsure))
 
     def _continue(self, time: float, guess: F64) -> None:
-        pose, inliers, known = self._locate(guess)
-        if not self._sound(time, pose, inliers, known):
+        found = locate(self.map, self.tracker.tracks, guess, self._velocity)
+        self.tracker.drop(found.wrong)
+        if not self._sound(time, found):
             self._bridge(time, guess)
             return
         if self._lost_at is not None:
             self.warn(f"{time:.2f} s: found again, {time - self._lost_at:.2f} s after it was lost")
             self._lost_at = None
-        self._place(time, pose, unsure=False)
+        self._place(time, found.pose, unsure=False)
         if self._due():
             self._keyframe(time)
 
-    def _locate(self, guess: F64) -> tuple[F64, int, int]:
-        """Pose by the known points; how many agree with it, of how many."""
-        tracks = self.tracker.tracks
-        rows, known = self.map.landmarks.find(tracks.ids)
-        n = int(known.sum())
-        if n < 8:
-            return guess, 0, n
-        xyz, bearing, one = self.map.landmarks.xyz[rows[known]], tracks.bearing[known], np.zeros(n, np.int32)
-        graph = Graph(
-            guess[None], xyz, np.arange(n, dtype=np.int32), one, bearing, np.zeros(1, bool), self.map.sigma,
-            bend=self.map.bend(guess[None], self._velocity[None], one, bearing), shared=self.map.shared,
-            shared_sigma=np.full(len(self.map.shared), 1e-9),
-        )  # fmt: skip
-        pose = solvers.named(self._backend).solve(graph, points=False).poses[0]
-        error = angles(pose, xyz, bearing)
-        self.tracker.drop(tracks.ids[known][error > 3 * self.map.gate])
-        return pose, int((error < self.map.gate).sum()), n
-
-    def _sound(self, time: float, pose: F64, inliers: int, known: int) -> bool:
-        """Whether a pose can be believed: enough points agree, no leap, and no quarrel with GPS."""
-        if inliers < 20 or inliers < 0.3 * known:
+    def _sound(self, time: float, found: Located) -> bool:
+        """Whether a pose can be believed: enough points agree, and no quarrel with GPS."""
+        if found.agree < 20 or found.agree < 0.3 * found.known:
             return False
         if self.gps is None:
             return True
@@ -205,7 +188,7 @@ class Odometry:
         back = next((p for p in reversed(self.placed) if p.time <= since), None)
         if far is None or back is None or back.unsure:
             return True
-        moved = float(np.linalg.norm(pose[:3, 3] - self.pose_of(back)[:3, 3]))
+        moved = float(np.linalg.norm(found.pose[:3, 3] - self.pose_of(back)[:3, 3]))
         return QUARREL[0] * far - 3 < moved < QUARREL[1] * far + 5
 
     def _common(self, keyframe: Keyframe) -> tuple[F64, F64]:
@@ -260,7 +243,7 @@ class Odometry:
         """The first keyframe of a map, unless there is nothing to see."""
         found = self.tracker.refill()
         tracks = self.tracker.tracks
-        self._blind, self._started, self._waiting, self._settled = found < 30, False, 0, 0
+        self._blind, self._started, self._waiting, self._settled = found < 30, False, [], 0
         if not self.map.keyframes or not self._blind:
             self.map.begin(Keyframe(time, pose, tracks.ids, tracks.bearing, self.map.part, self._velocity))
         self._place(time, pose, unsure=self.map.part > 0 or self._blind)
@@ -272,21 +255,25 @@ class Odometry:
         if len(now) < max(30, 0.2 * len(first.ids)):
             self._anew(time, guess)
             return
-        still = guess if self.map.part else first.T_world_cam
-        found = None
-        if _median_angle(there, now) > math.radians(0.5):
-            found = relative_pose(there, now, threshold=self.map.gate, rng=self._rng)
-        elif not self.map.part:
-            self._waiting = 0
-        if found is None or _median_angle(now @ found[0][:3, :3].T, there) < self._parallax:
-            self._waiting += 1
-            self._place(time, still, unsure=self.map.part > 0)
+        moved, found = _median_angle(there, now), None
+        if not self.map.part and moved < self.map.gate:  # the car stands
+            self._waiting = []
+            self._place(time, first.T_world_cam, unsure=False)
             return
-        T = found[0]
-        T[:3, 3] *= self._baseline(first, time, guess)
-        self._place(time, first.T_world_cam @ T, unsure=self.map.part > 0)
-        self._between(T)
-        self._velocity = np.concatenate([T[:3, 3], log_so3(T[:3, :3])]) / (time - self.placed[-2 - self._waiting].time)
+        if moved > math.radians(0.5):
+            found = relative_pose(there, now, threshold=self.map.gate, rng=self._rng)
+        if found is None or _median_angle(now @ found[0][:3, :3].T, there) < self._parallax:
+            self._waiting.append(self.tracker.tracks)
+            self._place(time, guess if self.map.part else first.T_world_cam, unsure=self.map.part > 0)
+            return
+        self._second(time, found[0], self._baseline(first, time, guess))
+
+    def _second(self, time: float, T: F64, baseline: float) -> None:
+        """A map's second keyframe, at T (4, 4) from the first, whose length is `baseline`; the frames between."""
+        T[:3, 3] *= baseline
+        since = self.placed[-1 - len(self._waiting)].time
+        self._place(time, self.map.keyframes[-1].T_world_cam @ T, unsure=self.map.part > 0)
+        self._velocity = np.concatenate([T[:3, 3], log_so3(T[:3, :3])]) / (time - since)
         self._started = True
         self._keyframe(time)
         if self.map.landmarks.find(self.tracker.tracks.ids)[1].sum() < 30:
@@ -294,14 +281,12 @@ class Odometry:
             self.placed.pop()
             self._time = self.placed[-1].time
             self._anew(time, self._pose)
-
-    def _between(self, T: F64) -> None:
-        """Frames since the car began to move lie on the way from a map's first keyframe to its second, at T (4, 4)."""
-        way = self.placed[-2 - self._waiting :]
-        turn = log_so3(T[:3, :3])
-        for p in way[1:]:
-            share = (p.time - way[0].time) / (way[-1].time - way[0].time)
-            p.T_key_cam = rigid(exp_so3(share * turn), share * T[:3, 3])
+            return
+        between, ends = self.placed[-1 - len(self._waiting) : -1], self.map.poses([-2, -1])
+        guesses = interpolate(ends, np.array([since, time]), np.array([p.time for p in between]))
+        for placed, tracks, guess in zip(between, self._waiting, guesses, strict=True):
+            pose = guess if placed.unsure else locate(self.map, tracks, guess, self._velocity).pose
+            placed.T_key_cam = inverse(ends[0]) @ pose
 
     def _baseline(self, first: Keyframe, time: float, guess: F64) -> float:
         """Metres between a map's first two keyframes: GPS's, else at the speed before, else 1."""

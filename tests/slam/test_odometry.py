@@ -8,8 +8,9 @@ from scan2sim.pipeline.similarity import umeyama
 from scan2sim.pipeline.types import F64
 from scan2sim.slam.finish import finish
 from scan2sim.slam.mapped import Mapped
-from scan2sim.slam.odometry import Odometry
+from scan2sim.slam.odometry import Odometry, OdometryParams
 from tests.present import present
+from tests.slam.conftest import Drive
 from tests.slam.made_up import Follower, drive, gps_of, run, scatter
 
 
@@ -32,6 +33,18 @@ def test_a_drive_is_found_up_to_scale_and_a_standing_car_stands() -> None:
     assert error(found, poses) < 0.15  # of 180 m
     assert np.linalg.norm(found[5] - found[0]) < 1e-6
     assert not any(p.unsure for p in odometry.placed)
+
+
+def test_a_car_that_stands_before_it_drives_begins_where_it_stood(corridor: Drive) -> None:
+    still, first = 20, corridor.greys[0]
+    odometry = Odometry(corridor.camera, OdometryParams(count=400))
+    for frame, grey in enumerate([*[first] * still, *corridor.greys[1:]]):
+        odometry.add(frame / 10, grey)
+    found = positions(odometry)
+    truth = np.concatenate([np.repeat(corridor.truth.positions[:1], still, axis=0), corridor.truth.positions[1:]])
+    off = np.linalg.norm(umeyama(found, truth, scaled=True).apply(found) - truth, axis=1)
+    assert np.ptp(found[:still], axis=0).max() < 0.01
+    assert off.max() < 0.1  # of 21 m
 
 
 def test_a_perspective_cameras_narrow_view_is_enough() -> None:

@@ -1,0 +1,58 @@
+"""Locate: where a frame is, by the points of the map that it sees."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from scan2sim.pipeline.types import F64, I64
+from scan2sim.slam import solvers
+from scan2sim.slam.geometry import angles
+from scan2sim.slam.graph import Graph
+from scan2sim.slam.localmap import LocalMap
+from scan2sim.slam.trackers import Tracks
+
+FEWEST = 8
+"""Points that must be known."""
+
+
+@dataclass(frozen=True)
+class Located:
+    """Where a frame is.
+
+    Attributes:
+        pose: (4, 4) camera to world; the guess, where too few points are known.
+        known: how many of the points that it sees are known.
+        agree: how many of these agree with the pose.
+        wrong: (N,) ids of those that contradict it.
+    """
+
+    pose: F64
+    known: int
+    agree: int
+    wrong: I64
+
+
+def locate(points: LocalMap, tracks: Tracks, guess: F64, velocity: F64) -> Located:
+    """The pose by the known points among a frame's tracks.
+
+    Args:
+        points: the map.
+        tracks: what the frame sees.
+        guess: (4, 4) about where it is.
+        velocity: (6,) metres and radians a second, in the camera's axes.
+    """
+    rows, known = points.landmarks.find(tracks.ids)
+    n = int(known.sum())
+    if n < FEWEST:
+        return Located(guess, n, 0, np.zeros(0, np.int64))
+    xyz, bearing, one = points.landmarks.xyz[rows[known]], tracks.bearing[known], np.zeros(n, np.int32)
+    graph = Graph(
+        guess[None], xyz, np.arange(n, dtype=np.int32), one, bearing, np.zeros(1, bool), points.sigma,
+        bend=points.bend(guess[None], velocity[None], one, bearing), shared=points.shared,
+        shared_sigma=np.full(len(points.shared), 1e-9),
+    )  # fmt: skip
+    pose = solvers.named(points.backend).solve(graph, points=False).poses[0]
+    error = angles(pose, xyz, bearing)
+    return Located(pose, n, int((error < points.gate).sum()), tracks.ids[known][error > 3 * points.gate])
