@@ -1,12 +1,14 @@
 """Visual SLAM against a rendered drive's truth, KITTI's, pycolmap, and the mission's own method.
 
-`python -m bench.slam [--parts drive kitti pano memory] [--length 1500] [--out bench-out/slam]`
+`python -m bench.slam [--parts drive kitti turn pano memory] [--length 1500] [--out bench-out/slam]`
 
 - drive: 360-degree video (1024 px high, 10 Mbit/s, 15 fps) along a real path (KITTI 00; without the data a made-up one)
   through a synthetic town with traffic, odometry alone, a consumer receiver's GPS for the scale: D3.2's two errors;
   frames a second; the first 40 seconds by the mission's method, too (`--backend adam`, adjacent distances).
 - kitti: 51 frames of KITTI odometry 06 (perspective, real): ATE after a similarity, odometry alone and with the
   global adjustment; pycolmap's incremental mapping of the same frames, and the ratio of the times.
+- turn: 51 frames of a rendered turn of 98 degrees (perspective, 52 m): ATE, and pycolmap's; what it costs there and on
+  KITTI's frames when every other frame has .45 of its brightness.
 - pano: rotation and direction of motion between two real 360 frames, against their reference.
 - memory: peak of the process over ever more frames.
 
@@ -21,26 +23,25 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from bench.measure import measure
+from bench.slam_frames import Sequence, lit, odometry, places, pycolmap
 from scan2sim.pipeline.io import trajectory as trajectory_io
-from scan2sim.pipeline.similarity import umeyama
 from scan2sim.pipeline.types import Camera
 from scan2sim.slam.evaluate import Evaluation, evaluate, plot
 from scan2sim.slam.facets import Facets
 from scan2sim.slam.geometry import log_so3, relative_pose
-from scan2sim.slam.odometry import Odometry, OdometryParams
 from scan2sim.slam.relocalise import describe, matches
 from scan2sim.slam.trackers import named
-from scan2sim.slam.video import open_video
 
 ROOT = Path(__file__).resolve().parent.parent
 DATA = ROOT.parent / "shared" / "data"
-PARTS = ("drive", "kitti", "pano", "memory")
+PARTS = ("drive", "kitti", "turn", "pano", "memory")
 
 
 def drive_of(out: Path, path: str, length: float) -> Path:
@@ -92,82 +93,57 @@ def drive(out: Path, path: str, length: float, stretch: float) -> dict[str, floa
     }  # fmt: skip
 
 
-def kitti_camera(folder: Path) -> Camera:
-    """Of KITTI odometry's left grey camera."""
-    P = [float(v) for v in (folder / "calib.txt").read_text().split()[:12]]
-    video = open_video(folder / "image_l")
-    return Camera("pinhole", video.width, video.height, P[0], P[5], P[2], P[6])
-
-
 def kitti(out: Path) -> dict[str, float | None]:
     """ATE on 51 real frames, and the time against pycolmap's incremental mapping."""
     from scan2sim.slam.adjust import adjust
     from scan2sim.slam.mapped import Mapped
 
-    folder = DATA / "kitti_odo06_vo51"
-    truth = np.loadtxt(folder / "poses.txt").reshape(-1, 3, 4)[:, :, 3]
-    camera = kitti_camera(folder)
-    params = OdometryParams.model_validate({})
-    warm = Odometry(camera, params)  # compiled code and file caches are no part of either's time
-    for frame in list(open_video(folder / "image_l").frames())[:5]:
-        warm.add(frame.time, frame.grey)
+    sequence = Sequence.of(DATA / "kitti_odo06_vo51", "KITTI 06")
+    odometry(sequence)  # compiled code and file caches are no part of either's time
     began = time.perf_counter()
-    odometry = Odometry(camera, params, keep=True)
-    for frame in open_video(folder / "image_l").frames():
-        odometry.add(frame.time, frame.grey)
+    found, _ = odometry(sequence, keep=True)
     seconds = time.perf_counter() - began
-    alone = _ate(odometry, truth)
+    alone = sequence.ate(places(found))
     began = time.perf_counter()
-    adjust(Mapped.of(odometry, []))
+    adjust(Mapped.of(found, []))
     adjusting = time.perf_counter() - began
-    adjusted = _ate(odometry, truth)
-    theirs, their_seconds, registered = pycolmap_reference(folder, camera, out / "pycolmap", truth)
+    theirs, their_seconds, _, registered = pycolmap(sequence, out / "pycolmap")
     print(f"KITTI 06, 51 frames: odometry {100 * alone:.2f} cm in {seconds:.1f} s")
-    print(f"  with global adjustment {100 * adjusted:.2f} cm, {adjusting:.1f} s more")
+    print(f"  with global adjustment {100 * sequence.ate(places(found)):.2f} cm, {adjusting:.1f} s more")
     print(f"  pycolmap {100 * theirs:.2f} cm in {their_seconds:.1f} s, {registered} frames", flush=True)
     return {"kitti06_ate_m": alone, "pycolmap_time_ratio": their_seconds / seconds}
 
 
-def _ate(odometry: Odometry, truth: np.ndarray) -> float:
-    found = np.stack([odometry.pose_of(p)[:3, 3] for p in odometry.placed])
-    return _rms(found, truth)
+def turn(out: Path) -> dict[str, float | None]:
+    """ATE in a rendered turn, against pycolmap's; what light that flickers costs there, and on KITTI's frames."""
+    from scan2sim.data_samples.turn import generate_turn
+
+    folder = out / "turn"
+    if not (folder / "calib.txt").is_file():
+        print("rendering a turn: about ten seconds a frame", flush=True)
+        generate_turn(folder)
+    sequence = Sequence.of(folder, "turn")
+    known = [(DATA / "kitti_odo06_vo51", "KITTI 06", 0), (DATA / "kitti_odo04_f00-24", "KITTI 04", 2)]
+    sequences = [sequence, *(Sequence.of(*one) for one in known if one[0].is_dir())]
+    ratios = [_flicker(one) for one in sequences]
+    found, busy = odometry(sequence)
+    alone = sequence.ate(places(found))
+    theirs, _, their_busy, registered = pycolmap(sequence, out / "pycolmap_turn")
+    print(f"turn, 51 frames: odometry {100 * alone:.2f} cm in {busy:.1f} s of processor time")
+    print(f"  pycolmap {100 * theirs:.2f} cm in {their_busy:.1f} s, {registered} frames", flush=True)
+    return {"turn_ate_m": alone, "turn_pycolmap_ratio": alone / theirs, "gain_ate_ratio": max(ratios)}
 
 
-def _rms(found: np.ndarray, truth: np.ndarray) -> float:
-    off = umeyama(found, truth, scaled=True).apply(found) - truth
-    return float(np.sqrt((off**2).sum(axis=1).mean()))
-
-
-def pycolmap_reference(folder: Path, camera: Camera, out: Path, truth: np.ndarray) -> tuple[float, float, int]:
-    """ATE, seconds and frames of pycolmap's incremental mapping with known intrinsics, in a process of its own."""
-    shutil.rmtree(out, ignore_errors=True)
-    out.mkdir(parents=True)
-    code = f"""
-import pycolmap, json, numpy as np
-from pathlib import Path
-out, images = Path({str(out)!r}), Path({str(folder / "image_l")!r})
-reader = pycolmap.ImageReaderOptions()
-reader.camera_model = "PINHOLE"
-reader.camera_params = "{camera.fx},{camera.fy},{camera.cx + 0.5},{camera.cy + 0.5}"
-pycolmap.extract_features(out / "db.db", images, camera_mode=pycolmap.CameraMode.SINGLE, reader_options=reader)
-pycolmap.match_sequential(out / "db.db")
-options = pycolmap.IncrementalPipelineOptions()
-options.ba_refine_focal_length = options.ba_refine_principal_point = options.ba_refine_extra_params = False
-options.mapper.init_max_forward_motion = 1
-options.mapper.init_min_tri_angle = 2
-models = pycolmap.incremental_mapping(out / "db.db", images, out, options)
-best = max(models.values(), key=lambda m: m.num_reg_images())
-places = {{best.images[i].name: best.images[i].projection_center().tolist() for i in best.reg_image_ids()}}
-(out / "places.json").write_text(json.dumps(places))
-"""
-    began = time.perf_counter()
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    seconds = time.perf_counter() - began
-    if done.returncode:
-        sys.exit(f"pycolmap failed: {done.stderr[-500:]}")
-    places = json.loads((out / "places.json").read_text())
-    rows = sorted((int(Path(name).stem), place) for name, place in places.items())
-    return _rms(np.array([p for _, p in rows]), truth[[i for i, _ in rows]]), seconds, len(rows)
+def _flicker(sequence: Sequence) -> float:
+    """ATE with every other frame at .45 of its brightness, over that without: means over three numbers of features."""
+    lights: list[Callable[[int], float]] = [lit, lambda k: 0.45 if k % 2 else 1.0, lambda k: 0.35 if k >= 12 else 1.0]
+    means = [
+        np.mean([sequence.ate(places(odometry(sequence, light, count=n)[0])) for n in (640, 700, 760)])
+        for light in lights
+    ]
+    told = ", ".join(f"{100 * mean:.2f}" for mean in means)
+    print(f"{sequence.name}: {told} cm (as it is; every other frame at .45; .35 from the 13th on)", flush=True)
+    return float(means[1] / means[0])
 
 
 def pano() -> None:
@@ -220,7 +196,6 @@ def memory(out: Path, path: str, length: float) -> None:
 import sys, resource
 from pathlib import Path
 from scan2sim.pipeline.types import Camera
-from scan2sim.slam.odometry import Odometry, OdometryParams
 from scan2sim.slam.video import open_video
 video = open_video(Path(sys.argv[1]))
 odometry, offset, count = Odometry(Camera("equirectangular", 512, 256), OdometryParams(count=300)), 0.0, 0
@@ -240,7 +215,7 @@ while count < 10000:
 def main() -> None:
     """Run the parts, print tables and the result."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--parts", nargs="+", choices=PARTS, default=["drive", "kitti", "pano"])
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=["drive", "kitti", "turn", "pano"])
     parser.add_argument("--path", default="00", help="of kitti_gt_poses")
     parser.add_argument("--length", type=float, default=1500.0)
     parser.add_argument("--adam", type=float, default=40.0, help="seconds for the mission's method; 0: leave it out")
@@ -248,10 +223,15 @@ def main() -> None:
     arguments = parser.parse_args()
     out: Path = arguments.out
     out.mkdir(parents=True, exist_ok=True)
-    keys = ("drift_percent", "local400_m", "adam_drift_percent", "kitti06_ate_m", "pycolmap_time_ratio", "fps")
+    keys = (
+        "drift_percent", "local400_m", "adam_drift_percent", "kitti06_ate_m", "pycolmap_time_ratio", "fps",
+        "turn_ate_m", "turn_pycolmap_ratio", "gain_ate_ratio",
+    )  # fmt: skip
     result: dict[str, float | None] = dict.fromkeys(keys)
     if "drive" in arguments.parts:
         result |= drive(out, arguments.path, arguments.length, arguments.adam)
+    if "turn" in arguments.parts:
+        result |= turn(out)
     for part, needed in (("kitti", "kitti_odo06_vo51"), ("pano", "pano360")):
         if part not in arguments.parts:
             continue

@@ -1,6 +1,7 @@
 """Corners, followed from frame to frame by pyramidal Lucas-Kanade, each in its facet of the sphere.
 
-Needs no weights. A corner is followed there and back; one that doesn't return to where it was is lost.
+Needs no weights. A corner is followed there and back; one that doesn't return to where it was is lost. Pictures are
+brought to one exposure before (`exposure.py`).
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import numpy as np
 
 from scan2sim.pipeline.types import F32, F64, I64, U8
 from scan2sim.slam.facets import Facets
-from scan2sim.slam.trackers import Tracks
+from scan2sim.slam.trackers import Tracks, exposure
 
 WINDOW, FINE = 17, 9
 """Pixels, of Lucas-Kanade's square: a large one finds a corner again, a small one says where it is: the larger
@@ -78,7 +79,9 @@ class CornerTracker:
             guess[:, 0] = start[:, 0] + (guess[:, 0] - start[:, 0] + turn / 2) % turn - turn / 2
         away = ~(np.isfinite(guess).all(axis=1) & (guess >= 0).all(axis=1) & (guess < (width, height)).all(axis=1))
         guess[away] = start[away]
-        there, ok, _ = flow(old, new, start, guess.copy(), WINDOW, LEVELS)
+        alike = exposure.between(old, new, start, guess).alike(old, new)
+        there, ok, _ = flow(*alike, start, guess.copy(), WINDOW, LEVELS)
+        old, new = exposure.between(old, new, start, np.where(ok > 0, there, np.nan)).alike(old, new)
         there, ok2, _ = flow(old, new, start, there, FINE, 1)
         back, ok3, _ = flow(new, old, there, start.copy(), FINE, 1)
         good = ((ok > 0) & (ok2 > 0) & (ok3 > 0)).ravel() & (np.linalg.norm(back - start, axis=1) < RETURN)

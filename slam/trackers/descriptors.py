@@ -18,7 +18,7 @@ from scan2sim.pipeline.types import F32, F64, I64, U8, Bools
 from scan2sim.slam.facets import Facets
 from scan2sim.slam.features import Features, Found
 from scan2sim.slam.matchers import Matcher, check
-from scan2sim.slam.trackers import Tracker, Tracks
+from scan2sim.slam.trackers import Tracker, Tracks, exposure
 from scan2sim.slam.trackers.corners import FINE, RETURN, SPACING, WINDOW, CornerTracker, flow
 
 STRAY = 4.0
@@ -172,6 +172,7 @@ class DescriptorTracker(CornerTracker):
         if not good.any():
             return guess, good
         start[~good] = 0
+        old, new = exposure.between(old, new, start, guess).alike(old, new)
         there, ok, _ = flow(old, new, start, guess.copy(), FINE, 1)
         back, ok2, _ = flow(new, old, there, start.copy(), FINE, 1)
         good &= ((ok > 0) & (ok2 > 0)).ravel() & (np.linalg.norm(back - start, axis=1) < RETURN)

@@ -9,6 +9,7 @@ from scan2sim.pipeline.cameras import pixel_rays, project
 from scan2sim.pipeline.types import F32, F64, U8, Camera
 from scan2sim.slam.facets import Facets
 from scan2sim.slam.geometry import exp_so3, relative_pose, rigid
+from scan2sim.slam.trackers import exposure
 from scan2sim.slam.trackers.corners import CornerTracker
 
 CAMERA = Camera("equirectangular", 768, 384)
@@ -75,6 +76,26 @@ def test_corners_are_followed_across_seam_and_poles(axis: list[int]) -> None:
     else:
         polar = np.abs(tracker.tracks.bearing[:, 1]) > 0.95
         assert polar.sum() > 5 and np.median(off[polar]) < 0.25
+
+
+@pytest.mark.parametrize(("gain", "offset"), [(0.45, 0), (0.6, 30), (1.3, -20)])
+def test_a_change_of_exposure_is_told_and_loses_no_corner(gain: float, offset: float) -> None:
+    world, facets = sphere(), Facets(CAMERA)
+    pictures = [frame(world, exp_so3([0, 0.04 * k, 0])) // 2 + 60 for k in range(2)]
+    lit = np.clip(gain * pictures[1].astype(np.float64) + offset, 0, 255).astype(np.uint8)
+    followed = []
+    for second in (pictures[1], lit):
+        tracker = CornerTracker(facets, None, 500)
+        tracker.track(pictures[0])
+        tracker.refill()
+        there = facets.pixels(0, tracker.tracks.bearing)
+        now = facets.pixels(0, tracker.tracks.bearing @ exp_so3([0, 0.04, 0]))
+        first = tracker.pictures[0]
+        tracker.track(second)
+        followed.append(len(tracker.tracks))
+    told = exposure.between(first, tracker.pictures[0], there, now)
+    assert told.gain == pytest.approx(gain, rel=0.03) and told.offset == pytest.approx(offset, abs=4)
+    assert followed[1] > 0.95 * followed[0]
 
 
 def test_nothing_is_found_or_followed_on_the_car() -> None:

@@ -47,6 +47,20 @@ def test_a_car_that_stands_before_it_drives_begins_where_it_stood(corridor: Driv
     assert off.max() < 0.1  # of 21 m
 
 
+def test_light_that_flickers_or_falls_costs_at_most_a_fifth(corridor: Drive) -> None:
+    every = np.ones(len(corridor.greys))
+    flickers, falls = every.copy(), every.copy()
+    flickers[2::2], falls[10:] = 0.45, 0.35
+    off = []
+    for light in (every, flickers, falls):
+        odometry = Odometry(corridor.camera, OdometryParams(count=400))
+        for frame, grey in enumerate(corridor.greys * light[:, None, None]):
+            odometry.add(frame / 10, grey.astype(np.uint8))
+        off.append(error(positions(odometry), corridor.truth.poses))
+        assert odometry.map.part == 0 and not any(p.unsure for p in odometry.placed)
+    assert max(off) < 1.2 * off[0]
+
+
 def test_a_perspective_cameras_narrow_view_is_enough() -> None:
     times, poses = drive(10)
 
