@@ -162,7 +162,33 @@ def tiles3d(folder: Path, scene: Scene) -> Iterator[Shown]:
             yield Shown(mesh.metadata["class"], world[mesh.faces], mesh.visual.uv[mesh.faces], picture)
 
 
+TAGS = {"Terrain": 2, "Building": 6, "TrafficSign": 64}
+
+
+def carla(folder: Path, scene: Scene) -> Iterator[Shown]:
+    about = json.loads((folder / "carla" / f"{scene.name}.json").read_text())
+    (ground,) = about["maps"]
+    files = dict.fromkeys(ground.get("tiles", [ground.get("source")]), "")
+    for file, tag in (files | {prop["source"]: prop["tag"] for prop in about["props"]}).items():
+        for name, corners, uv, picture in fbx(folder / "carla" / file):
+            kind = tag or name.removeprefix(f"{scene.name}_").split("_")[0]
+            yield Shown(TAGS[kind], corners, uv, image(picture))
+
+
+def fbx(path: Path) -> Iterator[tuple[str, np.ndarray, np.ndarray, Path]]:
+    """Name, corners (metres), texture coordinates and picture of each mesh, by assimp."""
+    assimp = pytest.importorskip("assimp_py", reason="assimp-py is not installed")
+    read = assimp.import_file(str(path), assimp.Process_Triangulate)
+    for mesh in read.meshes:
+        index = np.asarray(mesh.indices).reshape(-1, 3)
+        corners = np.asarray(mesh.vertices, float).reshape(-1, 3)[index] / 100
+        uv = np.asarray(mesh.texcoords[0], float).reshape(len(corners) * 3, -1)[index][..., :2]
+        ((picture,),) = read.materials[mesh.material_index]["TEXTURES"].values()
+        yield mesh.name, corners, uv, path.parent / picture
+
+
 Reader = Callable[[Path, Scene], Iterator[Shown]]
 READERS: dict[str, Reader] = {
     "gazebo": gazebo, "glb": glb, "usd": usd, "mujoco": mujoco, "urdf": urdf, "tiles3d": tiles3d,
+    "carla": carla,
 }  # fmt: skip

@@ -19,7 +19,7 @@ from scan2sim.pipeline.io.scenes import SceneParams
 from scan2sim.pipeline.step import silent
 from scan2sim.pipeline.types import Frame
 from tests.pipeline import made_up
-from tests.pipeline.io.scene_readers import READERS, Shown, image
+from tests.pipeline.io.scene_readers import READERS, Shown, fbx, image
 
 WITHOUT_MESHES = {"opendrive"}
 each = pytest.mark.parametrize("name", READERS)
@@ -157,3 +157,30 @@ def test_boxes_of_levels_hold_what_they_show_and_finer_ones(tmp_path: Path) -> N
 
     apart = np.ptp(check(root), axis=0)
     assert apart[0] == pytest.approx(45, abs=0.1)  # two tiles of 20 m, 25 m apart
+
+
+def test_carla_tells_road_from_terrain_and_all_else_by_its_tag(tmp_path: Path) -> None:
+    town = made_up.scene(tmp_path, tiles=1)
+    solid = town.tiles[0].solid()
+    assert solid.classification is not None
+    east = (solid.classification == CODE["terrain"]) & (solid.corners.mean(axis=1)[:, 0] > 0)
+    codes = np.where(east, CODE["road"], solid.classification).astype(np.uint8)
+    replace(solid, classification=codes).save(town.tiles[0].folder / "collision.npz")
+    written(town, "carla", tmp_path / "out")
+    meshes = {name: corners for name, corners, *_ in fbx(tmp_path / "out" / "carla" / "town" / "town.fbx")}
+    assert meshes.keys() == {"town_Road_Road_tile0_1", "town_Terrain_tile0_0"}  # a page for each half
+    assert meshes["town_Road_Road_tile0_1"][..., 0].min() > -1e-6
+    about = json.loads((tmp_path / "out" / "carla" / "town.json").read_text())
+    assert {prop["name"]: prop["tag"] for prop in about["props"]} == {
+        "town_tile0_building": "Building", "town_tile0_building_road_sign": "TrafficSign",
+    }  # fmt: skip
+
+
+def test_ground_too_long_for_a_carla_map_comes_in_squares_from_the_north_west(tmp_path: Path) -> None:
+    town = made_up.scene(tmp_path, apart=3000.0)
+    written(town, "carla", tmp_path / "out")
+    (about,) = json.loads((tmp_path / "out" / "carla" / "town.json").read_text())["maps"]
+    assert about["tiles"] == ["./town/town_Tile_0_0.fbx", "./town/town_Tile_1_0.fbx"]
+    (name, corners, _, picture), *_ = fbx(tmp_path / "out" / "carla" / "town" / "town_Tile_1_0.fbx")
+    assert name.startswith("town_Terrain_tile1") and corners[..., 0].min() == pytest.approx(2990, abs=0.01)
+    assert picture.parent.name == "town_Tile_1_0.fbm" and picture.is_file()
