@@ -3,8 +3,9 @@
 `make gate`, or `python -m bench.gate [--out bench-out/gate] [--worlds demo raw0009 survey] [--consumers gazebo ...]`.
 The demo tile, a real street and a world of ten tiles are made by the defaults (the ten tiles coarser) where they aren't
 there yet, exported in the format that a consumer reads, and read, driven on or looked at by it (`bench/consumers`, a
-file each). Beside that: steps of the ground at the tiles' borders, labels against the photos' true ones, and what
-loading costs Gazebo (`bench/gate_load.py`). Consumers and worlds that aren't there are skipped, and said.
+file each). Beside that: steps of the ground at the tiles' borders, labels against the photos' true ones, roads against
+the generated streets', surveyed points through all formats, and what loading costs Gazebo (`bench/gate_*.py`).
+Consumers and worlds that aren't there are skipped, and said.
 
 Ends with `RESULT {json}`: `consumers` that ran without a fault on every world, `skipped`, `faults`, and figures, the
 worst of all worlds. Exit status 1 where there is a fault.
@@ -22,16 +23,22 @@ from typing import Any
 from bench import consumers
 from bench.consumers import Fault
 from bench.gate_borders import steps
+from bench.gate_georeference import georeference
 from bench.gate_labels import agreement
 from bench.gate_load import load
 from bench.gate_places import find
 from bench.gate_worlds import ROOT, WORLDS, Absent, Subject, scan2sim
+from bench.roads import compared, summary
 from scan2sim.pipeline import backends
 from scan2sim.pipeline.io import robots
 from scan2sim.pipeline.io.scene import read_scene
 
-WORST = ("drop_max_m", "border_step_max_m")
+WORST = (
+    "drop_max_m", "border_step_max_m", "robot_off_way_max_m", "picture_off_px", "road_centre_p95_m", "lane_edge_p95_m",
+)  # fmt: skip
 """Figures of which the largest counts."""
+LEFT = "robot_left_road"
+"""Looks at robots that were beside the road, all together."""
 
 
 def main() -> None:
@@ -60,6 +67,7 @@ def main() -> None:
         _through(subject, able, result)
     if "gazebo" in able and not arguments.no_load:
         result |= load(arguments.out / "load")
+    result |= georeference(arguments.out / "georeference")
     faulty = {fault.split(" ")[0] for fault in result["faults"]}
     print("RESULT", json.dumps({"consumers": len(set(able) - faulty), **result}))
     sys.exit(bool(result["faults"]))
@@ -79,20 +87,25 @@ def _through(subject: Subject, able: dict[str, Any], result: dict[str, Any]) -> 
         try:
             _tell(subject, name, module.check(subject.run.parent / "exports" / module.FORMAT, places), result)
         except Fault as why:
+            _tell(subject, name, why.figures, result)
             print(f"{subject.name:8} {name:10} FAULT: {why}", flush=True)
             result["faults"].append(f"{name} on {subject.name}: {why}")
     if len(scene.tiles) > 1:
         _tell(subject, "borders", steps(scene, subject.tiles), result)
     if subject.street is not None:
         _tell(subject, "labels", agreement(scene, subject.street), result)
+    if subject.layout is not None:
+        _tell(subject, "roads", summary(compared(subject.run / "world", subject.layout)), result)
 
 
 def _tell(subject: Subject, what: str, figures: dict[str, Any], result: dict[str, Any]) -> None:
     """Print figures of a world, and keep those of the gate."""
     print(f"{subject.name:8} {what:10} {json.dumps(figures)}", flush=True)
     for name in WORST:
-        if name in figures:
+        if figures.get(name) is not None:
             result[name] = max(result.get(name, 0.0), figures[name])
+    if LEFT in figures:
+        result[LEFT] = result.get(LEFT, 0) + figures[LEFT]
     if "labels_agree" in figures:
         result["labels_agree"] = figures["labels_agree"]
 

@@ -73,7 +73,7 @@ def drive(engine: Engine, places: Places) -> dict[str, Any]:
         "robot_left_road": left,
     }
     if driven < far or left:
-        raise Fault(f"the robot was to drive {far:.1f} m along the road: {figures}")
+        raise Fault(f"the robot was to drive {far:.1f} m along the road", figures)
     return figures
 
 

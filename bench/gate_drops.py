@@ -44,5 +44,5 @@ def told(off: F64) -> dict[str, Any]:
         "fell_through": int(np.sum(off < -THROUGH)),
     }
     if figures["fell_through"] or figures["drop_max_m"] > WITHIN or np.isnan(off).any():
-        raise Fault(f"bodies don't come to rest on the cloud's surface: {figures}, {np.round(off, 3).tolist()}")
+        raise Fault(f"bodies don't come to rest on the cloud's surface: {np.round(off, 3).tolist()}", figures)
     return figures

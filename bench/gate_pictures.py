@@ -89,7 +89,7 @@ def compare(export: Path, name: str, seen: Photo, taken: U8, shown: Any) -> dict
         "picture_off_px": round(_off(seen.rgb, taken), 2),
     }
     if not np.any(shown) or figures["picture_off_px"] > OFF * seen.camera.width:
-        raise Fault(f"its picture isn't what the photo shows: {figures}")
+        raise Fault("its picture isn't what the photo shows", figures)
     return figures
 
 

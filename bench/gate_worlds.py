@@ -9,12 +9,15 @@ from pathlib import Path
 
 from bench.measure import measure
 from bench.street import STREETS
+from scan2sim.data_samples import make_tile
+from scan2sim.data_samples.layout import Layout, lay_out
 from scan2sim.data_samples.photos import Effects
 from scan2sim.data_samples.street import generate
 from scan2sim.pipeline.corridor import CutParams, cut_survey
 
 ROOT = Path(__file__).resolve().parent.parent
-STREET = {"length": 100.0, "points": 8e5, "photos": 40, "seed": 3, "photo_width": 640}
+LENGTH, SEED = 100.0, 3
+STREET = {"length": LENGTH, "points": 8e5, "photos": 40, "seed": SEED, "photo_width": 640}
 CUT = {"length": 10.0, "buffer": 3.0, "reach": 20.0, "photo_reach": 8.0}
 COARSE = ("voxel.size=0.15", "unwrap.texel=0.05", "visibility.pixels=200000", "pictures.width=320")
 """Settings of the ten tiles, so that they take a quarter of an hour and not three."""
@@ -29,12 +32,14 @@ class Subject:
         run: folder that `run` or `survey` was given as its output.
         tiles: folders of its tiles, by the names' order.
         street: the tile that it was generated as, with the truth of its photos, where there is one.
+        layout: of the generated street, whose lines are known.
     """
 
     name: str
     run: Path
     tiles: tuple[Path, ...]
     street: Path | None = None
+    layout: Layout | None = None
 
 
 class Absent(Exception):
@@ -45,7 +50,7 @@ def demo(folder: Path) -> Subject:
     """The committed tile."""
     tile = ROOT / "data_samples" / "tile"
     scan2sim("run", tile, "--out", folder / "run", "--hold-out", 8, "--set", "segment.overwrite=true")
-    return Subject("demo", folder / "run", (tile,))
+    return Subject("demo", folder / "run", (tile,), layout=lay_out(make_tile.LENGTH, make_tile.SEED))
 
 
 def raw0009(folder: Path) -> Subject:
@@ -72,7 +77,8 @@ def survey(folder: Path) -> Subject:
         cut_survey(street, tiles, CutParams.model_validate(CUT))
     options = [part for value in COARSE for part in ("--set", value)]
     scan2sim("survey", tiles, "--out", folder / "run", "--jobs", 2, "--cores", 1, *options)
-    return Subject("survey", folder / "run", tuple(sorted(p.parent for p in tiles.glob("*/tile.toml"))), street)
+    parts = tuple(sorted(p.parent for p in tiles.glob("*/tile.toml")))
+    return Subject("survey", folder / "run", parts, street, lay_out(LENGTH, SEED))
 
 
 WORLDS: dict[str, Callable[[Path], Subject]] = {"demo": demo, "raw0009": raw0009, "survey": survey}

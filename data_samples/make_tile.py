@@ -9,15 +9,18 @@ from scan2sim.data_samples import SMALL
 from scan2sim.data_samples.photos import Effects
 from scan2sim.data_samples.street import generate
 
+LENGTH, SEED = 26.0, 5
+"""Of its street."""
+
 
 def make(out: Path = SMALL) -> Path:
     """Write the tile that `data_samples/README.md` describes; returns its `tile.toml`."""
     return generate(
         out,
-        length=26.0,
+        length=LENGTH,
         points=4.2e5,
         photos=10,
-        seed=5,
+        seed=SEED,
         photo_width=800,
         truth_density=30.0,
         cloud_scale=0.005,

@@ -6,6 +6,7 @@ Each module has `FORMAT`, the format that it reads; `missing()`, why it can't ru
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -13,7 +14,16 @@ from bench.gate_places import Places
 
 
 class Fault(Exception):
-    """A consumer refuses an export, or what happens in it is wrong; the text says which."""
+    """A consumer refuses an export, or what happens in it is wrong.
+
+    Args:
+        text: what.
+        figures: that were measured all the same.
+    """
+
+    def __init__(self, text: str, figures: Mapping[str, Any] | None = None) -> None:
+        super().__init__(text)
+        self.figures = dict(figures or {})
 
 
 class Consumer(Protocol):

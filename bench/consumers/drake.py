@@ -16,7 +16,7 @@ from bench.consumers import Fault
 from bench.gate_places import Places
 
 FORMAT = "gazebo"
-GAZEBOS = ("plugin", "cast_shadows")
+GAZEBOS = ("plugin", "sensor", "cast_shadows")
 
 
 def missing() -> str:

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from scan2sim.pipeline.io.scene import Scene
+from tests.pipeline import made_up
 
 
 @dataclass(frozen=True)
@@ -192,3 +193,13 @@ READERS: dict[str, Reader] = {
     "gazebo": gazebo, "glb": glb, "usd": usd, "mujoco": mujoco, "urdf": urdf, "tiles3d": tiles3d,
     "carla": carla,
 }  # fmt: skip
+
+
+def surveyed_off(folder: Path, scene: Scene, name: str) -> float:
+    """Metres between a corner of the made-up scene's last house, as surveyed, and where a format's reader finds it."""
+    about = json.loads((folder / "metadata.json").read_text())
+    x, y = made_up.HOUSE
+    surveyed = scene.tiles[-1].frame.to_crs((x, y, 4.5))  # of the roof
+    shown = np.concatenate([one.corners.reshape(-1, 3) for one in READERS[name](folder, scene)])
+    found = (shown + about["world_origin_m"]) / about["unit_m"]
+    return float(np.linalg.norm(found - surveyed, axis=1).min())

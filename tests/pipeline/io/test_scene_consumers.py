@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import subprocess
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bench.consumers import omniverse, usd
 from scan2sim.pipeline.io import crs, scenes
 from scan2sim.pipeline.io.scene import Scene
 from scan2sim.pipeline.io.scenes import SceneParams
@@ -111,12 +111,11 @@ def test_a_ball_rests_on_pybullets_ground_and_its_camera_tells_classes(town: Sce
 
 def test_usd_has_no_fault(town: Scene, tmp_path: Path) -> None:
     module("pxr")
-    from pxr import Usd, UsdGeom, UsdPhysics, UsdValidation
+    from pxr import Usd, UsdGeom, UsdPhysics
 
     path = str(export(town, "usd", tmp_path) / "town.usdc")
-    every = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
-    faults = UsdValidation.ValidationContext(every).Validate(Usd.Stage.Open(path))
-    assert len(every) > 20 and not [fault.GetErrorAsString() for fault in faults]
+    count, faults = usd.faults(Path(path))
+    assert count > 20 and not faults
     bare = Usd.Stage.Open(path, Usd.Stage.LoadNone)
     assert not [prim for prim in bare.Traverse() if prim.IsA(UsdGeom.Mesh)]  # tiles load one by one
     bare.Load("/World/tile1")
@@ -151,13 +150,10 @@ def test_usd_tiles_have_their_coarser_levels_as_variants(town: Scene, tmp_path: 
 
 
 def test_omniverses_validator_finds_nothing_that_fails(town: Scene, tmp_path: Path) -> None:
-    module("pxr")
-    if importlib.util.find_spec("omni") is None:
-        pytest.skip("omniverse-asset-validator is not installed")
-    from omni.asset_validator import ValidationEngine
-
-    issues = ValidationEngine().validate(str(export(town, "usd", tmp_path) / "town.usdc")).issues()
-    assert not [str(issue.message) for issue in issues if issue.severity.name in ("ERROR", "FAILURE")]
+    if why := omniverse.missing():
+        pytest.skip(why)
+    found = omniverse.found(export(town, "usd", tmp_path) / "town.usdc")
+    assert not [text for severity, text in found if severity in omniverse.FAILED]
 
 
 VALIDATE = """

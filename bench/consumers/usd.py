@@ -1,0 +1,35 @@
+"""OpenUSD's own validators, all of them."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+from typing import Any
+
+from bench.consumers import Fault
+from bench.gate_places import Places
+
+FORMAT = "usd"
+
+
+def missing() -> str:
+    """Why it can't run here, or an empty text."""
+    return "" if importlib.util.find_spec("pxr") else "OpenUSD isn't installed (pip install usd-core)"
+
+
+def check(export: Path, places: Places) -> dict[str, Any]:
+    """Validate the stage with all its payloads."""
+    (stage,) = export.glob("*.usdc")
+    count, found = faults(stage)
+    if found:
+        raise Fault(f"{len(found)}, the first: {found[0]}")
+    return {"validators": count}
+
+
+def faults(path: Path) -> tuple[int, list[str]]:
+    """How many validators there are, and what they find."""
+    from pxr import Usd, UsdValidation
+
+    every = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    found = UsdValidation.ValidationContext(every).Validate(Usd.Stage.Open(str(path)))
+    return len(every), [fault.GetErrorAsString() for fault in found]

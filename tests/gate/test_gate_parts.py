@@ -1,0 +1,85 @@
+"""The gate's own measures: robots that leave the road, balls that lie too low, pictures from elsewhere are faults."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bench import gate_drops, gate_pictures
+from bench.consumers import Fault
+from bench.gate_drive import Pose, drive
+from bench.gate_pictures import Photo
+from bench.gate_places import Places
+from scan2sim.pipeline.robot import ROBOT
+from scan2sim.pipeline.types import Camera
+
+NOWHERE = np.zeros((0, 3))
+
+
+class Made:
+    """A robot that goes where its wheels roll, from the origin along x."""
+
+    def __init__(self, slip: float = 1.0) -> None:
+        self.x, self.y, self.heading, self.slip = 0.0, 0.3, 0.0, slip
+
+    def pose(self) -> Pose:
+        c, s = np.cos(self.heading), np.sin(self.heading)
+        return Pose(np.array([self.x, self.y, 0.0]), np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]]))
+
+    def turn(self, left: float, right: float, seconds: float) -> None:
+        speed, turn = (left + right) / 2 * ROBOT.wheel_radius, (right - left) * ROBOT.wheel_radius / ROBOT.track
+        self.heading += turn * seconds
+        self.x += self.slip * speed * np.cos(self.heading) * seconds
+        self.y += self.slip * speed * np.sin(self.heading) * seconds
+
+
+def street(bend: float = 0.0, half: float = 2.0) -> Places:
+    """A road along x, and a way on it that bends to the left."""
+    x, y = np.meshgrid(np.arange(-2, 30, 0.1), np.arange(-6, 6, 0.1))
+    ground = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+    along = np.arange(0.0, 28.0, 0.5)
+    way = np.column_stack([along, bend * along**2, 0 * along])
+    return Places(NOWHERE, NOWHERE, ground, np.abs(ground[:, 1]) < half, (way,))
+
+
+def test_it_drives_20_m_and_comes_back_to_its_way() -> None:
+    figures = drive(Made(), street(0.003))
+    assert figures["robot_driven_m"] == pytest.approx(20, abs=0.1) and figures["robot_left_road"] == 0
+    assert figures["robot_off_way_max_m"] < 0.5 and figures["robot_above_max_m"] < 0.01
+
+
+def test_a_robot_that_leaves_the_road_is_a_fault() -> None:
+    with pytest.raises(Fault) as caught:
+        drive(Made(), street(0.01))
+    assert caught.value.figures["robot_left_road"] > 10
+
+
+def test_a_robot_that_gets_stuck_is_a_fault() -> None:
+    with pytest.raises(Fault, match="was to drive 20"):
+        drive(Made(slip=0.1), street())
+
+
+def test_a_ball_that_lies_3_cm_too_low_is_a_fault() -> None:
+    places = street()
+    lying = np.array([[1.0, 0.0, gate_drops.BALL + 0.005], [2.0, 0.0, gate_drops.BALL - 0.005]])
+    assert gate_drops.told(gate_drops.gaps(lying, places))["drop_max_m"] == pytest.approx(0.005)
+    for z in (gate_drops.BALL - 0.03, -50.0):
+        with pytest.raises(Fault) as caught:
+            gate_drops.told(gate_drops.gaps(np.array([[1.0, 0.0, z]]), places))
+        assert caught.value.figures["fell_through"] == (z < -1)
+
+
+def test_a_picture_from_beside_the_photos_place_is_a_fault(tmp_path: Path) -> None:
+    scene = np.random.default_rng(0).integers(0, 255, (60, 80, 3)).astype(np.uint8).repeat(8, 0).repeat(8, 1)
+    seen = Photo(scene[:, 20:-20], Camera("pinhole", 600, 480, 300, 300, 299.5, 239.5), np.eye(4))
+    export = tmp_path / "exports" / "made"
+    export.mkdir(parents=True)
+    shown = np.ones((480, 600), bool)
+    good = gate_pictures.compare(export, "made", seen, seen.rgb // 2, shown)
+    assert good["picture_off_px"] < 0.1 and good["picture_ssim"] > 0.99  # half as bright, in the same place
+    assert (tmp_path / "pictures" / "made.png").is_file()
+    with pytest.raises(Fault) as caught:
+        gate_pictures.compare(export, "made", seen, scene[:, 40:], shown)
+    assert caught.value.figures["picture_off_px"] == pytest.approx(20, abs=1)
