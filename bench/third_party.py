@@ -68,9 +68,9 @@ PAGE = """# Third-party licences
 
 Made by `python -m bench.third_party > docs/third-party.md`; don't edit it. Versions are those of `constraints.txt`, on
 Linux x86-64. scan2sim itself is under the [Apache License 2.0](../LICENSE). Its wheel holds no package of others but
-three.js (MIT, `flows/reports/pages/three-LICENSE.txt`), which reports show worlds by, and uPlot 1.6.32 (MIT,
-`services/pages/uplot-LICENSE.txt`), which live pages draw with. What follows is installed beside it, by pip, from each
-project's own wheels.
+three.js (MIT, `flows/reports/pages/three-LICENSE.txt`), which reports and `scan2sim view` show worlds by, and uPlot
+1.6.32 (MIT, `services/pages/uplot-LICENSE.txt`), which live pages draw with. What follows is installed beside it, by
+pip, from each project's own wheels.
 
 This page tells what packages say of themselves; it is no legal advice.
 

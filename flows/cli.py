@@ -23,6 +23,7 @@ COMMANDS = {
     "tile": ("cut", "Cut a long corridor into tiles that overlap: a survey."),
     "survey": ("survey", "Make the worlds of all tiles of a survey, which meet, and one of them all."),
     "export": ("export", "Write a finished world in other formats, for other simulators."),
+    "view": ("view", "Open a finished world in the browser, or render a flight through it."),
     "verify": ("verify", "Read all that was made, and say what is damaged; the next run makes that anew."),
     "inspect": ("inspect", "Show one screen of facts."),
     "sample": ("sample", "Generate a synthetic street with its ground truth."),

@@ -10,15 +10,16 @@ import numpy as np
 from pydantic import Field
 
 from scan2sim.pipeline import backends
+from scan2sim.pipeline.classes import name_of
 from scan2sim.pipeline.io import image, provenance
 from scan2sim.pipeline.io.gltf import geometry, metadata, textures
 from scan2sim.pipeline.io.gltf.builder import Array, Builder
-from scan2sim.pipeline.io.gltf.geometry import Codec, Part
+from scan2sim.pipeline.io.gltf.geometry import Codec, Part, plain
 from scan2sim.pipeline.io.gltf.textures import Texture
 from scan2sim.pipeline.io.scene import Surface, Vector
 from scan2sim.pipeline.io.textured import unique_uv
 from scan2sim.pipeline.step import Params
-from scan2sim.pipeline.types import U8, View
+from scan2sim.pipeline.types import U8, Mesh, View
 
 UNLIT = "KHR_materials_unlit"
 LINEAR, MIPMAPS, CLAMP = 9729, 9987, 33071
@@ -105,6 +106,21 @@ def write(
             }
             node = {"name": mesh["name"], "mesh": builder.add("meshes", mesh)}
             root["children"].append(builder.add("nodes", node))
+    builder.save(path)
+
+
+def write_solid(path: Path, mesh: Mesh) -> None:
+    """Write what bodies collide with, a mesh a class, without any material; local metres, y up, as `write`."""
+    builder = Builder()
+    codes = np.zeros(len(mesh), np.uint8) if mesh.classification is None else mesh.classification
+    root: dict[str, Any] = {"name": path.stem, "children": []}
+    builder.add("nodes", root)
+    for code in np.unique(codes).tolist():
+        part = mesh.keep(codes == code)
+        primitive = plain.primitive(builder, Part(part.faces.astype(np.int64), {"POSITION": _y_up(part.vertices)}))
+        entry = {"name": name_of(code), "primitives": [primitive], "extras": {"class": name_of(code), "las_code": code}}
+        node = {"name": name_of(code), "mesh": builder.add("meshes", entry)}
+        root["children"].append(builder.add("nodes", node))
     builder.save(path)
 
 

@@ -12,13 +12,13 @@ from typing import Literal
 from scan2sim.pipeline.errors import InputError, SettingError, from_os_error
 from scan2sim.pipeline.io import files
 
-MARK = {"tile": "tile.toml", "survey": "survey.toml", "world": "metadata.json"}
+MARK = {"tile": "tile.toml", "survey": "survey.toml", "world": "metadata.json", "page": "view.js"}
 """Of what is made, the file by which it is known."""
 
 
 @contextmanager
 def tile_folder(
-    out: Path, overwrite: bool = False, kind: Literal["tile", "survey", "world"] = "tile"
+    out: Path, overwrite: bool = False, kind: Literal["tile", "survey", "world", "page"] = "tile"
 ) -> Iterator[Path]:
     """A temporary folder beside `out` that takes its place when the block ends well, and is removed otherwise.
 

@@ -12,6 +12,7 @@ from scan2sim.flows.cli import COMMANDS, app, loaded
 from scan2sim.flows.commands.numbers import Numbers
 from scan2sim.flows.recipes.settings import Settings
 from scan2sim.flows.recipes.steps import STEPS
+from scan2sim.flows.reports.view import ViewParams
 from scan2sim.pipeline.corridor import CutParams
 from scan2sim.pipeline.errors import SettingError
 from scan2sim.pipeline.io.scenes import SceneParams
@@ -144,12 +145,13 @@ def test_every_number_that_a_command_takes_has_a_range() -> None:
     found = [loaded(name) for name in COMMANDS]
     single = [one for some in found for one in getattr(some, "commands", {"": some}).values()]
     hints = [get_type_hints(one.callback) for one in single]
+    shown = (SceneParams, ViewParams)
     boxes = (detect.Params, movement.Params, classify.Params, segment.Params, ServeParams, NodeParams, CameraParams)
     bus = (QueryParams, TopicParams, TalkerParams, DatasetParams, TrafficParams, WorkParams, ScaleParams, PageParams)
     numbers = {name for of in hints for name, kind in of.items() if {int, float} & {kind, *get_args(kind)}}
     assert len(numbers) > 15 and numbers <= {
         name
-        for model in (Numbers, Filmed, CutParams, SceneParams, SweepsParams, MeasureParams, ChoiceParams, *bus, *boxes)
+        for model in (Numbers, Filmed, CutParams, SweepsParams, MeasureParams, ChoiceParams, *shown, *bus, *boxes)
         for name in model.model_fields
     }
 

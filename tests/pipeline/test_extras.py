@@ -89,7 +89,7 @@ USES = {
     "safetensors": ["segment train .", "slam FRAMES --features superpoint", "run TILE --set label.network=segformer"],
     "transformers": ["run TILE --set label.network=segformer", "segment tile TILE --set label.network=segformer"],
     "onnx": ["segment train ."],
-    "av": ["slam video.mp4", "slam FRAMES --view", "slam FRAMES --gps video.mp4"],
+    "av": ["slam video.mp4", "slam FRAMES --view", "slam FRAMES --gps video.mp4", "view world --film flight.mp4"],
     "matplotlib": ["slam evaluate truth.csv truth.csv", "slam study FRAMES --truth truth.csv"],
     "pycolmap": ["slam FRAMES --adjust"],
     "fast_simplification": ["run TILE --set decimate.backend=fast_simplification"],

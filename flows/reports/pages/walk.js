@@ -1,5 +1,6 @@
 // The world in the page: turned from above, walked through at eye height. Classic scripts, as a page that is opened by
 // a double click (file://) may load no modules and fetch nothing: world.js calls scan2simWorld with the GLB as base64.
+// Other pages make their own views of it: window.scan2sim.
 "use strict";
 
 (() => {
@@ -26,11 +27,12 @@
     }
   }
 
-  // Meshes of a GLB, z-up as in the simulator, in the photos' own light.
-  async function meshes(base64) {
+  // Meshes of a GLB, z-up as in the simulator, in the photos' own light; moved by an offset, metres.
+  async function meshes(base64, offset = [0, 0, 0]) {
     const bytes = Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0));
     const { scene } = await new THREE.GLTFLoader().parseAsync(bytes.buffer, "");
     scene.rotation.x = Math.PI / 2;
+    scene.position.set(...offset);
     scene.updateMatrixWorld();
     const found = [];
     scene.traverse((node) => {
@@ -40,6 +42,7 @@
       const material = new THREE.MeshBasicMaterial({ map, side: THREE.DoubleSide });
       const mesh = new THREE.Mesh(node.geometry.applyMatrix4(node.matrixWorld), material);
       mesh.name = node.name;
+      mesh.userData = node.userData;
       found.push(mesh);
     });
     return found;
@@ -96,14 +99,15 @@
       box.prepend(this.canvas);
       this.scene = new THREE.Scene();
       this.scene.background = new THREE.Color(SKY);
-      this.scene.add(...all);
-      this.ground = new Ground(all);
+      this.grounds = new Map();
+      if (all.length) this.put("world", all);
       this.camera = new THREE.PerspectiveCamera(65, 1, 0.05, 5000);
       this.camera.up.set(0, 0, 1);
       this.orbit = new THREE.OrbitControls(this.camera, this.canvas);
       this.orbit.maxPolarAngle = Math.PI / 2 - 0.02;
       this.orbit.addEventListener("change", () => (this.stale = true));
       this.held = new Set();
+      this.output = box.querySelector("output") ?? document.querySelector("output");
       this.listen();
       new ResizeObserver(() => this.fit()).observe(box);
       this.fit();
@@ -116,6 +120,20 @@
         requestAnimationFrame(frame);
       };
       requestAnimationFrame(frame);
+    }
+
+    // Show meshes, and walk on them.
+    put(name, found) {
+      this.scene.add(...found);
+      this.grounds.set(name, new Ground(found));
+      this.stale = true;
+    }
+
+    // The highest ground at a place that isn't above a height, else the lowest; null where there is none.
+    height(x, y, top) {
+      const found = [...this.grounds.values()].map((ground) => ground.height(x, y, top)).filter((z) => z !== null);
+      const below = found.filter((z) => z <= top);
+      return found.length ? (below.length ? Math.max(...below) : Math.min(...found)) : null;
     }
 
     fit() {
@@ -135,10 +153,25 @@
       this.camera.position.copy(eye);
       this.camera.lookAt(target);
       if (!this.walking) this.orbit.target.copy(target);
-      const ahead = target.sub(eye).normalize();
+      this.face();
+    }
+
+    // Walk on in the direction that is looked at.
+    face() {
+      const ahead = this.camera.getWorldDirection(new THREE.Vector3());
       this.turn = Math.atan2(ahead.y, ahead.x);
       this.tilt = Math.asin(ahead.z);
       this.stale = true;
+    }
+
+    // Buttons within an element that walk while they are held.
+    pads(within) {
+      within.querySelectorAll("[data-key]").forEach((button) => {
+        for (const kind of ["pointerdown", "pointerup", "pointerleave", "pointercancel"]) {
+          button.addEventListener(kind, () => this.hold(button.dataset.key, kind === "pointerdown"));
+        }
+        button.addEventListener("contextmenu", (event) => event.preventDefault());
+      });
     }
 
     listen() {
@@ -190,7 +223,7 @@
       const eye = this.camera.position, [cos, sin] = [Math.cos(this.turn), Math.sin(this.turn)];
       eye.x += way * (ahead * cos + right * sin);
       eye.y += way * (ahead * sin - right * cos);
-      const ground = this.ground.height(eye.x, eye.y, eye.z - EYE + STEP);
+      const ground = this.height(eye.x, eye.y, eye.z - EYE + STEP);
       if (ground !== null) eye.z += (ground + EYE - eye.z) * Math.min(1, 12 * seconds);
       this.stale = true;
     }
@@ -198,7 +231,7 @@
     draw() {
       this.stale = false;
       this.renderer.render(this.scene, this.camera);
-      this.box.querySelector("output").value = this.camera.position.toArray().map((v) => v.toFixed(2)).join("  ");
+      this.output.value = this.camera.position.toArray().map((v) => v.toFixed(2)).join("  ");
     }
   }
 
@@ -214,12 +247,7 @@
       });
       const view = new View(box, await meshes(base64), JSON.parse(box.dataset.about));
       box.querySelectorAll("[data-to]").forEach((button) => button.addEventListener("click", () => view.mode(button.dataset.to)));
-      box.querySelectorAll("[data-key]").forEach((button) => {
-        for (const kind of ["pointerdown", "pointerup", "pointerleave", "pointercancel"]) {
-          button.addEventListener(kind, () => view.hold(button.dataset.key, kind === "pointerdown"));
-        }
-        button.addEventListener("contextmenu", (event) => event.preventDefault());
-      });
+      view.pads(box);
       const full = box.querySelector("[data-full]");
       full.hidden = !document.fullscreenEnabled;
       full.addEventListener("click", () => (document.fullscreenElement ? document.exitFullscreen() : box.requestFullscreen()));
@@ -232,5 +260,6 @@
     }
   }
 
-  for (const box of document.querySelectorAll("[data-about]")) box.querySelector("[data-open]").addEventListener("click", () => open(box));
+  window.scan2sim = { View, load, meshes };
+  for (const box of document.querySelectorAll("header[data-about]")) box.querySelector("[data-open]").addEventListener("click", () => open(box));
 })();

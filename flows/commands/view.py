@@ -1,0 +1,66 @@
+"""`scan2sim view`: a finished world in the browser, or a flight through it as a video."""
+
+from __future__ import annotations
+
+import tempfile
+import webbrowser
+from contextlib import suppress
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from scan2sim.flows.commands.app import App
+from scan2sim.flows.commands.display import console, progress
+from scan2sim.flows.commands.options import options
+from scan2sim.flows.reports import film as films
+from scan2sim.flows.reports.view import INDEX, Pages, ViewParams, server
+from scan2sim.pipeline.extras import need
+from scan2sim.pipeline.io.importing import tile_folder
+from scan2sim.pipeline.io.scene import Scene, read_scene
+
+app = App()
+
+
+@app.command()
+@options(ViewParams)
+def view(
+    params: ViewParams,
+    world: Annotated[Path, typer.Argument(metavar="WORLD", help="The folder that run or survey was given as --out.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Keep the page in this folder, to be opened by a double click.")
+    ] = None,
+    film: Annotated[Path | None, typer.Option("--film", metavar="FLIGHT.mp4", help="Render a flight instead.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a page that is there already.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Serve the page, and open no browser.")] = False,
+) -> None:
+    """Open a finished world in the browser, or render a flight through it."""
+    if film is not None:
+        need("--film", "av")
+    scene = read_scene(world)
+    if film is not None:
+        with progress("flight") as report:
+            films.film(scene, film, params.seconds, params.width, report)
+        console.print(f"Flight: {film}", highlight=False, soft_wrap=True)
+    elif out is not None:
+        with progress("page") as report, tile_folder(out, overwrite, "page") as folder:
+            pages = Pages(scene, folder, params.megapixels)
+            for i, script in enumerate(pages.scripts):
+                report(i / len(pages.scripts), script)
+                pages.write(script)
+        console.print(f"Page: {out / INDEX}", highlight=False, soft_wrap=True)
+    else:
+        _serve(scene, params, browser=not quiet)
+
+
+def _serve(scene: Scene, params: ViewParams, *, browser: bool) -> None:
+    """Serve a world's page until Ctrl-C."""
+    with tempfile.TemporaryDirectory() as folder:
+        pages = Pages(scene, Path(folder), params.megapixels)
+        with server(pages, params.port) as served:
+            address = f"http://localhost:{served.server_port}/"
+            console.print(f"World:  {address}  (Ctrl-C ends)", highlight=False, soft_wrap=True)
+            if browser:
+                webbrowser.open(address)
+            with suppress(KeyboardInterrupt):
+                served.serve_forever()

@@ -1,0 +1,243 @@
+// A world tile by tile, the nearest first: coloured by photos, classes, or where colours are from. Classic scripts, so that
+// the page can be opened by a double click, too: each tile is a script that calls scan2simTile with a GLB as base64.
+"use strict";
+
+(() => {
+  const TEXELS = 320e6; // of all tiles that are held at once; beyond it the farthest are dropped
+  const SCALE = [[0, "#30123b"], [5, "#4686fb"], [10, "#1ae4b6"], [20, "#a4fc3c"], [35, "#fb7e21"], [60, "#7a0403"]]; // metres
+  const NONE = "#8a8f96";
+  const FIRST = 3; // row of the first photo in a GLB's table: 0 is filled, 1 points, 2 and on photos
+  const { View, load, meshes } = window.scan2sim;
+
+  // A surface whose texture's brightness is kept under a colour of each vertex, where `tinted` is 1.
+  function tintable(material, tinted) {
+    material.onBeforeCompile = (shader) => {
+      shader.uniforms.tinted = tinted;
+      shader.vertexShader = shader.vertexShader
+        .replace("#include <common>", "#include <common>\nattribute vec3 tint;\nvarying vec3 vTint;")
+        .replace("#include <begin_vertex>", "#include <begin_vertex>\nvTint = tint;");
+      shader.fragmentShader = shader.fragmentShader
+        .replace("#include <common>", "#include <common>\nuniform float tinted;\nvarying vec3 vTint;")
+        .replace("#include <map_fragment>", `#include <map_fragment>
+          float bright = pow(dot(diffuseColor.rgb, vec3(.2126, .7152, .0722)), .4545);
+          diffuseColor.rgb = mix(diffuseColor.rgb, vTint * (.3 + .9 * bright), tinted);`);
+    };
+    return material;
+  }
+
+  const linear = (colour) => new THREE.Color(colour).toArray();
+
+  function along(metres) {
+    const next = SCALE.findIndex(([at]) => at > metres);
+    if (next < 0) return linear(SCALE[SCALE.length - 1][1]);
+    const [[low, from], [high, to]] = [SCALE[next - 1], SCALE[next]];
+    return new THREE.Color(from).lerp(new THREE.Color(to), (metres - low) / (high - low)).toArray();
+  }
+
+  class World extends View {
+    constructor(box, about) {
+      super(box, [], about);
+      this.rgb = (of) => linear(`rgb(${of.join(",")})`);
+      this.tinted = { value: 0 };
+      this.colours = "photo";
+      this.shown = { wireframe: false, collision: false };
+      this.here = new Map(); // scripts that are loaded, to their meshes
+      this.wires = new THREE.MeshBasicMaterial({ color: 0x0a1018, wireframe: true, transparent: true, opacity: 0.45, depthWrite: false });
+      this.loop();
+    }
+
+    // Tiles by how near they are to what is looked at.
+    nearest() {
+      const eye = this.walking ? this.camera.position : this.orbit.target;
+      const away = ({ offset, low, high }) => Math.hypot(...[0, 1].map((k) => Math.max(0, offset[k] + low[k] - eye.getComponent(k), eye.getComponent(k) - offset[k] - high[k])));
+      return [...this.about.tiles].sort((a, b) => away(a) - away(b));
+    }
+
+    async loop() {
+      for (;;) {
+        const next = this.next();
+        if (next) await this.fetch(...next).catch((error) => this.say(error.message));
+        else await new Promise((done) => setTimeout(done, 300));
+        if (this.failed) return;
+      }
+    }
+
+    // The script that is wanted most: of a tile, what is seen and, where it is asked for, what bodies collide with.
+    next() {
+      let room = TEXELS;
+      for (const tile of this.nearest()) {
+        const held = this.here.get(tile.name);
+        room -= held?.texels ?? 0;
+        if (room < 0) { this.drop(tile.name); continue; }
+        if (!held) return [tile, tile.name];
+        if (this.shown.collision && !this.here.has(`${tile.name}_collision`)) return [tile, `${tile.name}_collision`];
+      }
+      this.say(this.here.size ? "" : "Loading …");
+      return null;
+    }
+
+    async fetch(tile, name) {
+      this.say(`Loading ${name} …`);
+      const got = new Promise((done) => (window.scan2simTile = (of, base64) => of === name && done(base64)));
+      try {
+        await load("tiles", [`${name}.js`]);
+      } catch (error) {
+        this.failed = true;
+        throw error;
+      }
+      const found = await meshes(await got, tile.offset);
+      const solid = name !== tile.name;
+      const texels = found.reduce((sum, { material }) => sum + (material.map ? material.map.image.width * material.map.image.height : 0), 0);
+      for (const mesh of found) this.dress(mesh, solid);
+      this.here.set(name, { tile, solid, texels, meshes: found });
+      if (solid) this.scene.add(...found);
+      else this.put(name, found);
+      this.look_after(name);
+      if (this.about.start === "turn" && this.walking) this.stand();
+    }
+
+    dress(mesh, solid) {
+      mesh.geometry.setAttribute("tint", new THREE.BufferAttribute(new Float32Array(3 * mesh.geometry.attributes.position.count).fill(1), 3));
+      if (solid) {
+        mesh.material = new THREE.MeshBasicMaterial({ color: 0xff8a1f, transparent: true, opacity: 0.3, side: THREE.DoubleSide, polygonOffset: true, polygonOffsetFactor: -2, polygonOffsetUnits: -8 });
+      } else {
+        tintable(mesh.material, this.tinted);
+      }
+      const wires = new THREE.Mesh(mesh.geometry, this.wires);
+      wires.renderOrder = 1;
+      mesh.add(wires);
+      mesh.wires = wires;
+    }
+
+    drop(name) {
+      for (const of of [name, `${name}_collision`]) {
+        const held = this.here.get(of);
+        if (!held) continue;
+        for (const mesh of held.meshes) {
+          this.scene.remove(mesh);
+          mesh.geometry.dispose();
+          mesh.material.map?.dispose();
+          mesh.material.dispose();
+        }
+        this.grounds.delete(of);
+        this.here.delete(of);
+        this.stale = true;
+      }
+    }
+
+    // What is shown of a tile as the buttons say.
+    look_after(name) {
+      const { meshes: found, solid } = this.here.get(name);
+      for (const mesh of found) {
+        mesh.visible = !solid || this.shown.collision;
+        mesh.wires.visible = solid || this.shown.wireframe;
+        if (!solid && this.colours !== "photo") this.tint(mesh);
+      }
+      this.stale = true;
+    }
+
+    tint(mesh) {
+      const { tint, _feature_id_0: row, _distance: far } = mesh.geometry.attributes;
+      const own = this.rgb(this.about.colours[mesh.userData.class] ?? [138, 143, 150]);
+      const sources = this.about.sources.map(this.rgb), none = linear(NONE);
+      const of = {
+        class: () => own,
+        source: (i) => (row ? sources[Math.min(row.getX(i), FIRST - 1)] : none),
+        distance: (i) => (far && far.getX(i) >= 0 ? along(far.getX(i)) : none),
+      }[this.colours];
+      for (let i = 0; i < tint.count; i++) tint.setXYZ(i, ...of(i));
+      tint.needsUpdate = true;
+    }
+
+    colour(kind) {
+      this.colours = kind;
+      this.tinted.value = kind === "photo" ? 0 : 1;
+      for (const name of this.here.keys()) this.look_after(name);
+    }
+
+    toggle(kind) {
+      this.shown[kind] = !this.shown[kind];
+      for (const name of this.here.keys()) this.look_after(name);
+      return this.shown[kind];
+    }
+
+    // Stand where a photo was taken: the same place, direction and angle of view.
+    photo({ pose, field, aspect }) {
+      const [right, down, ahead, eye] = [0, 1, 2, 3].map((k) => new THREE.Vector3(pose[k], pose[4 + k], pose[8 + k]));
+      this.mode("walk");
+      this.camera.position.copy(eye);
+      this.camera.up.copy(down.negate());
+      this.camera.lookAt(ahead.add(eye));
+      this.camera.up.set(0, 0, 1);
+      const wide = this.camera.aspect < aspect ? aspect / this.camera.aspect : 1; // all of the photo is in the window
+      this.camera.fov = (2 * Math.atan(wide * Math.tan((field * Math.PI) / 360)) * 180) / Math.PI;
+      this.camera.updateProjectionMatrix();
+      this.face();
+    }
+
+    stand() {
+      const eye = this.camera.position, ground = this.height(eye.x, eye.y, Infinity);
+      if (ground !== null) eye.z = ground + 1.6;
+      this.stale = true;
+    }
+
+    say(text) {
+      document.querySelector("[role=status]").textContent = text;
+    }
+  }
+
+  function legend(about, kind) {
+    const box = document.getElementById("legend");
+    const key = (colour, text) => `<span><i style="background:${colour}"></i>${text}</span>`;
+    const css = (rgb) => `rgb(${rgb.join(",")})`;
+    const last = SCALE[SCALE.length - 1][0];
+    box.hidden = kind === "photo";
+    box.innerHTML = {
+      photo: () => "",
+      class: () => Object.entries(about.colours).map(([name, rgb]) => key(css(rgb), name.replace("_", " "))).join(""),
+      source: () => ["filled", "from points", "from a photo"].map((text, i) => key(css(about.sources[i]), text)).reverse().join(""),
+      distance: () => `<b style="background:linear-gradient(90deg, ${SCALE.map(([at, colour]) => `${colour} ${(100 * at) / last}%`)})"></b><span>0 to ${last} m to the photo</span>${key(NONE, "no photo")}`,
+    }[kind]();
+  }
+
+  const all = (selector) => document.querySelectorAll(selector);
+  const press = (buttons, pressed) => buttons.forEach((button) => button.setAttribute("aria-pressed", String(pressed(button))));
+
+  function open() {
+    const box = document.getElementById("world"), about = JSON.parse(box.dataset.about);
+    const world = (window.world = new World(box, about));
+    const select = document.querySelector("#photos select");
+    const colour = (kind) => {
+      world.colour(kind);
+      legend(about, kind);
+      press(all("[data-colour]"), (button) => button.dataset.colour === kind);
+    };
+    all("[data-colour]").forEach((button) => button.addEventListener("click", () => colour(button.dataset.colour)));
+    all("[data-toggle]").forEach((button) => button.addEventListener("click", () => button.setAttribute("aria-pressed", String(world.toggle(button.dataset.toggle)))));
+    const mode = () => {
+      press(all("[data-to]"), (button) => button.dataset.to === box.dataset.mode);
+      all("[data-help]").forEach((help) => (help.hidden = help.dataset.help !== box.dataset.mode));
+    };
+    all("[data-to]").forEach((button) => button.addEventListener("click", () => { world.mode(button.dataset.to); world.fit(); mode(); }));
+    document.getElementById("photos").hidden = !about.photos.length;
+    select.replaceChildren(...about.photos.map(({ name }, i) => new Option(name, i)));
+    select.selectedIndex = Math.floor(about.photos.length / 2);
+    const stand = (step) => {
+      select.selectedIndex = Math.min(about.photos.length - 1, Math.max(0, select.selectedIndex + step));
+      world.photo(about.photos[select.selectedIndex]);
+      mode();
+    };
+    select.addEventListener("change", () => stand(0));
+    all("[data-photo]").forEach((button) => button.addEventListener("click", () => stand(Number(button.dataset.photo))));
+    world.pads(document);
+    colour("photo");
+    mode();
+    world.canvas.focus();
+  }
+
+  try {
+    open();
+  } catch (error) {
+    document.querySelector("[role=status]").textContent = /webgl/i.test(error.message) ? "This browser has no WebGL to show the world with." : error.message;
+  }
+})();

@@ -1,0 +1,115 @@
+"""`scan2sim view`: a world's page as who opens it sees it, how it is served, and the flight through it."""
+
+from __future__ import annotations
+
+import threading
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from scan2sim.flows.cli import app
+from scan2sim.flows.reports.film import flight
+from scan2sim.flows.reports.view import Pages, server
+from scan2sim.pipeline.errors import SettingError
+from tests.browser import Page, chromium
+from tests.pipeline import made_up
+
+HERE = "world.here.size >= world.about.tiles.length && !document.querySelector('[role=status]').textContent"
+DRAWN = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(true))))"
+
+
+def run(*words: object) -> None:
+    done = CliRunner().invoke(app, ["view", *map(str, words)])
+    if done.exception is not None:
+        raise done.exception
+
+
+def seen(page: Page) -> np.ndarray:
+    """What the canvas shows, below the buttons."""
+    page.value(DRAWN)
+    return page.picture()[80:700, :900].astype(int)
+
+
+def test_all_tiles_are_shown_by_photos_classes_and_sources(tmp_path: Path) -> None:
+    made_up.scene(tmp_path)
+    run(tmp_path / "world", "--out", tmp_path / "page")
+    with chromium(tmp_path) as page:
+        page.open(tmp_path / "page" / "index.html")  # by a double click: no server
+        page.until(f"window.world && {HERE}")
+        page.click("[data-photo='1']")
+        eye = np.array(page.value("document.querySelector('output').value").split(), float)
+        np.testing.assert_allclose(eye, [-8, -9, 2], atol=0.01)
+        photo = seen(page)
+        assert photo.std() > 30
+        pictures = [photo]
+        for kind in ("class", "source", "distance"):
+            page.click(f"[data-colour={kind}]")
+            pictures.append(seen(page))
+            assert page.value("document.getElementById('legend').innerText").strip()
+        assert all(np.abs(a - b).mean() > 3 for i, a in enumerate(pictures) for b in pictures[:i])
+        page.click("[data-colour=photo]")
+        assert (seen(page) == photo).all()
+        page.click("[data-toggle=wireframe]")
+        assert np.abs(seen(page) - photo).mean() > 0.5
+        page.click("[data-toggle=wireframe]")
+        page.click("[data-toggle=collision]")
+        page.until(f"world.here.size === 4 && {HERE}")
+        assert np.abs(seen(page) - photo).mean() > 3
+        page.click("[data-to=turn]")
+        assert np.abs(seen(page) - photo).mean() > 10
+        page.open(tmp_path / "page" / "index.html", phone=True)
+        page.until(f"window.world && {HERE}")
+        assert page.errors == []
+
+
+def test_a_page_that_lacks_a_tile_says_so(tmp_path: Path) -> None:
+    made_up.scene(tmp_path)
+    run(tmp_path / "world", "--out", tmp_path / "page")
+    (tmp_path / "page" / "tiles" / "tile1.js").unlink()
+    with chromium(tmp_path) as page:
+        page.open(tmp_path / "page" / "index.html")
+        page.until("document.querySelector('[role=status]').textContent.includes(\"tile1.js isn't beside\")")
+
+
+def test_tiles_are_made_when_they_are_asked_for_and_for_this_machine_alone(tmp_path: Path) -> None:
+    pages = Pages(made_up.scene(tmp_path), tmp_path / "page", 1.0)
+    with server(pages, 0) as served:
+        threading.Thread(target=served.serve_forever, daemon=True).start()
+        address = f"http://127.0.0.1:{served.server_port}"
+        try:
+            assert b"<title>town" in urllib.request.urlopen(f"{address}/").read()
+            assert not any((tmp_path / "page" / "tiles").iterdir())
+            for script in ("tile0.js", "tile0_collision.js"):
+                body = urllib.request.urlopen(f"{address}/tiles/{script}").read()
+                assert body.startswith(f'scan2simTile("{script.removesuffix(".js")}", "'.encode())
+            for name, host in (("/tiles/tile7.js", None), ("/../world/metadata.json", None), ("/", "elsewhere.org")):
+                asked = urllib.request.Request(address + name, headers={"Host": host} if host else {})
+                with pytest.raises(urllib.error.HTTPError) as caught:
+                    urllib.request.urlopen(asked)
+                assert caught.value.code == (403 if host else 404)
+            with pytest.raises(SettingError, match="can't listen"):
+                server(pages, served.server_port)
+        finally:
+            served.shutdown()
+
+
+def test_a_flight_is_a_video_of_the_world(tmp_path: Path) -> None:
+    av = pytest.importorskip("av", reason="PyAV isn't installed")
+    made_up.scene(tmp_path)
+    run(tmp_path / "world", "--film", tmp_path / "flight.mp4", "--seconds", 0.25, "--width", 160)
+    with av.open(str(tmp_path / "flight.mp4")) as video:
+        frames = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
+    assert len(frames) == 6 and frames[0].shape == (90, 160, 3)
+    assert all(frame.std() > 15 for frame in frames)
+    assert np.abs(frames[0].astype(int) - frames[3]).mean() > 5
+
+
+def test_without_a_road_the_flight_circles_around_the_world(tmp_path: Path) -> None:
+    poses = np.array(flight(made_up.scene(tmp_path, tiles=1), 12))
+    away = np.linalg.norm(poses[:, :2, 3], axis=1)
+    assert np.ptp(away) < 1 and away.min() > 14 and (poses[:, 2, 3] > 5).all()
+    assert (poses[:, :3, 2] * poses[:, :3, 3] < 1).all() and (poses[:, 2, 2] < 0).all()  # they look at its middle
