@@ -50,9 +50,7 @@ def film(scene: Scene, file: Path, seconds: float, width: int, report: Report) -
 
     size = width // 2 * 2, width * 9 // 32 * 2
     camera = render.pinhole(*size)
-    world = render.Renderer(
-        [_placed(tile.folder / group, tile.offset) for tile in scene.tiles for group in tile.groups]
-    )
+    world = render.Renderer([placed(tile.folder / group, tile.offset) for tile in scene.tiles for group in tile.groups])
     poses = flight(scene, round(seconds * FPS))
     with Encoder(file, size, FPS, preset="medium", crf="20") as encoder:
         for i, pose in enumerate(poses):
@@ -85,6 +83,13 @@ def flight(scene: Scene, count: int) -> list[F64]:
     return [render.look_at(e + (0, 0, up), t) for e, t, up in zip(*lines, rise, strict=True)]
 
 
+def placed(folder: Path, offset: tuple[float, float, float]) -> render.Body:
+    """A textured mesh of a tile in its place in the world."""
+    body = render.textured(folder)
+    mesh: Mesh = body.mesh
+    return replace(body, mesh=replace(mesh, vertices=(mesh.vertices + np.asarray(offset)).astype(np.float32)))
+
+
 def _circle(scene: Scene, count: int) -> list[F64]:
     low = np.min([np.add(tile.low, tile.offset) for tile in scene.tiles], axis=0)
     high = np.max([np.add(tile.high, tile.offset) for tile in scene.tiles], axis=0)
@@ -106,10 +111,3 @@ def _soft(places: F64, half: int) -> F64:
     index = np.arange(len(places))
     wide = np.minimum(half, np.minimum(index, len(places) - 1 - index))
     return (total[index + wide + 1] - total[index - wide]) / (2 * wide + 1)[:, None]
-
-
-def _placed(folder: Path, offset: tuple[float, float, float]) -> render.Body:
-    """A textured mesh of a tile in its place in the world."""
-    body = render.textured(folder)
-    mesh: Mesh = body.mesh
-    return replace(body, mesh=replace(mesh, vertices=(mesh.vertices + np.asarray(offset)).astype(np.float32)))

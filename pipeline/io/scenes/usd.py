@@ -8,20 +8,21 @@ world is on the map stands in the custom data of the root layer and of `/World`:
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from scan2sim.pipeline.cylinders import Cylinder
-from scan2sim.pipeline.io import scenes, sdf
+from scan2sim.pipeline.io import provenance, scenes, sdf
 from scan2sim.pipeline.io.files import make_folder
 from scan2sim.pipeline.io.scene import Scene, SceneTile, Surface, by_class
 from scan2sim.pipeline.io.scenes import SceneParams
 from scan2sim.pipeline.io.textured import unique_uv, vertex_normals
 from scan2sim.pipeline.solids import Solid, solids
 from scan2sim.pipeline.step import Report
-from scan2sim.pipeline.types import F32, Mesh
+from scan2sim.pipeline.types import F32, Mesh, View
 
 NEEDS = ("pxr",)
 FOLDER = "usd"
@@ -91,7 +92,8 @@ def _write_tile(path: Path, tile: SceneTile, own: SceneTile, params: SceneParams
     Usd.ModelAPI(root).SetKind(Kind.Tokens.component)
     for scope in ("Looks", "Visual", "Collision"):
         UsdGeom.Scope.Define(stage, root.GetPath().AppendChild(scope))
-    triangles = 0
+    triangles, views = 0, tile.views()
+    _list_photos(UsdGeom.PrimvarsAPI(root), views)
     for group, shape in tile.textured().items():
         pages = scenes.write_pages(path.with_suffix(""), group, shape, params)
         looks = {
@@ -100,7 +102,7 @@ def _write_tile(path: Path, tile: SceneTile, own: SceneTile, params: SceneParams
         }
         for surface in by_class(group, shape):
             for part in surface.parts(params.max_visual_triangles):
-                _show(stage, root, part, looks)
+                _show(stage, root, part, looks, views)
                 triangles += len(part.shape)
     for solid in solids(own.solid(), own.friction):
         _collide(stage, root, solid)
@@ -108,7 +110,7 @@ def _write_tile(path: Path, tile: SceneTile, own: SceneTile, params: SceneParams
     return triangles
 
 
-def _show(stage: Any, root: Any, surface: Surface, looks: dict[int, Any]) -> None:
+def _show(stage: Any, root: Any, surface: Surface, looks: dict[int, Any], views: Sequence[View]) -> None:
     """A surface, a subset of its faces for each page, with its labels."""
     from pxr import Sdf, UsdGeom, UsdSemantics, UsdShade, Vt
 
@@ -120,10 +122,7 @@ def _show(stage: Any, root: Any, surface: Surface, looks: dict[int, Any]) -> Non
     st = primvars.CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.faceVarying)
     st.Set(Vt.Vec2fArray.FromNumpy(uv))
     st.SetIndices(Vt.IntArray.FromNumpy(corner_uv.ravel()))
-    seen = surface.seen()
-    if seen is not None:
-        given = primvars.CreatePrimvar("scan2sim:seen", Sdf.ValueTypeNames.IntArray, UsdGeom.Tokens.uniform)
-        given.Set(Vt.IntArray.FromNumpy(seen.astype(np.int32)))
+    _origin(primvars, surface, views)
     prim = mesh.GetPrim()
     for taxonomy, label in {"class": surface.label, "las_code": str(surface.code)}.items():
         UsdSemantics.LabelsAPI.Apply(prim, taxonomy).CreateLabelsAttr([label])
@@ -135,6 +134,33 @@ def _show(stage: Any, root: Any, surface: Surface, looks: dict[int, Any]) -> Non
             UsdShade.Tokens.materialBind, UsdGeom.Tokens.partition,
         )  # fmt: skip
         UsdShade.MaterialBindingAPI.Apply(subset.GetPrim()).Bind(looks[page])
+
+
+def _list_photos(primvars: Any, views: Sequence[View]) -> None:
+    """The photos that faces name by their numbers, and when each was taken, on all that is below a prim."""
+    from pxr import Sdf, UsdGeom, Vt
+
+    rows = provenance.table(views)[provenance.FIRST :]
+    for name, values in (("photos", [row.photo for row in rows]), ("taken", [row.taken for row in rows])):
+        if any(values):
+            listed = primvars.CreatePrimvar(f"scan2sim:{name}", Sdf.ValueTypeNames.StringArray, UsdGeom.Tokens.constant)
+            listed.Set(Vt.StringArray(values))
+
+
+def _origin(primvars: Any, surface: Surface, views: Sequence[View]) -> None:
+    """Where each face has its colour from, which photo gives its detail, and how far that was from its middle."""
+    from pxr import Sdf, UsdGeom, Vt
+
+    seen, row = surface.seen(), provenance.rows(surface)
+    if seen is None or row is None:
+        return
+    far = provenance.distance(surface.shape.mesh.corners.mean(axis=1), row, views)
+    photo = np.maximum(row - provenance.FIRST, -1)
+    for name, values in (("seen", seen.astype(np.int32)), ("photo", photo.astype(np.int32))):
+        given = primvars.CreatePrimvar(f"scan2sim:{name}", Sdf.ValueTypeNames.IntArray, UsdGeom.Tokens.uniform)
+        given.Set(Vt.IntArray.FromNumpy(values))
+    given = primvars.CreatePrimvar("scan2sim:distance", Sdf.ValueTypeNames.FloatArray, UsdGeom.Tokens.uniform)
+    given.Set(Vt.FloatArray.FromNumpy(far))
 
 
 def _collide(stage: Any, root: Any, solid: Solid) -> None:

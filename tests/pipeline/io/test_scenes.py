@@ -179,3 +179,20 @@ def test_ground_too_long_for_a_carla_map_comes_in_squares_from_the_north_west(tm
     (name, corners, _, picture), *_ = fbx(tmp_path / "out" / "carla" / "town" / "town_Tile_1_0.fbx")
     assert name.startswith("town_Terrain_tile1") and corners[..., 0].min() == pytest.approx(2990, abs=0.01)
     assert picture.parent.name == "town_Tile_1_0.fbm" and picture.is_file()
+
+
+def test_usd_tells_of_each_face_its_photo_and_how_far_that_was(town: Scene, exported: dict[str, Path]) -> None:
+    pytest.importorskip("pxr", reason="usd-core is not installed")
+    from pxr import Usd, UsdGeom
+
+    written(town, "usd", exported["usd"])
+    stage = Usd.Stage.Open(str(exported["usd"] / "town.usdc"))
+    tile = town.tiles[0]
+    root = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath("/World/tile0"))
+    assert list(root.GetPrimvar("scan2sim:photos").Get()) == ["front"]
+    assert list(root.GetPrimvar("scan2sim:taken").Get()) == ["2018-06-01T00:00:00+00:00"]
+    ground = next(surface for surface in tile.surfaces() if surface.name == "terrain")
+    mesh = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath("/World/tile0/Visual/terrain"))
+    far = np.linalg.norm(ground.shape.mesh.corners.mean(axis=1) - tile.views()[0].centre, axis=1)
+    np.testing.assert_allclose(mesh.GetPrimvar("scan2sim:distance").Get(), far, atol=1e-3)
+    assert set(mesh.GetPrimvar("scan2sim:photo").Get()) == {0} and set(mesh.GetPrimvar("scan2sim:seen").Get()) == {255}

@@ -1,0 +1,21 @@
+"""Blender as a module (PyPI's bpy): it imports the OpenUSD stage, all triangles and textures among them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from bench import blender
+from bench.gate_places import Places
+
+FORMAT = "usd"
+
+
+def missing() -> str:
+    """Why it can't run here, or an empty text."""
+    return blender.module_missing()
+
+
+def check(export: Path, places: Places) -> dict[str, Any]:
+    """Import, and count what is there."""
+    return blender.check(blender.module(), export, sorted(export.glob("*.usdc")), ".usdc")

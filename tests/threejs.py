@@ -1,0 +1,126 @@
+"""three.js in headless Chromium, as `scan2sim view` brings it: GLBs are shown as a web viewer would."""
+
+from __future__ import annotations
+
+import base64
+import functools
+import json
+import shutil
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from scan2sim.flows.reports.tile import PAGES
+from scan2sim.pipeline.types import F64, Camera
+from tests import browser
+from tests.browser import Page
+
+SKY = (255, 0, 255)
+"""The colour where nothing is."""
+NEAR, FAR = 0.05, 3000.0
+"""Metres from the eye."""
+PAGE = """<!DOCTYPE html><meta charset="utf-8"><body style="margin: 0"><script src="three.js"></script>
+<script>
+const scene = new THREE.Scene();
+scene.background = new THREE.Color("magenta");
+const camera = new THREE.PerspectiveCamera();
+camera.matrixAutoUpdate = false;
+let renderer;
+async function open(width, height, files) {
+  renderer = new THREE.WebGLRenderer({ antialias: true, preserveDrawingBuffer: true });
+  renderer.setSize(width, height);
+  const told = { triangles: 0, textures: 0, features: 0 };
+  for (const file of files) {
+    const gltf = await new THREE.GLTFLoader().loadAsync("world/" + file);
+    scene.add(gltf.scene);
+    gltf.scene.traverse((node) => {
+      if (!node.isMesh) return;
+      told.triangles += node.geometry.index.count / 3;
+      told.textures += node.material.map?.image.width > 0;
+      told.features += node.geometry.attributes._feature_id_0 !== undefined;
+    });
+  }
+  return told;
+}
+function look(pose, projection) {
+  camera.matrix.fromArray(pose);
+  camera.updateMatrixWorld(true);
+  camera.projectionMatrix.fromArray(projection);
+  camera.projectionMatrixInverse.copy(camera.projectionMatrix).invert();
+  renderer.render(scene, camera);
+  return renderer.domElement.toDataURL("image/png");
+}
+</script>"""
+
+
+def missing() -> str:
+    """Why it can't run here, or an empty text."""
+    return "" if any(map(shutil.which, browser.NAMES)) else "Chromium isn't installed (apt-get install chromium)"
+
+
+class Viewer:
+    """GLBs in three.js.
+
+    Attributes:
+        told: how many `triangles`, and meshes with a texture (`textures`) and with `features`, there are.
+    """
+
+    def __init__(self, page: Page, told: dict[str, Any]) -> None:
+        self._page, self.told = page, told
+
+    def picture(self, camera: Camera, pose: F64) -> np.ndarray:
+        """(H, W, 3) RGB from a pinhole camera's pose in the world, z up; `SKY` where nothing is."""
+        onto_gl = np.diag([1.0, -1, -1, 1])  # x right, y up, z backwards
+        y_up = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+        told = (y_up @ pose @ onto_gl).T.ravel().tolist(), _projection(camera).T.ravel().tolist()
+        data = self._page.value(f"look({json.dumps(told[0])}, {json.dumps(told[1])})").partition(",")[2]
+        assert not self._page.errors, self._page.errors
+        image = cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)
+        assert image is not None
+        return np.asarray(image[..., ::-1])
+
+
+@contextmanager
+def viewer(world: Path, files: Sequence[str], work: Path, size: tuple[int, int]) -> Iterator[Viewer]:
+    """GLBs of a folder in three.js; the test is skipped where there is no Chromium.
+
+    Args:
+        world: folder of the files.
+        files: their names.
+        work: an empty folder, or none yet.
+        size: of pictures, pixels.
+    """
+    work.mkdir(exist_ok=True)
+    (work / "world").symlink_to(world.resolve())
+    shutil.copyfile(PAGES / "three.js", work / "three.js")
+    (work / "page.html").write_text(PAGE)
+    handler = functools.partial(_Quiet, directory=str(work))
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server, browser.chromium(work) as page:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        try:
+            page.do("Page.navigate", url=f"http://127.0.0.1:{server.server_port}/page.html")
+            page.until("document.readyState === 'complete' && window.THREE !== undefined")
+            yield Viewer(page, page.value(f"open({size[0]}, {size[1]}, {json.dumps(list(files))})"))
+        finally:
+            server.shutdown()
+
+
+def _projection(camera: Camera) -> F64:
+    """(4, 4) of a pinhole as OpenGL has it; its centre counts from the middle of the first pixel."""
+    width, height = camera.width, camera.height
+    out = np.zeros((4, 4))
+    out[0, 0], out[1, 1] = 2 * camera.fx / width, 2 * camera.fy / height
+    out[0, 2], out[1, 2] = 1 - 2 * (camera.cx + 0.5) / width, 2 * (camera.cy + 0.5) / height - 1
+    out[2, 2], out[2, 3], out[3, 2] = -(FAR + NEAR) / (FAR - NEAR), -2 * FAR * NEAR / (FAR - NEAR), -1
+    return out
+
+
+class _Quiet(SimpleHTTPRequestHandler):
+    def log_message(self, format: str, *args: object) -> None:
+        """Nothing is told of requests."""
