@@ -1,7 +1,7 @@
 """Gazebo's own libraries (Debian's Fortress): libsdformat, ignition-common's MeshManager, ignition-physics with DART.
 
 The world is parsed with warnings as errors, every mesh and texture is loaded, triangles are counted; a ball and a box
-of a car's size fall on the road, balls on the borders of tiles.
+of a car's size fall on the road, balls on the borders of tiles; the robot is driven along the road.
 """
 
 from __future__ import annotations
@@ -10,10 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from bench import gate_drops
+from bench import gate_drive, gate_drops
 from bench.consumers import Fault
+from bench.gate_drive import Pose
 from bench.gate_places import Places
+from scan2sim.pipeline.robot import ROBOT
 from scan2sim.pipeline.types import F64
 from tests.gazebo import checker
 
@@ -39,7 +42,25 @@ def check(export: Path, places: Places) -> dict[str, Any]:
         cars += _checked(world, [("car", _over(place, places)) for place in group])["bodies"]
     balls = gate_drops.gaps(np.array([body["rest"] for body in seen["bodies"][: len(bodies)]]), places)
     off = np.concatenate([balls, [_car_off(car, places) for car in cars]])
-    return {"meshes": len(seen["meshes"]), "solids": seen["solids"], **gate_drops.told(off)}
+    figures = {"meshes": len(seen["meshes"]), "solids": seen["solids"], **gate_drops.told(off)}
+    left, right = (f"{wheel.name}_joint" for wheel in ROBOT.wheels)
+    with checker.Driven(world, ROBOT.name, (left, right)) as driven:
+        return figures | gate_drive.drive(_Robot(driven), places)
+
+
+class _Robot:
+    """The robot in Gazebo's physics."""
+
+    def __init__(self, driven: checker.Driven) -> None:
+        self._driven = driven
+
+    def pose(self) -> Pose:
+        """Where the robot is."""
+        return Pose(np.asarray(self._driven.place["rest"]), _rotation(self._driven.place).as_matrix())
+
+    def turn(self, left: float, right: float, seconds: float) -> None:
+        """Have the wheels turn so fast for a time."""
+        self._driven.turn(left, right, seconds)
 
 
 def _checked(world: Path, bodies: list[checker.Body]) -> dict[str, Any]:
@@ -75,9 +96,11 @@ def _apart(places: F64) -> list[list[F64]]:
 
 def _car_off(body: dict[str, Any], places: Places) -> float:
     """Metres between a box' underside and the cloud's surface, where it is nearest to it."""
-    from scipy.spatial.transform import Rotation
-
-    w, x, y, z = body["lies"]
-    under = Rotation.from_quat([x, y, z, w]).apply(_underside()) + body["rest"]
+    under = _rotation(body).apply(_underside()) + body["rest"]
     gap = under[:, 2] - places.heights(under[:, :2])
     return float(np.nanmin(gap))
+
+
+def _rotation(body: dict[str, Any]) -> Rotation:
+    """Of how a body lies."""
+    return Rotation.from_quat(body["lies"], scalar_first=True)

@@ -1,4 +1,4 @@
-"""Gazebo's own readers and physics as a test's judge (`check_world.cpp`)."""
+"""Gazebo's own readers and physics as a test's judge (`check_world.cpp`, `drive_world.cpp`)."""
 
 from __future__ import annotations
 
@@ -82,6 +82,47 @@ def load_meshes(*files: Path) -> dict[str, float]:
     if done.returncode:
         raise Refused(done.stderr.strip() or f"exit code {done.returncode}")
     return json.loads(done.stdout.splitlines()[-1])
+
+
+class Driven:
+    """The exported robot in Gazebo's physics, its wheels turned as told (`drive_world.cpp`); a context.
+
+    Args:
+        world: its .sdf.
+        name: of the robot's model.
+        joints: its left and its right one.
+    """
+
+    def __init__(self, world: Path, name: str, joints: tuple[str, str]) -> None:
+        command = [str(part) for part in (program("drive_world"), world, name, *joints)]
+        pipe = subprocess.PIPE
+        self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True)
+        self.place = self._told()
+
+    def __enter__(self) -> Driven:
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        self._process.kill()
+        self._process.communicate()
+
+    def turn(self, left: float, right: float, seconds: float) -> None:
+        """Have the wheels turn so fast, radians a second; then `place` tells `rest` and `lies`, as `check_world` does.
+
+        Raises:
+            Refused: the physics gave up.
+        """
+        assert self._process.stdin is not None
+        self._process.stdin.write(f"{left:.9g} {right:.9g} {seconds:.9g}\n")
+        self._process.stdin.flush()
+        self.place = self._told()
+
+    def _told(self) -> dict[str, Any]:
+        assert self._process.stdout is not None and self._process.stderr is not None
+        line = self._process.stdout.readline()
+        if not line:
+            raise Refused(self._process.stderr.read().strip() or "it ended")
+        return dict(json.loads(line))
 
 
 def _run(*command: object) -> subprocess.CompletedProcess[str]:
