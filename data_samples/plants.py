@@ -55,13 +55,16 @@ def leafy_tree(plan: Tree, rounds: int = 2) -> Part:
     return join(parts)
 
 
-def shrub(radius: float, colour: RGB, seed: int) -> Part:
-    """A bush of two clumps."""
+def shrub(radius: float, colour: RGB, seed: int, rounds: int = 2) -> Part:
+    """A bush of two clumps, the larger of 20 * 4 ** `rounds` triangles."""
     rng = np.random.default_rng(seed)
     leaf = Paint(Material.FOLIAGE, colour, paints.BUSH, seed)
     beside = (0.8 * radius, 0.3 * radius, 0.4 * radius)
     return join(
-        [clump((0, 0, 0.6 * radius), radius, leaf, rng, 2), clump(beside, 0.7 * radius, leaf, rng, 1, flat=0.9)]
+        [
+            clump((0, 0, 0.6 * radius), radius, leaf, rng, rounds),
+            clump(beside, 0.7 * radius, leaf, rng, max(0, rounds - 1), flat=0.9),
+        ]
     )
 
 

@@ -284,6 +284,11 @@ class _Graph:
             lists |= {"plants": self.at(PLANTS, "geojson"), "plants_csv": self.at(PLANTS, "csv")}
         return lists
 
+    def planted(self, output: str) -> Sources:
+        """Models of plants, where there is no mesh of vegetation."""
+        wanted = self.settings.params(PLANTS).models and self.settings.params(SPLIT).vegetation == "locations"
+        return {"vegetation": self.at(PLANTS, output)} if wanted else {}
+
     def photos(self, evidence: Sources, lists: Sources) -> tuple[Sources, Sources]:
         """What photos see of the meshes, and how well they agree; signs are fitted to them, and listed in `lists`.
 
@@ -348,10 +353,11 @@ class _Graph:
         """What users get: the world, maps, figures and pictures."""
         at, add, tile = self.at, self.add, self.tile
         cell = {"place": self.cell["seed"], "neighbours": self.cell["neighbours"]} if self.cell else {}
-        add(COLLISION, {**surfaces, "cloud": at(SPLIT, "terrain")}, **cell)
+        add(COLLISION, {**surfaces, **self.planted("mesh"), "cloud": at(SPLIT, "terrain")}, **cell)
+        planted = self.planted("textured")
         choice = {f"choice.{g}": at(CHOOSE, "choice", g) for g in self.groups}
         shown = {"views": seen["views"], "collision": at(COLLISION, "mesh")}
-        add(EXPORT, textured | choice | lists | self.listed | shown, name=tile.name)
+        add(EXPORT, textured | planted | choice | lists | self.listed | shown, name=tile.name)
         if self.settings.params(EXPORT).rasters:
             add(RASTERS, textured, name=tile.name, **_fineness(self.settings))
         truth: Sources = {}
@@ -363,7 +369,7 @@ class _Graph:
             mine = {f"textured.{g}": at(LEVEL, "textured", g) for g in self.groups}
             theirs = {f"textured.{g}.{n}": at(LEVEL, "textured", g, n) for g in self.groups for n in self.first}
             add(BORDERS, mine | theirs, **self.cell)
-        add(PREVIEW, textured | self.scanner)
+        add(PREVIEW, textured | planted | self.scanner)
         stages = {f"decimate.{g}": at(DECIMATE, "mesh", g) for g in self.groups}
         add(PICTURES, textured | stages | self._clouds() | {"views": seen["views"]} | self.scanner)
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import Field
 
 from scan2sim.pipeline.cells import Cell
 from scan2sim.pipeline.ranges import Place
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.types import F32, F64, PointCloud
+from scan2sim.pipeline.types import F32, F64, U8, PointCloud
 
 CELL = 0.25  # metres, of the canopy raster
 
@@ -24,44 +25,72 @@ class PlantsParams(Params):
         seed: the tile's (x, y), world metres, where it meets others: plants beyond its cell are theirs; set by the
             recipe.
         neighbours: names of tiles whose cells touch to their seeds, world metres; set by the recipe.
+        models: low-poly trees and bushes stand in the world where vegetation is only listed (`split.vegetation` is
+            "locations").
     """
 
     min_height: float = Field(0.4, ge=0.01, le=100)
     min_distance: float = Field(1.5, ge=0.1, le=1000)
     seed: Place | None = None
     neighbours: dict[str, Place] = Field(default_factory=dict)
+    models: bool = True
 
 
 def plants(inputs: Inputs, params: PlantsParams, out: Path, report: Report) -> Done:
     """Find each plant's top in the canopy of `vegetation` above `terrain`; write GeoJSON and CSV.
 
     Place and base are in the tile's CRS; height and crown radius (of the circle with the crown's
-    area) in metres. Crowns are grown from the tops by watershed (Vincent and Soille 1991).
+    area) in metres; red, green and blue (0 to 255) are the mean of the crown's points, a usual green where they have
+    no colour. Crowns are grown from the tops by watershed (Vincent and Soille 1991). With `models` a textured mesh of
+    low-poly plants is written, too (`mesh`, and `textured`, its folder).
     """
+    from scan2sim.pipeline import planting
     from scan2sim.pipeline.io import geojson
 
     cloud, ground = PointCloud.load(inputs["vegetation"]), PointCloud.load(inputs["terrain"])
-    found = crowns(cloud.xyz, ground.xyz, params) if len(cloud) else np.empty((0, 5))
+    found, crown = crowns(cloud.xyz, ground.xyz, params) if len(cloud) else (np.empty((0, 5)), np.empty(0, int))
+    colour = _colours(cloud, crown, len(found))
     if params.seed is not None:
         cell = Cell(params.seed, params.neighbours)
-        found = found[cell.outside(found[:, :2] + np.asarray(cloud.frame.origin[:2])) <= 0]
+        own = cell.outside(found[:, :2] + np.asarray(cloud.frame.origin[:2])) <= 0
+        found, colour = found[own], colour[own]
     places = cloud.frame.to_crs(found[:, :3])
+    names = ("x", "y", "z", "height_m", "crown_radius_m", "red", "green", "blue")
+    digits = (3, 3, 3, 2, 2)
+    sizes = np.column_stack([places, found[:, 3:]]).tolist()
     rows = [
-        {"x": round(x, 3), "y": round(y, 3), "z": round(z, 3), "height_m": round(h, 2), "crown_radius_m": round(r, 2)}
-        for (x, y, z), (h, r) in zip(places.tolist(), found[:, 3:].tolist(), strict=True)
+        dict(zip(names, [*map(round, size, digits), *rgb], strict=True))
+        for size, rgb in zip(sizes, colour.tolist(), strict=True)
     ]
-    heading = "x,y,z,height_m,crown_radius_m"
-    text = "\n".join([heading, *(",".join(str(value) for value in row.values()) for row in rows)])
+    text = "\n".join([",".join(names), *(",".join(str(value) for value in row.values()) for row in rows)])
     (out / "plants.csv").write_text(text + "\n", encoding="utf-8")
-    features = [((row["x"], row["y"], row["z"]), {k: row[k] for k in ("height_m", "crown_radius_m")}) for row in rows]
+    features = [((row["x"], row["y"], row["z"]), {name: row[name] for name in names[3:]}) for row in rows]
     geojson.write_points(out / "plants.geojson", cloud.frame.crs, features)
-    return Done(
-        {"geojson": out / "plants.geojson", "csv": out / "plants.csv"}, {"points": len(cloud), "plants": len(rows)}
-    )
+    files = {"geojson": out / "plants.geojson", "csv": out / "plants.csv"}
+    if params.models:
+        models = out / "models"
+        models.mkdir()
+        planting.plant(found[:, :3], found[:, 3], found[:, 4], colour, cloud.frame, models)
+        files |= {"textured": models, "mesh": models / "mesh.npz"}
+    return Done(files, {"points": len(cloud), "plants": len(rows)})
 
 
-def crowns(xyz: F32, ground: F32, params: PlantsParams) -> F64:
-    """(P, 5) x, y, z of the base, height, crown radius: metres, local."""
+def _colours(cloud: PointCloud, crown: npt.NDArray[np.int_], count: int) -> U8:
+    """(P, 3) mean colours of crowns' points; a usual green where they have none."""
+    from scan2sim.pipeline.planting import LEAVES
+
+    use = cloud.coloured & (crown >= 0)
+    each = np.bincount(crown[use], minlength=count)
+    colour = np.tile(np.array(LEAVES, float), (count, 1))
+    if cloud.rgb is not None:
+        for k in range(3):
+            total = np.bincount(crown[use], cloud.rgb[use, k], count)
+            colour[each > 0, k] = total[each > 0] / each[each > 0]
+    return np.rint(colour).astype(np.uint8)
+
+
+def crowns(xyz: F32, ground: F32, params: PlantsParams) -> tuple[F64, npt.NDArray[np.int_]]:
+    """(P, 5) x, y, z of the base, height, crown radius: metres, local; and of each point, whose it is, or -1."""
     from scipy import ndimage
     from scipy.spatial import cKDTree
 
@@ -87,14 +116,15 @@ def crowns(xyz: F32, ground: F32, params: PlantsParams) -> F64:
     markers[background] = -1
     grown = ndimage.watershed_ift(levels, markers.astype(np.int32)) if count else markers
     if not count:
-        return np.empty((0, 5))
+        return np.empty((0, 5)), np.full(len(xyz), -1)
     plant = np.arange(1, count + 1)
     middle = np.array(ndimage.center_of_mass(top, markers * top, plant))
     row, column = middle.astype(int).T
     crown = np.where(filled, grown, 0)
     tall = ndimage.maximum(height, crown, plant)
     area = np.bincount(crown[crown > 0], minlength=count + 1)[1 : count + 1] * CELL**2
-    return np.column_stack([(middle + 0.5) * CELL + low, base[row, column], tall, np.sqrt(area / np.pi)])
+    found = np.column_stack([(middle + 0.5) * CELL + low, base[row, column], tall, np.sqrt(area / np.pi)])
+    return found, np.maximum(crown[cell[:, 0], cell[:, 1]], 0) - 1
 
 
-PLANTS = Step("plants", 2, plants, PlantsParams)
+PLANTS = Step("plants", 3, plants, PlantsParams)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -77,6 +78,15 @@ def test_a_world_is_written_within_a_budget(tmp_path: Path) -> None:
     groups = json.loads((tmp_path / "out" / "metadata.json").read_text())["groups"].values()
     assert 500 < sum(group["triangles"] for group in groups) <= 1050
     assert parse("triangles=200k, texture=64MP") == (200_000, 64e6) and parse(None) == (None, None)
+
+
+def test_a_world_whose_borders_need_more_than_its_budget_is_told_of(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(made_up, "ground", partial(made_up.ground, 300))  # 1,200 edges all around
+    world = made_up.world(tmp_path).files["world"]
+    said = run(world, "--to", "glb", "--out", tmp_path / "out", "--budget", "triangles=1k")
+    assert "where its surfaces end they are kept" in said
 
 
 def test_a_robot_is_put_into_a_world_within_a_budget(tmp_path: Path) -> None:

@@ -35,7 +35,7 @@ class Shown:
 
 def image(path: Path) -> np.ndarray:
     """Of a file whose name is ASCII and without spaces."""
-    assert path.as_posix().isascii() and " " not in path.name
+    assert path.name.isascii() and " " not in path.name
     read = cv2.imread(str(path))
     assert read is not None, path
     return read[..., ::-1]

@@ -196,3 +196,15 @@ def test_usd_tells_of_each_face_its_photo_and_how_far_that_was(town: Scene, expo
     far = np.linalg.norm(ground.shape.mesh.corners.mean(axis=1) - tile.views()[0].centre, axis=1)
     np.testing.assert_allclose(mesh.GetPrimvar("scan2sim:distance").Get(), far, atol=1e-3)
     assert set(mesh.GetPrimvar("scan2sim:photo").Get()) == {0} and set(mesh.GetPrimvar("scan2sim:seen").Get()) == {255}
+
+
+@each
+def test_folders_may_have_any_name_and_tiles_may_lack_a_class(tmp_path: Path, name: str) -> None:
+    scene = made_up.scene(tmp_path / "Straße mit Bäumen")
+    bare = replace(scene.tiles[1], groups={"terrain": scene.tiles[1].groups["terrain"]})
+    scene = replace(scene, tiles=(scene.tiles[0], bare))
+    written(scene, name, tmp_path / "out")
+    own, seen = faces(expected(scene)), faces(list(READERS[name](tmp_path / "out", scene)))
+    np.testing.assert_array_equal(seen[:, 0], own[:, 0])
+    for path in (tmp_path / "out").rglob("*"):
+        assert path.name.isascii() and " " not in path.name
