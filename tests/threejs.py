@@ -1,4 +1,4 @@
-"""three.js in headless Chromium, as `scan2sim view` brings it: GLBs are shown as a web viewer would."""
+"""three.js in headless Chromium, as `scan2sim view` brings it, or npm's: GLBs are shown as a web viewer would."""
 
 from __future__ import annotations
 
@@ -25,19 +25,20 @@ SKY = (255, 0, 255)
 """The colour where nothing is."""
 NEAR, FAR = 0.05, 3000.0
 """Metres from the eye."""
-PAGE = """<!DOCTYPE html><meta charset="utf-8"><body style="margin: 0"><script src="three.js"></script>
+PAGE = """<!DOCTYPE html><meta charset="utf-8"><body style="margin: 0">HEAD
 <script>
-const scene = new THREE.Scene();
-scene.background = new THREE.Color("magenta");
-const camera = new THREE.PerspectiveCamera();
-camera.matrixAutoUpdate = false;
-let renderer;
+let renderer, scene, camera;
 async function open(width, height, files) {
+  scene = new THREE.Scene();
+  scene.background = new THREE.Color("magenta");
+  camera = new THREE.PerspectiveCamera();
+  camera.matrixAutoUpdate = false;
   renderer = new THREE.WebGLRenderer({ antialias: true, preserveDrawingBuffer: true });
   renderer.setSize(width, height);
   const told = { triangles: 0, textures: 0, features: 0 };
+  const loader = window.unpacking ? unpacking(renderer) : new THREE.GLTFLoader();
   for (const file of files) {
-    const gltf = await new THREE.GLTFLoader().loadAsync("world/" + file);
+    const gltf = await loader.loadAsync("world/" + file);
     scene.add(gltf.scene);
     gltf.scene.traverse((node) => {
       if (!node.isMesh) return;
@@ -56,6 +57,19 @@ function look(pose, projection) {
   renderer.render(scene, camera);
   return renderer.domElement.toDataURL("image/png");
 }
+</script>"""
+OURS = '<script src="three.js"></script>'
+NPMS = """<script type="importmap">{"imports": {"three": "./npm/build/three.module.js", "three/": "./npm/"}}</script>
+<script type="module">
+import * as all from "three";
+import { GLTFLoader } from "three/examples/jsm/loaders/GLTFLoader.js";
+import { DRACOLoader } from "three/examples/jsm/loaders/DRACOLoader.js";
+import { KTX2Loader } from "three/examples/jsm/loaders/KTX2Loader.js";
+import { MeshoptDecoder } from "three/examples/jsm/libs/meshopt_decoder.module.js";
+window.unpacking = (renderer) => new GLTFLoader().setMeshoptDecoder(MeshoptDecoder)
+  .setDRACOLoader(new DRACOLoader().setDecoderPath("npm/examples/jsm/libs/draco/gltf/"))
+  .setKTX2Loader(new KTX2Loader().setTranscoderPath("npm/examples/jsm/libs/basis/").detectSupport(renderer));
+window.THREE = all;
 </script>"""
 
 
@@ -87,7 +101,9 @@ class Viewer:
 
 
 @contextmanager
-def viewer(world: Path, files: Sequence[str], work: Path, size: tuple[int, int]) -> Iterator[Viewer]:
+def viewer(
+    world: Path, files: Sequence[str], work: Path, size: tuple[int, int], package: Path | None = None
+) -> Iterator[Viewer]:
     """GLBs of a folder in three.js; the test is skipped where there is no Chromium.
 
     Args:
@@ -95,11 +111,14 @@ def viewer(world: Path, files: Sequence[str], work: Path, size: tuple[int, int])
         files: their names.
         work: an empty folder, or none yet.
         size: of pictures, pixels.
+        package: npm's three, which brings what unpacks geometry and textures.
     """
     work.mkdir(exist_ok=True)
     (work / "world").symlink_to(world.resolve())
     shutil.copyfile(PAGES / "three.js", work / "three.js")
-    (work / "page.html").write_text(PAGE)
+    if package is not None:
+        (work / "npm").symlink_to(package)
+    (work / "page.html").write_text(PAGE.replace("HEAD", NPMS if package is not None else OURS))
     handler = functools.partial(_Quiet, directory=str(work))
     with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server, browser.chromium(work) as page:
         threading.Thread(target=server.serve_forever, daemon=True).start()

@@ -11,7 +11,8 @@ import pytest
 from bench.consumers import gltf_validator, omniverse, usd
 from scan2sim.flows.reports import film
 from scan2sim.pipeline import backends, render
-from scan2sim.pipeline.io import crs, scenes
+from scan2sim.pipeline.errors import UnavailableError
+from scan2sim.pipeline.io import crs, glb, scenes
 from scan2sim.pipeline.io.scene import Scene
 from scan2sim.pipeline.io.scenes import SceneParams
 from scan2sim.pipeline.step import silent
@@ -184,6 +185,27 @@ def test_three_js_shows_all_tiles_as_the_projects_renderer_does(town: Scene, tmp
     both = own.hit & (picture != threejs.SKY).any(axis=2)
     assert both.sum() > 0.98 * own.hit.sum() > 0.3 * own.hit.size
     assert np.abs(picture[both].astype(int) - own.rgb[both]).mean() < 6
+
+
+@pytest.mark.parametrize("params", [{"glb_mesh": "meshopt"}, {"glb_mesh": "draco"}, {"glb_texture": "ktx2"}], ids=str)
+def test_three_js_unpacks_what_is_packed(town: Scene, tmp_path: Path, params: dict[str, str]) -> None:
+    package = cesium.node_module("three")
+    try:
+        glb.ways(glb.GlbParams(**params))
+    except UnavailableError as error:
+        pytest.skip(str(error))
+    if why := threejs.missing() or ("" if package else "three is not installed (npm install -g three)"):
+        pytest.skip(why)
+    view = town.tiles[0].views()[0]
+    pictures = []
+    for name, packed in (("plain", {}), ("packed", params)):
+        folder = export(town, "glb", tmp_path / name, **packed)
+        with threejs.viewer(folder, ["tile0.glb", "tile1.glb"], tmp_path / f"{name}-page", (640, 480), package) as page:
+            pictures.append(page.picture(view.camera, view.T_world_cam).astype(int))
+            assert page.told["textures"] == page.told["features"] == 8
+    apart = np.abs(pictures[0] - pictures[1]).max(axis=2)
+    assert (pictures[0] != threejs.SKY).any(axis=2).mean() > 0.3
+    assert np.mean(apart > 40) < 0.01 and apart.mean() < 4
 
 
 def test_cesium_shows_all_tiles_where_they_are_on_the_earth(town: Scene, tmp_path: Path) -> None:

@@ -10,6 +10,8 @@ import subprocess
 import tempfile
 from pathlib import Path
 
+import numpy as np
+
 from scan2sim.pipeline.errors import UnavailableError
 from scan2sim.pipeline.io import image
 from scan2sim.pipeline.types import U8
@@ -21,14 +23,14 @@ LIMIT = 1800.0
 
 
 def encode(page: U8, quality: int) -> bytes:
-    """See `pipeline.io.gltf.textures.Texture`; sides are filled up to multiples of four texels, as glTF wants them.
+    """See `pipeline.io.gltf.textures.Texture`; sides are stretched to multiples of four texels, as glTF wants them.
 
     Raises:
         UnavailableError: the program fails.
     """
     with tempfile.TemporaryDirectory() as folder:
         source, target = Path(folder) / "page.png", Path(folder) / "page.ktx2"
-        image.write(source, page, compression=1)
+        image.write(source, _in_fours(page), compression=1)
         of255 = str(max(1, round(quality * 2.55)))
         if shutil.which("basisu"):
             command = ["basisu", "-ktx2", "-mipmap", "-q", of255, "-file", str(source), "-output_file", str(target)]
@@ -39,3 +41,10 @@ def encode(page: U8, quality: int) -> bytes:
             said = (done.stderr or done.stdout).strip().splitlines()[-1:]
             raise UnavailableError(command[0], f"failed: {' '.join(said)}", "Choose export.glb_texture=webp or jpeg")
         return target.read_bytes()
+
+
+def _in_fours(page: U8) -> U8:
+    import cv2
+
+    height, width = (side + -side % 4 for side in page.shape[:2])
+    return np.asarray(cv2.resize(page, (width, height), interpolation=cv2.INTER_LINEAR), np.uint8)
