@@ -1,6 +1,6 @@
 """Visual SLAM against a rendered drive's truth, KITTI's, pycolmap, and the mission's own method.
 
-`python -m bench.slam [--parts drive kitti turn pano memory] [--length 1500] [--out bench-out/slam]`
+`python -m bench.slam [--parts drive kitti turn trust pano memory] [--length 1500] [--out bench-out/slam]`
 
 - drive: 360-degree video (1024 px high, 10 Mbit/s, 15 fps) along a real path (KITTI 00; without the data a made-up one)
   through a synthetic town with traffic, odometry alone, a consumer receiver's GPS for the scale: D3.2's two errors;
@@ -9,6 +9,7 @@
   global adjustment; pycolmap's incremental mapping of the same frames, and the ratio of the times.
 - turn: 51 frames of a rendered turn of 98 degrees (perspective, 52 m): ATE, and pycolmap's; what it costs there and on
   KITTI's frames when every other frame has .45 of its brightness.
+- trust: the share of positions that lie in their 95 % ellipsoids, over 20 simulated drives; pictures of these.
 - pano: rotation and direction of motion between two real 360 frames, against their reference.
 - memory: peak of the process over ever more frames.
 
@@ -31,6 +32,7 @@ import numpy as np
 
 from bench.measure import measure
 from bench.slam_frames import Sequence, lit, odometry, places, pycolmap
+from bench.slam_trust import covariance
 from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.types import Camera
 from scan2sim.slam.evaluate import Evaluation, evaluate, plot
@@ -41,7 +43,7 @@ from scan2sim.slam.trackers import named
 
 ROOT = Path(__file__).resolve().parent.parent
 DATA = ROOT.parent / "shared" / "data"
-PARTS = ("drive", "kitti", "turn", "pano", "memory")
+PARTS = ("drive", "kitti", "turn", "trust", "pano", "memory")
 
 
 def drive_of(out: Path, path: str, length: float) -> Path:
@@ -215,7 +217,7 @@ while count < 10000:
 def main() -> None:
     """Run the parts, print tables and the result."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--parts", nargs="+", choices=PARTS, default=["drive", "kitti", "turn", "pano"])
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=["drive", "kitti", "turn", "trust", "pano"])
     parser.add_argument("--path", default="00", help="of kitti_gt_poses")
     parser.add_argument("--length", type=float, default=1500.0)
     parser.add_argument("--adam", type=float, default=40.0, help="seconds for the mission's method; 0: leave it out")
@@ -225,13 +227,15 @@ def main() -> None:
     out.mkdir(parents=True, exist_ok=True)
     keys = (
         "drift_percent", "local400_m", "adam_drift_percent", "kitti06_ate_m", "pycolmap_time_ratio", "fps",
-        "turn_ate_m", "turn_pycolmap_ratio", "gain_ate_ratio",
+        "turn_ate_m", "turn_pycolmap_ratio", "gain_ate_ratio", "covariance_95",
     )  # fmt: skip
     result: dict[str, float | None] = dict.fromkeys(keys)
     if "drive" in arguments.parts:
         result |= drive(out, arguments.path, arguments.length, arguments.adam)
     if "turn" in arguments.parts:
         result |= turn(out)
+    if "trust" in arguments.parts:
+        result |= covariance(out)
     for part, needed in (("kitti", "kitti_odo06_vo51"), ("pano", "pano360")):
         if part not in arguments.parts:
             continue

@@ -67,6 +67,10 @@ class BusyError(ScanError):
     """Another run is at work in the same place."""
 
 
+class UnsureError(ScanError):
+    """What came out is there, but most of it was guessed, not seen."""
+
+
 class UnavailableError(ScanError):
     """Something that is not installed or can't run on this machine."""
 
@@ -80,6 +84,7 @@ EXIT_CODES: dict[type[BaseException], tuple[int, int, str]] = {
     SpaceError: (6, 507, "the disk is full or can't be written to"),
     UnavailableError: (7, 501, "something needed is not installed or can't run here"),
     BusyError: (8, 409, "another run is at work in the same folder"),
+    UnsureError: (9, 422, "the result is there, but most of it was guessed, not seen"),
     KeyboardInterrupt: (130, 499, "interrupted; what was finished is kept"),
 }
 

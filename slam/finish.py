@@ -6,15 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scan2sim.pipeline.types import F64, I64, Bools, Frame, GpsTrack, Trajectory
+from scan2sim.pipeline.types import F64, I64, Frame, GpsTrack, Trajectory
 from scan2sim.slam import scale
 from scan2sim.slam.geometry import exp_so3
 from scan2sim.slam.mapped import Mapped
-
-DRIFT, TURN = 0.003, 2e-5
-"""Of the way and radians a metre: how far tracked poses are off, one standard deviation (bench/slam.py measures it)."""
-BRIDGED_DRIFT, BRIDGED_TURN = 0.2, 0.03
-"""Of the way and radians a second, where poses were carried on without seeing."""
+from scan2sim.slam.uncertainty import covariances, moved
 
 
 @dataclass(frozen=True)
@@ -61,7 +57,8 @@ def finish(mapped: Mapped, gps: GpsTrack | None, *, georeference: bool = True) -
             turn, shift = place(positions, gps.at(times))
             R, positions, rotations = turn @ R, positions @ turn.T + shift, turn @ rotations
             frame = gps.frame
-    covariance = uncertainty(times, positions, unsure)
+    unit = float(np.median(factor)) if len(factor) else 1.0
+    covariance = moved(covariances(mapped, gps, unit, placed=gps is not None and georeference), R, unit)
     trajectory = Trajectory(times, positions, rotations, unsure, covariance)
     return trajectory, Placing(R, positions[0] - poses[0, :3, 3] @ R.T, factor, frame)
 
@@ -93,17 +90,3 @@ def place(positions: F64, there: F64) -> tuple[F64, F64]:
         off = np.linalg.norm((a @ turn.T + shift - b)[:, :2], axis=1)
         w = 1 / (1 + (off / 3.0) ** 2)
     return turn, shift
-
-
-def uncertainty(times: F64, positions: F64, unsure: Bools) -> F64:
-    """(T, 6, 6) covariance against the start: little for what was tracked, much for what was bridged."""
-    way = np.linalg.norm(np.diff(positions, axis=0), axis=1)
-    seconds = np.diff(times)
-    blind = unsure[1:]
-    tracked = np.cumsum(np.where(blind, 0, way))
-    sigma = DRIFT * tracked + np.sqrt(np.cumsum(np.where(blind, (BRIDGED_DRIFT * way) ** 2 * 10, 0)))
-    turn = TURN * tracked + np.sqrt(np.cumsum(np.where(blind, (BRIDGED_TURN * seconds) ** 2 * 10, 0)))
-    out = np.zeros((len(times), 6, 6))
-    for k in range(3):
-        out[1:, k, k], out[1:, 3 + k, 3 + k] = sigma**2, turn**2
-    return out

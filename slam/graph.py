@@ -79,12 +79,11 @@ class Graph:
 
 @dataclass(frozen=True)
 class Solution:
-    """What came out: `poses` (C, 4, 4), `points` (P, 3), `shared` (S,), `covariance` (C, 6, 6) or None."""
+    """What came out: `poses` (C, 4, 4), `points` (P, 3), `shared` (S,)."""
 
     poses: F64
     points: F64
     shared: F64
-    covariance: F64 | None = None
 
 
 def errors(graph: Graph, poses: F64, points: F64, shared: F64 | None = None) -> F64:

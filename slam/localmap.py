@@ -13,8 +13,10 @@ from scan2sim.pipeline.ranges import Reach
 from scan2sim.pipeline.step import Params
 from scan2sim.pipeline.types import F64, I32, I64, Bools, Camera, GpsTrack
 from scan2sim.slam import shared, solvers
-from scan2sim.slam.geometry import triangulate
+from scan2sim.slam.geometry import angles, triangulate
 from scan2sim.slam.graph import Chord, Graph, errors
+from scan2sim.slam.information import Information
+from scan2sim.slam.solvers import lm
 
 
 class MapParams(Params):
@@ -57,7 +59,7 @@ class Keyframe:
         ids, bearing: (N,), (N, 3) the features it sees.
         part: number of the map it belongs to.
         velocity: (6,) metres and radians a second, in the camera's axes.
-        covariance: (6, 6) of its pose against the window's oldest, or None.
+        tied: whether it was placed by what the keyframes before it see; else it is where it is believed to be.
     """
 
     time: float
@@ -66,7 +68,7 @@ class Keyframe:
     bearing: F64
     part: int
     velocity: F64
-    covariance: F64 | None = None
+    tied: bool = True
 
 
 @dataclass
@@ -117,6 +119,7 @@ class LocalMap:
     """Keyframes and landmarks; `part` counts the maps begun."""
 
     STATE = ("keyframes", "landmarks", "retired", "_others", "part", "shared")
+    PARTS = ("information",)
 
     def __init__(
         self, camera: Camera, params: MapParams, pixel: float, *, gps: GpsTrack | None, backend: str, keep: bool
@@ -128,6 +131,7 @@ class LocalMap:
         self.keyframes: list[Keyframe] = []
         self.landmarks = Landmarks()
         self.retired: list[Landmarks] = []
+        self.information = Information(params.window + params.anchors + 1)
         self._others = 0  # of those retired, how many are of earlier maps
         self.part = 0
         wanted = zip(shared.NAMES, shared.SIGMA, (params.rolling_shutter, params.lens_offset), strict=True)
@@ -137,6 +141,7 @@ class LocalMap:
 
     def begin(self, keyframe: Keyframe) -> None:
         """A new map, of one keyframe."""
+        self.tell()
         self._retire(self.landmarks)
         self.landmarks, self._others = Landmarks(), len(self.retired)
         self.keyframes.append(keyframe)
@@ -167,6 +172,35 @@ class LocalMap:
             keyframe.velocity = keyframe.velocity * np.repeat([factor, 1.0], 3)
         for points in (self.landmarks, *self.retired[self._others :]):
             points.xyz = centre + factor * (points.xyz - centre)
+        self.information.rescale(len(self.keyframes) - len(mine), factor)
+
+    def tell(self) -> None:
+        """Let all points that are known say what they do of the keyframes; twice is once."""
+        if self.keyframes:
+            part = self.keyframes[-1].part
+            first = max(0, len(self.keyframes) - self.params.window - self.params.anchors - 1)
+            for k in range(first, len(self.keyframes)):
+                if self.keyframes[k].part == part:
+                    self._tell(k)
+
+    def _tell(self, first: int) -> None:
+        """Let the points that a keyframe sees say what they do of it and of those after it."""
+        which = list(range(first, len(self.keyframes)))
+        ids = self.information.untold(self.keyframes[first].ids, first)
+        seen = self.observations(which)
+        seen = seen.keep(np.isin(seen.ids, ids[self.landmarks.find(ids)[1]]))
+        if not len(seen.ids):
+            return
+        xyz = self.landmarks.xyz[self.landmarks.find(seen.ids)[0]]
+        error = angles(self.poses(which)[seen.of], xyz, seen.bearing)
+        seen, error = seen.keep(error < self.gate), error[error < self.gate]
+        names, rows, counts = np.unique(seen.ids, return_inverse=True, return_counts=True)
+        several = counts[rows] >= 2
+        seen, error, names = seen.keep(several), error[several], names[counts >= 2]
+        if len(names):
+            xyz = self.landmarks.xyz[self.landmarks.find(names)[0]]
+            graph = self.graph(which, seen, names, xyz, np.zeros(len(which), bool))
+            self.information.tell(which, names, lm.information(graph), error)
 
     def _retire(self, gone: Landmarks) -> None:
         if self.keep and len(gone):
@@ -175,7 +209,11 @@ class LocalMap:
     def _forget(self) -> None:
         """What keyframes saw that have left the window, so that memory doesn't grow."""
         last = len(self.keyframes) - self.params.window - self.params.anchors - 1
-        if last >= 0 and not self.keep:
+        if last < 0:
+            return
+        if self.keyframes[last].part == self.part:
+            self._tell(last)
+        if not self.keep:
             self.keyframes[last].ids, self.keyframes[last].bearing = np.zeros(0, np.int64), np.zeros((0, 3))
 
     def window(self) -> list[int]:

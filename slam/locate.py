@@ -11,6 +11,7 @@ from scan2sim.slam import solvers
 from scan2sim.slam.geometry import angles
 from scan2sim.slam.graph import Graph
 from scan2sim.slam.localmap import LocalMap
+from scan2sim.slam.solvers import lm
 from scan2sim.slam.trackers import Tracks
 
 FEWEST = 8
@@ -26,12 +27,14 @@ class Located:
         known: how many of the points that it sees are known.
         agree: how many of these agree with the pose.
         wrong: (N,) ids of those that contradict it.
+        covariance: (6, 6) of the pose against the points, metres and radians about world axes; None: unknown.
     """
 
     pose: F64
     known: int
     agree: int
     wrong: I64
+    covariance: F64 | None = None
 
 
 def locate(points: LocalMap, tracks: Tracks, guess: F64, velocity: F64) -> Located:
@@ -55,4 +58,14 @@ def locate(points: LocalMap, tracks: Tracks, guess: F64, velocity: F64) -> Locat
     )  # fmt: skip
     pose = solvers.named(points.backend).solve(graph, points=False).poses[0]
     error = angles(pose, xyz, bearing)
-    return Located(pose, n, int((error < points.gate).sum()), tracks.ids[known][error > 3 * points.gate])
+    good = error < points.gate
+    covariance = _covariance(pose, xyz[good], bearing[good], error[good]) if good.sum() >= FEWEST else None
+    return Located(pose, n, int(good.sum()), tracks.ids[known][error > 3 * points.gate], covariance)
+
+
+def _covariance(pose: F64, xyz: F64, bearing: F64, error: F64) -> F64:
+    """Of a pose (4, 4) by points (N, 3), their bearings (N, 3) and the errors of these (N,), radians."""
+    n = len(xyz)
+    graph = Graph(pose[None], xyz, np.arange(n, dtype=np.int32), np.zeros(n, np.int32), bearing, np.zeros(1, bool), 1.0)
+    noise = float((error**2).sum()) / (2 * n - 6)
+    return np.asarray(noise * np.linalg.pinv(lm.information(graph, points=False), hermitian=True), np.float64)

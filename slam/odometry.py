@@ -55,20 +55,29 @@ class OdometryParams(MapParams):
 
 @dataclass
 class Placed:
-    """Where a frame is: (4, 4) in the axes of keyframe `keyframe`, and whether it was bridged, not seen."""
+    """Where a frame is.
+
+    Attributes:
+        time: seconds.
+        keyframe: number of the one whose axes the pose is in.
+        T_key_cam: (4, 4).
+        unsure: it was bridged, not seen; or nothing ties the map that it was seen in to those before.
+        covariance: (6, 6) of its pose against the map's points, metres and radians about world axes; None: bridged.
+    """
 
     time: float
     keyframe: int
     T_key_cam: F64
     unsure: bool
+    covariance: F64 | None = None
 
 
 class Odometry:
     """Feed `add` with frames; `placed` and `map` hold what came out."""
 
     STATE = (
-        "placed", "_rng", "_pose", "_time", "_velocity", "_started", "_blind", "_waiting", "_settled", "_lost_at",
-        "_memory", "_known",
+        "placed", "_rng", "_pose", "_time", "_velocity", "_started", "_blind", "_waiting", "_settled", "_adrift",
+        "_lost_at", "_memory", "_known",
     )  # fmt: skip
     PARTS = ("map", "tracker")
 
@@ -109,6 +118,7 @@ class Odometry:
         self._parallax = math.radians(params.parallax or (1.0 if self.facets.whole else 3.0))
         self._waiting: list[Tracks] = []  # of frames since the first keyframe of a map, or since the car moved
         self._settled = 0
+        self._adrift = False  # nothing ties this map to those before
         self._lost_at: float | None = None
         self._memory: list[tuple[list[U8], F64]] = []  # facets and poses of the last good keyframes
         self._known: tuple[float, list[Remembered]] | None = None
@@ -154,7 +164,7 @@ class Odometry:
             expected[known] = seen / np.maximum(np.linalg.norm(seen, axis=1, keepdims=True), 1e-9)
         return expected
 
-    def _place(self, time: float, pose: F64, *, unsure: bool) -> None:
+    def _place(self, time: float, pose: F64, *, unsure: bool, covariance: F64 | None = None) -> None:
         """Keep a frame's pose, and what it says of the car's speed."""
         dt = time - self._time
         if dt > 0:
@@ -162,7 +172,8 @@ class Odometry:
             self._velocity = np.concatenate([moved[:3, 3], log_so3(moved[:3, :3])]) / dt
         self._pose, self._time = pose, time
         last = len(self.map.keyframes) - 1
-        self.placed.append(Placed(time, last, inverse(self.map.keyframes[last].T_world_cam) @ pose, unsure))
+        from_key = inverse(self.map.keyframes[last].T_world_cam) @ pose
+        self.placed.append(Placed(time, last, from_key, unsure or self._adrift, covariance))
 
     def _continue(self, time: float, guess: F64) -> None:
         found = locate(self.map, self.tracker.tracks, guess, self._velocity)
@@ -173,7 +184,7 @@ class Odometry:
         if self._lost_at is not None:
             self.warn(f"{time:.2f} s: found again, {time - self._lost_at:.2f} s after it was lost")
             self._lost_at = None
-        self._place(time, found.pose, unsure=False)
+        self._place(time, found.pose, unsure=False, covariance=found.covariance)
         if self._due():
             self._keyframe(time)
 
@@ -239,13 +250,14 @@ class Odometry:
 
     # beginning, and beginning anew
 
-    def _begin(self, time: float, pose: F64) -> None:
-        """The first keyframe of a map, unless there is nothing to see."""
+    def _begin(self, time: float, pose: F64, *, tied: bool = True) -> None:
+        """The first keyframe of a map, unless there is nothing to see; `tied`: its place has been seen."""
         found = self.tracker.refill()
         tracks = self.tracker.tracks
         self._blind, self._started, self._waiting, self._settled = found < 30, False, [], 0
         if not self.map.keyframes or not self._blind:
-            self.map.begin(Keyframe(time, pose, tracks.ids, tracks.bearing, self.map.part, self._velocity))
+            keyframe = Keyframe(time, pose, tracks.ids, tracks.bearing, self.map.part, self._velocity, tied)
+            self.map.begin(keyframe)
         self._place(time, pose, unsure=self.map.part > 0 or self._blind)
 
     def _initialise(self, time: float, guess: F64) -> None:
@@ -315,7 +327,12 @@ class Odometry:
         self.map.part += 1
         self.tracker.tracks = Tracks()
         found = self._recognised(time)
-        self._begin(time, guess if found is None else found)
+        self._adrift = found is None and not self._bridged_by_gps(time)
+        self._begin(time, guess if found is None else found, tied=found is not None)
+
+    def _bridged_by_gps(self, time: float) -> bool:
+        """Whether GPS tells how far the car came while it was lost."""
+        return self._lost_at is not None and gps_distance(self.gps, self._lost_at - 1.0, time) is not None
 
     def _recognised(self, time: float) -> F64 | None:
         """The pose by the keyframes before the loss."""

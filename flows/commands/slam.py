@@ -21,7 +21,7 @@ from scan2sim.flows.engine.planning import STORE, Planned
 from scan2sim.flows.engine.progress import PublishedRun, published
 from scan2sim.flows.recipes.settings import Settings
 from scan2sim.flows.recipes.video import ALONE, STEPS, Video, recipe
-from scan2sim.pipeline.errors import SettingError
+from scan2sim.pipeline.errors import SettingError, UnsureError
 from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.io.worlds import link
 from scan2sim.pipeline.store import Digests, Manifest, Store
@@ -38,6 +38,8 @@ MADE = (
     "colmap",
 )
 """What a run may leave beside `slam.json`."""
+MOSTLY = 0.5
+"""Of the poses: where more are unsure, the path is none."""
 
 app = App("Where the camera of a video went: `slam VIDEO --out DIR`.", first=True)
 
@@ -60,6 +62,12 @@ def slam_a_video(
         warn(text)
     console.print(json.dumps(figures, indent=1), highlight=False, markup=False)
     console.print(f"Trajectory: {out / 'trajectory.csv'}", highlight=False, soft_wrap=True, markup=False)
+    if figures["unsure_share"] > MOSTLY:
+        share = f"{100 * figures['unsure_share']:.0f} %"
+        raise UnsureError(
+            out / "trajectory.csv", f"{share} of the poses are unsure: they were carried on",
+            "Give --gps, more frames a second, or a part of the video that is lit and goes on",
+        )  # fmt: skip
 
 
 @app.command("evaluate")

@@ -21,8 +21,8 @@ ENOUGH = 1e-4
 """Relative fall of the cost below which no further iteration is made."""
 
 
-def solve(graph: Graph, *, iterations: int | None = None, points: bool = True, covariance: bool = False) -> Solution:
-    """See `slam.solvers.Solver`; `covariance` gives that of the cameras, (C, 6, 6), at the solution."""
+def solve(graph: Graph, *, iterations: int | None = None, points: bool = True) -> Solution:
+    """See `slam.solvers.Solver`."""
     poses, xyz, shared = graph.poses.copy(), graph.points.copy(), graph.shared.copy()
     free = np.cumsum(~graph.fixed).astype(np.int64) - 1
     free[graph.fixed] = -1
@@ -50,21 +50,18 @@ def solve(graph: Graph, *, iterations: int | None = None, points: bool = True, c
         damping = max(damping / 10, 1e-9)
         if fell < ENOUGH:
             break
-    known = _covariance(graph, poses, xyz, shared, free, starts, size) if covariance else None
-    return Solution(poses, xyz, shared, known)
+    return Solution(poses, xyz, shared)
 
 
-def _covariance(graph: Graph, poses: F64, xyz: F64, shared: F64, free: I64, starts: I64, size: int) -> F64:
-    H, g, V, gp, W = _normal(graph, poses, xyz, shared, free, starts, size, True)
-    out = np.zeros((len(poses), 6, 6))
-    if not size:
-        return out
-    reduced, _ = _reduce(H, g, V, gp, W, starts, graph.camera_of, free, graph.bend.shape[1], 1e-9)
-    inverse = np.linalg.pinv(reduced, hermitian=True)
-    for c in np.flatnonzero(~graph.fixed):
-        at = slice(6 * free[c], 6 * free[c] + 6)
-        out[c] = inverse[at, at]
-    return out
+def information(graph: Graph, *, points: bool = True) -> F64:
+    """(6 C, 6 C) what the observations alone say of the cameras, per squared radian; points eliminated, or believed."""
+    count = len(graph.poses)
+    free, starts = np.arange(count), np.searchsorted(graph.point_of, np.arange(len(graph.points) + 1))
+    none = np.zeros((0, 0, 6)), np.zeros(0)
+    H, g, V, gp, W = _accumulate(
+        graph.poses, graph.points, starts, graph.camera_of, graph.bearing, *none, free, 6 * count, 1.0
+    )
+    return _reduce(H, g, V, gp, W, starts, graph.camera_of, free, 0, 0.0)[0] if points else H
 
 
 def _moved(poses: F64, shared: F64, step: F64, fixed: Bools) -> tuple[F64, F64]:

@@ -7,11 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from scan2sim.pipeline.types import Camera, GpsTrack
+from scan2sim.pipeline.types import F64, Bools, Camera, GpsTrack
 from scan2sim.slam.geometry import exp_so3, rigid
 from scan2sim.slam.odometry import Odometry, OdometryParams
 from scan2sim.slam.trackers import Tracks
 
+INSIDE = 7.815
+"""Of chi-square with three degrees of freedom: where 95 % are."""
 CAMERA_TO_WORLD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # looks along +x, z up
 
 
@@ -95,6 +97,14 @@ class Follower:
         return len(chosen)
 
 
+class Narrow(Follower):
+    """Sees what a perspective camera does: 45 degrees about its axis."""
+
+    def _seen(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        bearing, seen = super()._seen(points)
+        return bearing, seen & (bearing[:, 2] > 0.7)
+
+
 def gps_of(times: np.ndarray, poses: np.ndarray, sigma: float = 0.0, seed: int = 0) -> GpsTrack:
     """Fixes at every pose."""
     noise = np.random.default_rng(seed).normal(0, sigma, (len(times), 3)) if sigma else 0.0
@@ -117,3 +127,19 @@ def run(
     for time in times:
         odometry.add(float(time), np.zeros((4, 8), np.uint8))
     return odometry
+
+
+def off(odometry: Odometry, poses: F64) -> F64:
+    """(T, 3) errors of positions against poses (T, 4, 4) at 10 Hz that begin where the odometry's do, at its scale."""
+    first, second = odometry.map.keyframes[:2]
+    a, b = (poses[round(10 * k.time)] for k in (first, second))
+    unit = np.linalg.norm(second.T_world_cam[:3, 3] - first.T_world_cam[:3, 3]) / np.linalg.norm(b[:3, 3] - a[:3, 3])
+    truth = np.linalg.inv(a) @ poses
+    truth[:, :3, 3] *= unit
+    found = np.stack([odometry.pose_of(p)[:3, 3] for p in odometry.placed])
+    return found - (first.T_world_cam @ truth)[:, :3, 3]
+
+
+def inside(errors: F64, covariance: F64) -> Bools:
+    """(T,) whether 95 % ellipsoids hold the errors."""
+    return np.einsum("ti,tij,tj->t", errors, np.linalg.inv(covariance[:, :3, :3]), errors) < INSIDE

@@ -20,7 +20,7 @@ from scan2sim.flows.cli import app
 from scan2sim.flows.engine.planning import plan
 from scan2sim.flows.recipes.settings import Settings
 from scan2sim.flows.recipes.video import Video, recipe
-from scan2sim.pipeline.errors import InputError, ScanError
+from scan2sim.pipeline.errors import InputError, ScanError, UnsureError, exit_code
 from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.store import Store
 from scan2sim.pipeline.types import U8
@@ -60,6 +60,16 @@ def test_it_writes_the_trajectory_in_all_formats_and_says_that_there_is_no_gps(
     assert not (out / "trajectory.geojson").exists()
     assert json.loads((out / "slam.json").read_text())["frames"] == len(found)
     assert list((out / "steps").rglob("state*")) == []
+
+
+def test_a_path_that_was_mostly_guessed_ends_with_a_code_of_its_own(corridor: Drive, tmp_path: Path) -> None:
+    frames = tmp_path / "frames"
+    frames.mkdir()
+    for k, grey in enumerate(corridor.greys[:12]):
+        cv2.imwrite(str(frames / f"{k:03d}.png"), grey if k < 2 else np.full_like(grey, 9))
+    with pytest.raises(UnsureError, match="of the poses are unsure"):
+        command("slam", frames, "--out", tmp_path / "out")
+    assert (tmp_path / "out" / "trajectory.csv").is_file() and exit_code(UnsureError("", "", "")) == 9
 
 
 def test_what_was_tracked_is_kept_when_only_its_placing_changes(corridor: Drive, tmp_path: Path) -> None:

@@ -1,0 +1,62 @@
+"""Whether a trajectory's covariances can be trusted: simulated drives, whose truth is known, and their ellipsoids."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from scan2sim.pipeline.types import F64
+from scan2sim.slam.mapped import Mapped
+from scan2sim.slam.uncertainty import covariances
+from tests.slam.made_up import Follower, Narrow, drive, inside, off, run, scatter
+
+DRIVES, SECONDS = 20, 20.0
+
+
+def covariance(out: Path) -> dict[str, float | None]:
+    """The share of positions in their 95 % ellipsoids: every other drive with a 360 camera, the others perspective."""
+    held = []
+    for seed in range(DRIVES):
+        times, poses = drive(SECONDS, turn=0.05 * (1 + seed % 4))
+        kind, count = ((Follower, 6000), (Narrow, 20000))[seed % 2]
+        odometry = run(times, kind(poses, scatter(poses, count, seed), seed=seed), parallax=(3.0, 1.0)[seed % 2])
+        errors, known = off(odometry, poses), covariances(Mapped.of(odometry, ()), None)
+        held.append(float(inside(errors, known).mean()))
+        if seed < 2:
+            found = np.stack([odometry.pose_of(p)[:3, 3] for p in odometry.placed])
+            _draw(out / f"ellipsoids_{kind.__name__.lower()}.png", found, found - errors, known)
+    kinds = [float(np.mean(held[k::2])) for k in (0, 1)]
+    print(f"95 % ellipsoids hold {np.mean(held):.1%} of positions over {DRIVES} drives", end=" ")
+    print(
+        f"(360 degrees {kinds[0]:.1%}, perspective {kinds[1]:.1%}; each {', '.join(f'{h:.0%}' for h in held)})",
+        flush=True,
+    )
+    return {"covariance_95": float(np.mean(held))}
+
+
+def _draw(file: Path, found: F64, truth: F64, known: F64) -> None:
+    """Path over truth from above, and errors beside their standard deviations, along the map's x and z."""
+    import matplotlib.pyplot as plt
+    from matplotlib.patches import Ellipse
+
+    figure, (above, along) = plt.subplots(1, 2, figsize=(13, 5))
+    above.plot(*truth[:, [0, 2]].T, "k", lw=1, label="truth")
+    above.plot(*found[:, [0, 2]].T, "C0", lw=1, label="found")
+    for place, block in zip(found[::10], known[::10], strict=True):
+        values, axes = np.linalg.eigh(block[np.ix_([0, 2], [0, 2])])
+        size = 2 * np.sqrt(5.99 * values) * 20
+        above.add_patch(
+            Ellipse(place[[0, 2]], *size, angle=np.degrees(np.arctan2(axes[1, 0], axes[0, 0])), fill=False, ec="C3")
+        )
+    above.set(aspect="equal", title="95 % ellipses, 20 times as large")
+    for k, name in ((0, "x"), (2, "z")):
+        sigma = np.sqrt(known[:, k, k])
+        along.plot(found[:, k] - truth[:, k], f"C{k}", label=f"error, {name}")
+        along.fill_between(np.arange(len(sigma)), -1.96 * sigma, 1.96 * sigma, color=f"C{k}", alpha=0.2)
+    along.set(xlabel="frame", title="errors and 95 %")
+    for part in (above, along):
+        part.legend()
+        part.grid(alpha=0.3)
+    figure.savefig(file, dpi=80)
+    plt.close(figure)
