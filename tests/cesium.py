@@ -119,6 +119,7 @@ class Viewer:
         *,
         focal: float,
         centre: tuple[float, float] | None = None,
+        pixels: float = 16.0,
     ) -> list[str]:
         """Look from somewhere until nothing more is loaded; returns the contents that are shown, by their paths.
 
@@ -126,6 +127,7 @@ class Viewer:
             position, direction, up: earth-centred; metres.
             focal: pixels.
             centre: of the picture, pixels, as `Camera` has it; default: its middle.
+            pixels: that a level's error may span; 16 is Cesium's default.
         """
         width, height = self._size
         x, y = centre or (width / 2 - 0.5, height / 2 - 0.5)
@@ -137,6 +139,7 @@ class Viewer:
             "yOffset": NEAR * (y + 0.5 - height / 2) / focal,
         }
         told = ", ".join(map(json.dumps, (list(position), list(direction), list(up), frustum)))
+        self.page.value(f"void (tiles.maximumScreenSpaceError = {pixels})")
         shown: list[str] = self.page.value(f"look({told})")
         assert not self.page.errors, self.page.errors
         return shown

@@ -19,6 +19,8 @@ from tests import cesium
 FORMAT = "tiles3d"
 SMALL = 8.0
 """Pixels that the coarsest level's error spans from afar: it is fine enough there."""
+ALL = 0.01
+"""Pixels that no level's error stays below but the finest's."""
 AHEAD = 10.0
 """Metres to places by which directions are taken."""
 LEVEL = "/level"
@@ -31,7 +33,10 @@ def missing() -> str:
 
 
 def check(export: Path, places: Places) -> dict[str, Any]:
-    """Look from a photo's pose, and from above; see the module."""
+    """Look from a photo's pose, and from above; see the module.
+
+    `levels_differ` are grey levels (mean) between the picture with coarser levels and that with the finest alone.
+    """
     tileset = json.loads((export / "tileset.json").read_text(encoding="utf-8"))
     about = tileset["extras"]
     if about["crs"] == crs.LOCAL:
@@ -41,6 +46,8 @@ def check(export: Path, places: Places) -> dict[str, Any]:
     focal, centre = seen.camera.fx, (seen.camera.cx, seen.camera.cy)
     size = seen.camera.width, seen.camera.height
     with tempfile.TemporaryDirectory() as work, cesium.viewer(export, Path(work), size) as view:
+        view.look(*_onto_earth(frame, seen.pose), focal=focal, centre=centre, pixels=ALL)
+        finest = view.picture()
         near = view.look(*_onto_earth(frame, seen.pose), focal=focal, centre=centre)
         picture = view.picture()
         far = view.look(*_onto_earth(frame, _above(tileset, places, focal)), focal=focal, centre=centre)
@@ -49,7 +56,8 @@ def check(export: Path, places: Places) -> dict[str, Any]:
     if far != [tileset["root"]["content"]["uri"]]:
         raise Fault(f"the coarsest level isn't shown from afar, but {far}")
     likeness = gate_pictures.compare(export, "cesium", seen, picture, (picture != cesium.SKY).any(axis=2))
-    return {"shown_near": len(near), "shown_far": len(far), **likeness}
+    differ = round(float(np.abs(picture.astype(float) - finest).mean()), 2)
+    return {"shown_near": len(near), "shown_far": len(far), "levels_differ": differ, **likeness}
 
 
 def _above(tileset: dict[str, Any], places: Places, focal: float) -> F64:
