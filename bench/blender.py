@@ -53,7 +53,7 @@ def module() -> tuple[str, ...]:
     return (sys.executable,)
 
 
-def check(command: Sequence[str], export: Path, files: Sequence[Path], suffix: str) -> dict[str, Any]:
+def check(command: Sequence[str], export: Path, files: Sequence[Path], suffix: str, double: int = 0) -> dict[str, Any]:
     """Import files into one empty scene, and hold what is there against the export's own figures.
 
     Args:
@@ -61,12 +61,13 @@ def check(command: Sequence[str], export: Path, files: Sequence[Path], suffix: s
         export: folder of the export, with `metadata.json`.
         files: to be imported.
         suffix: of them, and of the files whose triangles `metadata.json` counts.
+        double: triangles that Blender leaves out.
 
     Raises:
         Fault: triangles, textures or coordinates are missing, or they lie elsewhere.
     """
     about = json.loads((export / "metadata.json").read_text(encoding="utf-8"))
-    wanted = sum(count for file, count in about["triangles_by_file"].items() if file.endswith(suffix))
+    wanted = sum(count for file, count in about["triangles_by_file"].items() if file.endswith(suffix)) - double
     found = _imported(command, files, suffix)
     figures = {name: found[name] for name in ("objects", "triangles", "textures")}
     if found["triangles"] != wanted:

@@ -1,4 +1,4 @@
-"""KTX 2 with Basis Universal (ETC1S): stays packed on graphics cards, a sixth of the memory; `KHR_texture_basisu`.
+"""KTX 2 with Basis Universal (ETC1S): stays packed in graphics cards; `KHR_texture_basisu`.
 
 Encoded by Binomial's `basisu`, or by `toktx` of Khronos' KTX-Software, with mip-maps: none can be made of it later.
 """

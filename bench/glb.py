@@ -1,0 +1,76 @@
+"""How large GLBs are, by how they are packed, and what telling where colours are from costs.
+
+`python -m bench.glb [--world OUT]`, OUT the folder that `run` or `survey` was given (default: the gate's demo tile).
+Each way writes the world's GLBs anew. Ways that need a package or program that isn't there are skipped, and said.
+
+Ends with `RESULT {"ways": {way: {"mb", "geometry_mb", "textures_mb", "seconds"}}, "skipped": [...]}`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import struct
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from bench.gate_worlds import ROOT
+from scan2sim.pipeline.errors import UnavailableError
+from scan2sim.pipeline.io import scenes
+from scan2sim.pipeline.io.scene import Scene, read_scene
+from scan2sim.pipeline.io.scenes import SceneParams
+from scan2sim.pipeline.step import silent
+
+WAYS: dict[str, dict[str, Any]] = {
+    "default": {},
+    "without provenance": {"glb_bare": True},
+    "lit, without provenance": {"glb_bare": True, "glb_lit": True},
+    "meshopt": {"glb_mesh": "meshopt"},
+    "draco": {"glb_mesh": "draco"},
+    "webp": {"glb_texture": "webp"},
+    "meshopt, webp": {"glb_mesh": "meshopt", "glb_texture": "webp"},
+    "ktx2": {"glb_texture": "ktx2"},
+}
+
+
+def measure(scene: Scene, params: dict[str, Any]) -> dict[str, float]:
+    """Megabytes of a world's GLBs, and of what is in them; seconds that writing takes."""
+    with tempfile.TemporaryDirectory() as place:
+        begun = time.perf_counter()
+        scenes.write(scene, ["glb"], Path(place), SceneParams(**params), silent)
+        seconds = time.perf_counter() - begun
+        files = sorted(Path(place).glob("*.glb"))
+        whole, textures = sum(file.stat().st_size for file in files), sum(map(_textures, files))
+    megabytes = {"mb": whole, "geometry_mb": whole - textures, "textures_mb": textures}
+    return {name: round(size / 1e6, 2) for name, size in megabytes.items()} | {"seconds": round(seconds, 1)}
+
+
+def _textures(path: Path) -> int:
+    """Bytes of a GLB's pictures."""
+    data = path.read_bytes()
+    (length,) = struct.unpack("<I", data[12:16])
+    tree = json.loads(data[20 : 20 + length])
+    return sum(tree["bufferViews"][picture["bufferView"]]["byteLength"] for picture in tree["images"])
+
+
+def main() -> None:
+    """Write all ways, print a table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--world", type=Path, default=ROOT / "bench-out" / "gate" / "demo" / "run")
+    parser.add_argument("--ways", nargs="+", choices=list(WAYS), default=list(WAYS))
+    arguments = parser.parse_args()
+    scene = read_scene(arguments.world)
+    result: dict[str, Any] = {"ways": {}, "skipped": []}
+    for way in arguments.ways:
+        try:
+            result["ways"][way] = found = measure(scene, WAYS[way])
+            print(f"{way:24}", json.dumps(found), flush=True)
+        except UnavailableError as why:
+            result["skipped"].append(f"{way}: {why}")
+    print("RESULT", json.dumps(result))
+
+
+if __name__ == "__main__":
+    main()
