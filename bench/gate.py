@@ -58,15 +58,17 @@ def main() -> None:
         if why := module.missing():
             result["skipped"].append(f"{name}: {why}")
     able = {name: module for name, module in able.items() if not module.missing()}
+    runs: dict[str, Path] = {}
     for name in arguments.worlds:
         try:
             subject = WORLDS[name](arguments.out / name)
         except Absent as why:
             result["skipped"].append(f"{name}: {why}")
             continue
+        runs[name] = subject.run
         _through(subject, able, result)
     if "gazebo" in able and not arguments.no_load:
-        result |= load(arguments.out / "load")
+        result |= load(arguments.out / "load", runs)
     result |= georeference(arguments.out / "georeference")
     faulty = {fault.split(" ")[0] for fault in result["faults"]}
     print("RESULT", json.dumps({"consumers": len(set(able) - faulty), **result}))

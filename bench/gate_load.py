@@ -1,12 +1,14 @@
 """What loading a tile costs Gazebo's MeshManager, beside one mesh of a million triangles (D3.2, section 4.2).
 
 Both are made here, of a rolling ground: the tile as full as the defaults allow (terrain and buildings of 100,000
-triangles each, vegetation of 300,000, what is touched of 50,000), as OBJ; the single mesh as OBJ and as Collada.
+triangles each, vegetation of 300,000, what is touched of 50,000), as OBJ; the single mesh as OBJ and as Collada. Beside
+them the gate's own worlds, as they are.
 """
 
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,8 +28,12 @@ TOUCHED = 50_000
 ROUNDS = 3
 
 
-def load(folder: Path) -> dict[str, Any]:
+def load(folder: Path, worlds: Mapping[str, Path]) -> dict[str, Any]:
     """Print the processor's seconds, and megabytes, side by side.
+
+    Args:
+        folder: for what is made.
+        worlds: runs that are measured as they are, by their names.
 
     Returns:
         `load_ratio`: the tile's part of what the single mesh takes as OBJ, of seconds or memory, whichever is more.
@@ -47,6 +53,7 @@ def load(folder: Path) -> dict[str, Any]:
         "tile, OBJ": [*tile, folder / "collision.obj"],
         "single mesh, OBJ": [folder / "million.obj"],
         "single mesh, Collada": [folder / "million.dae"],
+        **{f"{name}, OBJ": sorted(run.glob("world/models/*/meshes/*.obj")) for name, run in worlds.items()},
     }
     taken = {what: least([checker.load_meshes(*paths) for _ in range(ROUNDS)]) for what, paths in files.items()}
     for what, figures in taken.items():
