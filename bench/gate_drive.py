@@ -62,8 +62,9 @@ def drive(engine: Engine, places: Places) -> dict[str, Any]:
         below = _wheels(pose)
         left += not places.on_road(below[:, :2]).all()
         above = max(above, float(np.nanmax(np.abs(below[:, 2] - places.heights(below[:, :2])), initial=0.0)))
-        aside = max(aside, float(np.linalg.norm(way[:, :2] - pose.place[:2], axis=1).min()))
-        driven = _chainage(way, along, pose.place) - first
+        at = _chainage(way, along, pose.place)
+        aside = max(aside, float(np.linalg.norm(_place(way, along, at) - pose.place[:2])))
+        driven = at - first
         if driven >= far:
             break
     figures = {
@@ -85,10 +86,15 @@ def _chainage(way: F64, along: F64, place: F64) -> float:
     return float(along[i] + share * (along[i + 1] - along[i]))
 
 
+def _place(way: F64, along: F64, at: float) -> F64:
+    """(2,) the place on a way at a chainage."""
+    return np.array([np.interp(at, along, k) for k in way[:, :2].T])
+
+
 def _steering(way: F64, along: F64, pose: Pose) -> float:
     """Radians a second to the left."""
     at = _chainage(way, along, pose.place) + AHEAD
-    goal = np.array([np.interp(at, along, k) for k in way[:, :2].T]) - pose.place[:2]
+    goal = _place(way, along, at) - pose.place[:2]
     aside = float(goal @ pose.rotation[:2, 1])
     return 2 * SPEED * aside / max(float(goal @ goal), 1e-6)
 

@@ -16,7 +16,7 @@ from scan2sim.pipeline.step import silent
 from tests.pipeline import made_up
 from tests.pipeline.io.scene_readers import READERS, surveyed_off
 
-APART = 5000.0
+APART = 5000.1234567
 
 
 def georeference(folder: Path) -> dict[str, Any]:

@@ -69,12 +69,14 @@ def find(scene: Scene) -> Start:
 
 def _paths(scene: Scene) -> list[Course]:
     """Ways that were driven, by tile; places are where the recording device was."""
+    from scipy.spatial import cKDTree
+
     found = []
     for tile in scene.tiles:
         if (tile.folder / PATH).is_file():
             places = Trajectory.load(tile.folder / PATH).positions + np.asarray(tile.offset)
             for way in driven.ways(places, np.ones(len(places), bool)):
-                nearest = np.linalg.norm(way[:, None] - places[:, :2], axis=2).argmin(axis=1)
+                _, nearest = cKDTree(places[:, :2]).query(way)
                 found.append(Course(np.column_stack([way, places[nearest, 2]]), "path"))
     return found
 
