@@ -181,6 +181,7 @@ class GpsTrack:
         sigma: (N,) metres, one standard deviation of a horizontal axis as the receiver's DOP tells it, or None.
         frame: UTM zone of the track, origin near its first fix; "local" for a file of local metres.
         epoch: UNIX time at which `times` are 0, where a video's telemetry tells it, or None.
+        scatter: metres, one standard deviation of a horizontal axis: what smoothing has left of the fixes' scatter.
     """
 
     times: F64
@@ -188,6 +189,7 @@ class GpsTrack:
     sigma: F64 | None = None
     frame: Frame = field(default_factory=Frame)
     epoch: float | None = None
+    scatter: float = 0.0
 
     def __len__(self) -> int:
         return len(self.times)

@@ -51,7 +51,8 @@ def finish(mapped: Mapped, gps: GpsTrack | None, *, georeference: bool = True) -
     positions, rotations = poses[:, :3, 3] @ R.T, R @ poses[:, :3, :3]
     factor, frame = np.ones(len(times) - 1), Frame()
     if gps is not None:
-        factor = scale.factors(times, positions, unsure, gps)
+        drifting = scale.AROUND if mapped.camera.model == "equirectangular" else scale.AHEAD
+        factor = scale.factors(times, positions, unsure, gps, drifting)
         positions = scale.apply(positions, factor)
         if georeference:
             turn, shift = place(positions, gps.at(times))

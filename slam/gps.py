@@ -16,7 +16,8 @@ def smooth(track: GpsTrack, seconds: float = 1.0, max_gap: float = 3.0) -> GpsTr
     LOWESS (Cleveland 1979) of degree 2: neighbours weigh by a Gaussian of `seconds`, and fixes that stray from their
     neighbours' curve lose their weight. `sigma` stays: a receiver's error hardly changes within seconds.
     """
-    return replace(track, positions=_lowess(track, seconds, max_gap)[0])
+    positions, leverage = _lowess(track, seconds, max_gap)
+    return replace(track, positions=positions, scatter=noise(track) * float(np.sqrt(np.median(leverage))))
 
 
 def noise(track: GpsTrack, seconds: float = 1.5, max_gap: float = 3.0) -> float:

@@ -32,6 +32,8 @@ QUARREL = 0.4, 2.5
 """Vision that says less, or more, of GPS's distance over two seconds is mistaken: it followed a bus, say."""
 SETTLED = 15.0, 60.0
 """Metres after which a map's scale, first taken from two keyframes, is set by GPS anew."""
+STILL = 1e-6 * np.eye(6)
+"""Square metres, square radians: of a car that stands."""
 REMEMBER = 20.0
 """Seconds for which the keyframes before a loss are looked for."""
 
@@ -270,7 +272,7 @@ class Odometry:
         moved, found = _median_angle(there, now), None
         if not self.map.part and moved < self.map.gate:  # the car stands
             self._waiting = []
-            self._place(time, first.T_world_cam, unsure=False)
+            self._place(time, first.T_world_cam, unsure=False, covariance=STILL)
             return
         if moved > math.radians(0.5):
             found = relative_pose(there, now, threshold=self.map.gate, rng=self._rng)
@@ -297,8 +299,9 @@ class Odometry:
         between, ends = self.placed[-1 - len(self._waiting) : -1], self.map.poses([-2, -1])
         guesses = interpolate(ends, np.array([since, time]), np.array([p.time for p in between]))
         for placed, tracks, guess in zip(between, self._waiting, guesses, strict=True):
-            pose = guess if placed.unsure else locate(self.map, tracks, guess, self._velocity).pose
-            placed.T_key_cam = inverse(ends[0]) @ pose
+            found = locate(self.map, tracks, guess, self._velocity)
+            placed.T_key_cam = inverse(ends[0]) @ (guess if placed.unsure else found.pose)
+            placed.covariance = None if placed.unsure else found.covariance
 
     def _baseline(self, first: Keyframe, time: float, guess: F64) -> float:
         """Metres between a map's first two keyframes: GPS's, else at the speed before, else 1."""

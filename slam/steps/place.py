@@ -42,4 +42,4 @@ def place(inputs: Inputs, params: PlaceParams, out: Path, report: Report) -> Don
     return Done({"path": folder, "trajectory": folder / "trajectory.csv"}, facts, [] if mapped.gps else [alone])
 
 
-PLACE = Step("place", 1, place, PlaceParams)
+PLACE = Step("place", 2, place, PlaceParams)
