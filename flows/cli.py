@@ -32,6 +32,10 @@ COMMANDS = {
     "monitor": ("monitor", "The event bus: topics of ROS 2 watched, and what goes through them told."),
     "toolbox": ("toolbox", "ML toolboxes: objects, movement, classes, segments of images, from files or as a service."),
     "qos": ("qos", "Quality of service of toolboxes: what is required, and what a network and a machine give."),
+    "orchestrate": (
+        "orchestrate",
+        "Services on edge and cloud through Open Source MANO: what is to run, and where.",
+    ),
     "slam": ("slam", "Where the camera of a video went: `slam VIDEO --out DIR`."),
 }
 """Commands to their files in `flows.commands`, each with an `app`, and what they are for."""

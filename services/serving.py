@@ -170,6 +170,8 @@ class _Guard:
     def _refused(self, scope: Message) -> Response | None:
         """What who may not ask is told."""
         path, headers = scope["path"], dict(scope["headers"])
+        if _from_elsewhere(scope.get("method", "GET"), headers):
+            return _refusal(403, path, "is asked for by another site's page", "Ask from its own page, or a program")
         if self._requests >= REQUESTS and not path.startswith("/health/"):
             return _refusal(503, path, "is asked for by too many at once", "Ask again in a while")
         if path in self._public or path.startswith(PUBLIC):
@@ -225,6 +227,14 @@ class _Guard:
             return message
 
         return counted
+
+
+def _from_elsewhere(method: str, headers: Mapping[bytes, bytes]) -> bool:
+    """Whether another site's page, in a visitor's browser, wants something done."""
+    origin = headers.get(b"origin")
+    if origin is None or method in ("GET", "HEAD"):
+        return False
+    return origin.partition(b"://")[2] != headers.get(b"host", b"")
 
 
 def _with_headers(send: Send) -> Send:

@@ -24,6 +24,7 @@ from scan2sim.pipeline.io.survey import SurveyFile
 from scan2sim.pipeline.io.tile import TileFile
 from scan2sim.pipeline.step import Params
 from scan2sim.services.monitoring.rules import Rule
+from scan2sim.services.orchestration.deployment import Deployment
 from tests.conftest import ROOT
 
 ROOMS = ("pipeline", "segmentation", "texturing", "slam", "flows", "services", "data_samples")
@@ -128,7 +129,7 @@ def refused(model: type[BaseModel], table: dict[str, Any]) -> list[Any]:
     return []
 
 
-FILES = (Drive, TileFile, SurveyFile, RulesFile)
+FILES = (Drive, TileFile, SurveyFile, RulesFile, Deployment)
 
 
 @pytest.mark.parametrize("page", named([page for page in PAGES + MODULES if "```toml" in about(page)]))

@@ -116,9 +116,10 @@ def monitor_scale(params: ScaleParams) -> None:
 @options(PoolParams, **BUS_OPTIONS)
 def monitor_pool(params: PoolParams) -> None:
     """Start and stop workers of a Prefect pool as the bus asks for them."""
+    from scan2sim.services.monitoring.actuators.prefect import PrefectWorkers
     from scan2sim.services.monitoring.pool import PoolNode
 
-    spin(lambda: PoolNode(params))
+    spin(lambda: PoolNode(params, params.queue or params.pool, PrefectWorkers(params.pool)))
 
 
 @app.command("alarms")

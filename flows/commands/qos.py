@@ -70,6 +70,8 @@ def qos_measure(
         _say(f"{name}: {'passed' if passed(found, metrics) else 'FAILED'}")
     if out:
         told = {
+            "toolbox": params.toolbox,
+            "environment": params.environment,
             "passed": passed(found, NETWORK),
             "machine_passed": passed(found, MACHINE),
             "rows": [_json(row) for row in found],

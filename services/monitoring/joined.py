@@ -35,15 +35,20 @@ class ScaleParams(BusParams, ScalingParams):
     log_file: Annotated[Path | None, Field(description="File for what was decided, a line of JSON each time.")] = None
 
 
-class PoolParams(BusParams):
+class FollowedParams(BusParams):
+    """Of a node that starts and stops workers."""
+
+    queue: Annotated[
+        str | None, Field(description="Queue whose events are followed; default: called as what is scaled.")
+    ] = None
+    min_workers: Annotated[int, Field(ge=0, le=MOST, description="Workers, at least.")] = 1
+    max_workers: Annotated[int, Field(ge=1, le=MOST, description="Workers, at most.")] = 5
+
+
+class PoolParams(FollowedParams):
     """Of a node that starts and stops workers of a Prefect pool."""
 
     pool: Annotated[str, Field(description="Its name, as scan2sim-process; it must be there.")]
-    queue: Annotated[str | None, Field(description="Queue whose events are followed; default: called as the pool.")] = (
-        None
-    )
-    min_workers: Annotated[int, Field(ge=0, le=MOST, description="Workers, at least.")] = 1
-    max_workers: Annotated[int, Field(ge=1, le=MOST, description="Workers, at most.")] = 5
 
 
 class AlarmsParams(BusParams):

@@ -27,6 +27,7 @@ from scan2sim.services.monitoring.kept import QueryParams
 from scan2sim.services.monitoring.shown import PageParams
 from scan2sim.services.monitoring.traffic import TrafficParams
 from scan2sim.services.monitoring.watched import DatasetParams, TalkerParams, TopicParams, WorkParams
+from scan2sim.services.orchestration.settings import ApplyParams, ResizeParams
 from scan2sim.services.qos.encoding import ChoiceParams
 from scan2sim.services.qos.measure import MeasureParams
 from scan2sim.services.toolboxes.boxes import classify, detect, movement, segment
@@ -148,10 +149,11 @@ def test_every_number_that_a_command_takes_has_a_range() -> None:
     shown = (SceneParams, ViewParams)
     boxes = (detect.Params, movement.Params, classify.Params, segment.Params, ServeParams, NodeParams, CameraParams)
     bus = (QueryParams, TopicParams, TalkerParams, DatasetParams, TrafficParams, WorkParams, ScaleParams, PageParams)
+    osm, qos = (ApplyParams, ResizeParams), (MeasureParams, ChoiceParams)
     numbers = {name for of in hints for name, kind in of.items() if {int, float} & {kind, *get_args(kind)}}
     assert len(numbers) > 15 and numbers <= {
         name
-        for model in (Numbers, Filmed, CutParams, SweepsParams, MeasureParams, ChoiceParams, *shown, *bus, *boxes)
+        for model in (Numbers, Filmed, CutParams, SweepsParams, *shown, *qos, *osm, *bus, *boxes)
         for name in model.model_fields
     }
 

@@ -112,6 +112,9 @@ USES = {
     "fastapi": ["monitor page --kafka localhost:9"],
     "uvicorn": ["monitor page --kafka localhost:9"],
     "pyarrow": ["monitor archive kept", "monitor query kept"],
+    "httpx": ["orchestrate list", "orchestrate apply services.toml"],
+    "yaml": ["orchestrate package detect --out packages"],
+    "jsonschema": ["orchestrate onboard package.tar.gz"],
     "trackers": ["toolbox movement FRAMES"],
     "supervision": ["toolbox movement FRAMES"],
     "efficientnet_lite_pytorch": ["toolbox classify FRAMES"],
@@ -156,7 +159,7 @@ def test_every_extra_is_there_and_brings_its_package() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     core = {re.split(r"[^\w.-]", line)[0] for line in project["dependencies"]}
     for package, extra in EXTRA_OF.items():
-        named = {"pxr": "usd_core"}.get(package, package)
+        named = {"pxr": "usd_core", "yaml": "pyyaml"}.get(package, package)
         brought = {re.split(r"[^\w.-]", line)[0].replace("-", "_") for line in project["optional-dependencies"][extra]}
         assert named in brought and named not in core
 

@@ -227,3 +227,12 @@ def test_a_body_that_never_comes_is_waited_for_in_bounds(plain: int) -> None:
     with socket.create_connection(("127.0.0.1", plain), timeout=20) as half:
         half.sendall(b"POST /length HTTP/1.1\r\nHost: localhost\r\nContent-Length: 10\r\n\r\nabc")
         assert b"408" in half.recv(100)
+
+
+def test_other_sites_pages_have_nothing_done() -> None:
+    """A visitor's browser would send their forms here; it says where they are from."""
+    client = TestClient(app_of(), base_url="http://localhost:8080")
+    assert client.post("/length", content=b"abc", headers={"Origin": "http://evil.example"}).status_code == 403
+    assert client.post("/length", content=b"abc", headers={"Origin": "null"}).status_code == 403
+    assert client.post("/length", content=b"abc", headers={"Origin": "http://localhost:8080"}).json() == 3
+    assert client.post("/length", content=b"abc").json() == 3 and client.get("/number?value=1").json() == 1

@@ -1,0 +1,46 @@
+"""Where a service may run, by what was measured there."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from scan2sim.pipeline.errors import InputError
+from scan2sim.services.orchestration import placement
+
+
+def measured(folder: Path, environment: str, toolbox: str = "detect", **failed: float | None) -> Path:
+    """A site's file, where some metrics fall short."""
+    rows: list[dict[str, Any]] = [{"metric": "delay", "required": "at most 100", "measured": 3.0, "passed": True}]
+    for metric, value in failed.items():
+        rows.append({"metric": metric, "required": "at least 8", "measured": value, "passed": False})
+    path = folder / f"{environment}.json"
+    path.write_text(json.dumps({"toolbox": toolbox, "environment": environment, "rows": rows, "more": 1}))
+    return path
+
+
+def test_the_nearest_site_that_does_is_first_and_others_say_why_not(tmp_path: Path) -> None:
+    sites = [
+        placement.read(measured(tmp_path, "cloud")),
+        placement.read(measured(tmp_path, "robot", cpu_cores=2, gpu_cores=None)),
+        placement.read(measured(tmp_path, "edge")),
+    ]
+    found = placement.place("detect", sites)
+    assert [(one.environment, one.fits) for one in found] == [("robot", False), ("edge", True), ("cloud", True)]
+    assert found[0].why == (
+        "cpu cores is 2, at least 8 is asked",
+        "gpu cores: there is none, at least 8 is asked",
+    )
+
+
+def test_measurements_of_something_else_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="measured with segment"):
+        placement.place("detect", [placement.read(measured(tmp_path, "edge", "segment"))])
+    bad = tmp_path / "bad.json"
+    for text in ("{}", "[", "[" * 5000, '{"toolbox": "detect", "environment": "moon", "rows": []}'):
+        bad.write_text(text)
+        with pytest.raises(InputError, match="no measurement"):
+            placement.read(bad)
