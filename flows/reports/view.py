@@ -21,6 +21,7 @@ from scan2sim.pipeline.io.files import make_folder
 from scan2sim.pipeline.io.glb import GlbParams
 from scan2sim.pipeline.io.provenance import SOURCES
 from scan2sim.pipeline.io.scene import Scene, SceneTile
+from scan2sim.pipeline.io.start import courses
 from scan2sim.pipeline.step import Params
 from scan2sim.pipeline.steps.pictures import EYE_HEIGHT, SEEN_RGB, bird_pose
 from scan2sim.pipeline.types import F64, View
@@ -150,7 +151,7 @@ def _about(scene: Scene) -> dict[str, Any]:
     high = np.max([np.add(tile.high, tile.offset) for tile in scene.tiles], axis=0)
     air = bird_pose(low, high)
     photos = _photos(scene)
-    walk = _ahead(np.array(photos[len(photos) // 2]["pose"]).reshape(4, 4)) if photos else _on_ground(low, high)
+    walk = _ahead(np.array(photos[len(photos) // 2]["pose"]).reshape(4, 4)) if photos else _on_ground(scene, low, high)
     codes = colour_of()
     return {
         "tiles": [
@@ -194,8 +195,11 @@ def _ahead(pose: F64, reach: float = 20.0) -> list[list[float]]:
     return [eye.round(3).tolist(), (eye + reach * pose[:3, 2]).round(3).tolist()]
 
 
-def _on_ground(low: F64, high: F64) -> list[list[float]]:
-    """An eye at one end of a world, which looks along it; the page puts it onto the ground."""
+def _on_ground(scene: Scene, low: F64, high: F64) -> list[list[float]]:
+    """An eye on the road that looks along it, else along the world; the page puts it onto the ground."""
+    for way in courses(scene):
+        places = way.places + (0, 0, 0 if way.by == "path" else EYE_HEIGHT)
+        return [places[len(places) // 4].round(3).tolist(), places[-1].round(3).tolist()]
     middle, along = (low + high) / 2, np.eye(3)[int(np.argmax((high - low)[:2]))]
     start = middle - along * (high - low) * 0.4
     start[2] = middle[2] = low[2] + EYE_HEIGHT

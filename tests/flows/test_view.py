@@ -66,6 +66,20 @@ def test_all_tiles_are_shown_by_photos_classes_and_sources(tmp_path: Path) -> No
         assert page.errors == []
 
 
+def test_a_world_without_photos_is_walked_through_too(tmp_path: Path) -> None:
+    made_up.world(tmp_path)
+    run(tmp_path / "export" / "world", "--out", tmp_path / "page")
+    with chromium(tmp_path) as page:
+        page.open(tmp_path / "page" / "index.html")
+        page.until(f"window.world && {HERE}")
+        above = seen(page)
+        page.click("[data-to=walk]")
+        assert np.abs(seen(page) - above).mean() > 10 and page.errors == []
+        x, y, z = map(float, page.value("document.querySelector('output').value").split())
+        assert z == pytest.approx(float(made_up.height(np.array(x), np.array(y))) + 1.6, abs=0.1)
+        assert page.value("document.getElementById('photos').hidden")
+
+
 def test_a_page_that_lacks_a_tile_says_so(tmp_path: Path) -> None:
     made_up.scene(tmp_path)
     run(tmp_path / "world", "--out", tmp_path / "page")

@@ -93,7 +93,7 @@
       if (solid) this.scene.add(...found);
       else this.put(name, found);
       this.look_after(name);
-      if (this.about.start === "turn" && this.walking) this.stand();
+      if (this.walking && !this.about.photos.length) this.stand();
     }
 
     dress(mesh, solid) {
@@ -175,6 +175,12 @@
       this.face();
     }
 
+    mode(name) {
+      super.mode(name);
+      if (this.walking && !this.about.photos.length) this.stand();
+    }
+
+    // On the ground: where one begins to walk is known of photos alone.
     stand() {
       const eye = this.camera.position, ground = this.height(eye.x, eye.y, Infinity);
       if (ground !== null) eye.z = ground + 1.6;

@@ -221,6 +221,15 @@ def test_cesium_shows_all_tiles_where_they_are_on_the_earth(town: Scene, tmp_pat
         assert np.degrees([latitude, longitude]) == pytest.approx(here[:2], abs=5e-4)
 
 
+def test_cesium_tells_of_what_is_picked_which_photo_it_is_from(town: Scene, tmp_path: Path) -> None:
+    folder = export(town, "tiles3d", tmp_path / "out")
+    with cesium.viewer(folder, tmp_path / "view", (320, 240)) as view:
+        view.look(*above(town, 60), focal=200)
+        told = "['source', 'photo', 'taken'].map((name) => picked.getProperty(name))"
+        found = view.page.value(f"(picked => {told})(widget.scene.pick(new Cesium.Cartesian2(100, 120)))")
+        assert found == ["photo", "front", "2018-06-01T00:00:00+00:00"]
+
+
 def test_cesium_loads_finer_levels_as_it_comes_nearer(town: Scene, tmp_path: Path) -> None:
     levels = detailed(town, 2, tmp_path / "levels", silent)
     folder = export(levels, "tiles3d", tmp_path / "out")
