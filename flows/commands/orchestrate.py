@@ -274,9 +274,9 @@ def _apply(params: ApplyParams, path: Path, *, nothing: bool = False) -> None:
     asked = deployment.read(path)
     if nothing:
         asked = deployment.Deployment(deployment=asked.deployment)
-    stop = threading.Event()
-    with _osm(params, apply.Pace()) as osm, progress(asked.deployment) as report, _ends(stop):
-        applied = apply.apply(osm, apply.target(osm, asked, path.parent), params, report, stop)
+    stop, pace = threading.Event(), apply.Pace()
+    with _osm(params, pace) as osm, progress(asked.deployment) as report, _ends(stop):
+        applied = apply.apply(osm, apply.target(osm, asked, path.parent), params, report, stop, pace)
     _tell(applied)
     if stop.is_set():
         raise KeyboardInterrupt

@@ -152,16 +152,42 @@ def _why(there: Instance, wanted: Wanted) -> str:
     return f"{there.machines} of {wanted.replicas}" if wanted.kind == "machine" else "is to have other values"
 
 
-def apply(osm: Osm, there: Target, params: ApplyParams, report: Report, stop: threading.Event | None = None) -> Applied:
+class Pace:
+    """Called before each request (`Osm`): keeps requests of threads apart that work on one instance each."""
+
+    def __init__(self, apart: float = APART) -> None:
+        self._apart, self._last = apart, threading.local()
+
+    def begin(self) -> None:
+        """From now on, this thread's requests are kept apart."""
+        self._last.time = 0.0
+
+    def __call__(self) -> None:
+        """Wait until this thread may ask again."""
+        if not hasattr(self._last, "time"):
+            return
+        time.sleep(max(0.0, self._last.time + self._apart - time.monotonic()))
+        self._last.time = time.monotonic()
+
+
+def apply(
+    osm: Osm,
+    there: Target,
+    params: ApplyParams,
+    report: Report,
+    stop: threading.Event | None = None,
+    pace: Pace | None = None,
+) -> Applied:
     """Do it; what fails doesn't keep the rest from being done.
 
     Args:
         stop: set to begin nothing more; what is done is kept.
+        pace: called before each of `osm`'s requests.
     """
     ended = stop or threading.Event()
     patience = Patience(params.timeout, params.wait, ended.is_set)
     applied = Applied()
-    records = _onboard(osm, there, applied, report)
+    records = _onboard(osm, there, applied, report, ended)
     work: list[tuple[str, Wanted | None]] = [(name, None) for name in there.without]
     changed = [n for n, one in there.wanted.items() if next_action(one, there.instances.get(n)) is not None]
     work += [(name, there.wanted[name]) for name in changed if there.wanted[name].nsd in records]
@@ -186,7 +212,7 @@ def apply(osm: Osm, there: Target, params: ApplyParams, report: Report, stop: th
             done += 1
             report(done / len(work), name)
 
-    with ThreadPoolExecutor(params.parallel) as pool:
+    with ThreadPoolExecutor(params.parallel, initializer=pace.begin if pace else None) as pool:
         try:
             list(pool.map(one, work))
         except KeyboardInterrupt:
@@ -197,11 +223,13 @@ def apply(osm: Osm, there: Target, params: ApplyParams, report: Report, stop: th
     return applied
 
 
-def _onboard(osm: Osm, there: Target, applied: Applied, report: Report) -> dict[str, str]:
+def _onboard(osm: Osm, there: Target, applied: Applied, report: Report, ended: threading.Event) -> dict[str, str]:
     """Packages that are missing, functions first; returns records of network services by their descriptors' ids."""
     found: dict[str, str] = {}
     refused: set[str] = set()
     for package in there.packages.values():
+        if ended.is_set():
+            break
         if refused & set(package.descriptor.functions):
             continue
         known = record_of(package, there.records[collection_of(package)])
@@ -243,21 +271,6 @@ def _unneeded(there: Target) -> list[tuple[str, dict[str, Any]]]:
         keep = {str(one["_id"]) for one in needed if one}
         found += [(collection, one) for one in records if str(one["_id"]) not in keep]
     return found
-
-
-class Pace:
-    """Called before each request: keeps those of one thread apart, and so those about one instance."""
-
-    def __init__(self, apart: float = APART) -> None:
-        self._apart, self._last = apart, threading.local()
-
-    def __call__(self) -> None:
-        """Wait until this thread may ask again."""
-        now = time.monotonic()
-        due = getattr(self._last, "time", 0.0) + self._apart
-        if due > now:
-            time.sleep(due - now)
-        self._last.time = time.monotonic()
 
 
 def failure(applied: Applied) -> StepError | None:
