@@ -30,8 +30,9 @@ def commands(sdf: Path) -> dict[str, str]:
 
 
 def lines(sdf: Path) -> list[str]:
-    """What is said at the end of a run: where the world is, and the command for the Gazebo of this machine."""
+    """What is said at the end of a run: where the world is, and what shows it, a browser or this machine's Gazebo."""
     here = "ign gazebo" if shutil.which("ign") else "gz sim"
     found = commands(sdf)
-    world = [f"World:  {sdf.parent}"] if sdf.parent.is_dir() else []
+    place = sdf.parent
+    world = [f"World:  {place}", f"View:   scan2sim view {shlex.quote(str(place))}"] if place.is_dir() else []
     return [*world, *([f"Gazebo: {found[RELEASES[here][0]]}"] if found else [])]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import subprocess
 from pathlib import Path
 
@@ -33,4 +34,5 @@ def test_a_shell_hands_gazebo_the_world_and_its_models_whatever_the_folder_is_ca
 
 def test_a_world_without_gazebos_files_has_no_command(tmp_path: Path) -> None:
     assert gazebo.commands(tmp_path / "street.sdf") == {}
-    assert gazebo.lines(tmp_path / "street.sdf") == [f"World:  {tmp_path}"]
+    shown = f"View:   scan2sim view {shlex.quote(str(tmp_path))}"
+    assert gazebo.lines(tmp_path / "street.sdf") == [f"World:  {tmp_path}", shown]
