@@ -10,7 +10,8 @@
 - turn: 51 frames of a rendered turn of 98 degrees (perspective, 52 m): ATE, and pycolmap's; what it costs there and on
   KITTI's frames when every other frame has .45 of its brightness.
 - trust: the share of positions that lie in their 95 % ellipsoids, over 20 simulated drives; pictures of these;
-  what GPS of 10 cm leaves of the error of a turn whose scale drifts as KITTI's did (step lengths .885, 1.001, 1.048).
+  what GPS of 10 cm leaves of the error of a turn whose scale drifts as KITTI's did (step lengths .885, 1.001, 1.048);
+  on how many drives a focal length 5 % off is noticed.
 - pano: rotation and direction of motion between two real 360 frames, against their reference.
 - memory: peak of the process over ever more frames.
 
@@ -33,7 +34,7 @@ import numpy as np
 
 from bench.measure import measure
 from bench.slam_frames import Sequence, lit, odometry, places, pycolmap
-from bench.slam_trust import covariance, gps_gain
+from bench.slam_trust import covariance, focal, gps_gain
 from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.types import Camera
 from scan2sim.slam.evaluate import Evaluation, evaluate, plot
@@ -228,7 +229,8 @@ def main() -> None:
     out.mkdir(parents=True, exist_ok=True)
     keys = (
         "drift_percent", "local400_m", "adam_drift_percent", "kitti06_ate_m", "pycolmap_time_ratio", "fps",
-        "turn_ate_m", "turn_pycolmap_ratio", "gain_ate_ratio", "covariance_95", "gps_gain",
+        "turn_ate_m", "turn_pycolmap_ratio", "gain_ate_ratio", "covariance_95", "gps_gain", "focal_noticed",
+        "focal_false_alarms",
     )  # fmt: skip
     result: dict[str, float | None] = dict.fromkeys(keys)
     if "drive" in arguments.parts:
@@ -236,7 +238,7 @@ def main() -> None:
     if "turn" in arguments.parts:
         result |= turn(out)
     if "trust" in arguments.parts:
-        result |= covariance(out) | gps_gain()
+        result |= covariance(out) | gps_gain() | focal()
     for part, needed in (("kitti", "kitti_odo06_vo51"), ("pano", "pano360")):
         if part not in arguments.parts:
             continue

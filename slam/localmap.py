@@ -16,6 +16,7 @@ from scan2sim.slam import shared, solvers
 from scan2sim.slam.geometry import angles, triangulate
 from scan2sim.slam.graph import Chord, Graph, errors
 from scan2sim.slam.information import Information
+from scan2sim.slam.lens import misfit
 from scan2sim.slam.solvers import lm
 
 
@@ -118,7 +119,7 @@ class Observations:
 class LocalMap:
     """Keyframes and landmarks; `part` counts the maps begun."""
 
-    STATE = ("keyframes", "landmarks", "retired", "_others", "part", "shared")
+    STATE = ("keyframes", "landmarks", "retired", "_others", "part", "shared", "misfits")
     PARTS = ("information",)
 
     def __init__(
@@ -132,6 +133,7 @@ class LocalMap:
         self.landmarks = Landmarks()
         self.retired: list[Landmarks] = []
         self.information = Information(params.window + params.anchors + 1)
+        self.misfits: list[float] = []  # by which share the focal length is too short, as windows that turn say
         self._others = 0  # of those retired, how many are of earlier maps
         self.part = 0
         wanted = zip(shared.NAMES, shared.SIGMA, (params.rolling_shutter, params.lens_offset), strict=True)
@@ -152,6 +154,8 @@ class LocalMap:
         self.keyframes.append(keyframe)
         self._new_points()
         self._optimise()
+        if self.camera.model == "pinhole" and len(self.keyframes) % (self.params.window // 2) == 0:
+            self._check_lens()
         self._forget()
         return self._reject()
 
@@ -299,6 +303,18 @@ class LocalMap:
             self.keyframes[k].T_world_cam = pose
         self.landmarks.put(names, solved.points)
         self.shared = solved.shared
+
+    def _check_lens(self) -> None:
+        """Ask the window whether the focal length fits."""
+        window = self.window()
+        seen = self.observations(window)
+        seen = seen.keep(self.landmarks.find(seen.ids)[1])
+        names, rows, counts = np.unique(seen.ids, return_inverse=True, return_counts=True)
+        names, seen = names[counts > 2], seen.keep(counts[rows] > 2)
+        if len(names) and len(window) > 2:
+            xyz = self.landmarks.xyz[self.landmarks.find(names)[0]]
+            share = misfit(self.graph(window, seen, names, xyz, np.zeros(len(window), bool)))
+            self.misfits += [] if share is None else [share]
 
     def _chords(self, window: list[int]) -> tuple[Chord, ...]:
         """GPS distances within the window."""

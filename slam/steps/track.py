@@ -17,7 +17,7 @@ from scan2sim.pipeline.io import image
 from scan2sim.pipeline.ranges import Focal, Pixels, Rate, Shift
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.types import U8, Camera, GpsTrack
-from scan2sim.slam import features, matchers, solvers, trackers
+from scan2sim.slam import features, lens, matchers, solvers, trackers
 from scan2sim.slam.facets import Facets
 from scan2sim.slam.gps import smooth
 from scan2sim.slam.mapped import Mapped
@@ -81,6 +81,8 @@ def track_video(inputs: Inputs, params: TrackParams, out: Path, report: Report, 
             video, start, every=params.every, until=params.until or None, state=checkpoint / "state.npz",
             watch=recorder, report=report,
         )  # fmt: skip
+    wrong = lens.told(run.odometry.map.misfits, camera.fx)
+    warnings += [] if wrong is None else [wrong]
     files = {"mapped": Mapped.of(run.odometry, run.names).write(out / "mapped.npz")}
     films = {"view": film} if params.view else {}
     return Done(

@@ -158,3 +158,20 @@ def drifting_turn() -> tuple[F64, F64, F64]:
 def ate(found: F64, truth: F64) -> float:
     off = umeyama(found, truth, scaled=True).apply(found) - truth
     return float(np.sqrt((off**2).sum(axis=1).mean()))
+
+
+def misfits_of(wrong: float, seed: int, focal: float = 700.0) -> list[float]:
+    """What a turn's windows say of a focal length that is `wrong` times the true one (pixels)."""
+
+    class Mistaken(Narrow):
+        def _seen(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            bearing, seen = super()._seen(points)
+            bearing = bearing * [1 / wrong, 1 / wrong, 1]
+            return bearing / np.linalg.norm(bearing, axis=1, keepdims=True), seen
+
+    times, poses = drive(8, turn=0.3)
+    camera = Camera("pinhole", 1240, 1240, wrong * focal, wrong * focal, 619.5, 619.5)
+    odometry = Odometry(camera, OdometryParams(), tracker=Mistaken(poses, scatter(poses, 12000, seed), seed=seed))
+    for time in times:
+        odometry.add(float(time), np.zeros((4, 8), np.uint8))
+    return odometry.map.misfits
