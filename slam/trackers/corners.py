@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from scan2sim.pipeline.types import F32, F64, I64, U8
+from scan2sim.slam import exposure
 from scan2sim.slam.facets import Facets
-from scan2sim.slam.trackers import Tracks, exposure
+from scan2sim.slam.trackers import Tracks
 
 WINDOW, FINE = 17, 9
 """Pixels, of Lucas-Kanade's square: a large one finds a corner again, a small one says where it is: the larger

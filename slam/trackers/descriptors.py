@@ -15,10 +15,11 @@ import numpy.typing as npt
 
 from scan2sim.pipeline.errors import SettingError
 from scan2sim.pipeline.types import F32, F64, I64, U8, Bools
+from scan2sim.slam import exposure
 from scan2sim.slam.facets import Facets
 from scan2sim.slam.features import Features, Found
 from scan2sim.slam.matchers import Matcher, check
-from scan2sim.slam.trackers import Tracker, Tracks, exposure
+from scan2sim.slam.trackers import Tracker, Tracks
 from scan2sim.slam.trackers.corners import FINE, RETURN, SPACING, WINDOW, CornerTracker, flow
 
 STRAY = 4.0

@@ -7,9 +7,9 @@ import pytest
 
 from scan2sim.pipeline.cameras import pixel_rays, project
 from scan2sim.pipeline.types import F32, F64, U8, Camera
+from scan2sim.slam import exposure
 from scan2sim.slam.facets import Facets
 from scan2sim.slam.geometry import exp_so3, relative_pose, rigid
-from scan2sim.slam.trackers import exposure
 from scan2sim.slam.trackers.corners import CornerTracker
 
 CAMERA = Camera("equirectangular", 768, 384)

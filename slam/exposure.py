@@ -19,7 +19,8 @@ AROUND = 17
 """Pixels, of the square about a feature whose mean is taken: Lucas-Kanade's larger one."""
 STEADY = 0.05
 """Gains nearer to 1 than this, and changes of the mean below it, aren't told from none: where the exposure is held,
-what comes nearer looks otherwise by up to 2 % (one standard deviation; three real streets and a rendered one)."""
+what comes nearer looks otherwise by some 2 % (one standard deviation; two real streets and a rendered one), and telling
+that from light cost accuracy on one of them."""
 DARKEST = 50.0
 """A picture whose values spread so many times less shows nothing."""
 OFF = 2.5 * 1.4826
