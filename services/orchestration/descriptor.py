@@ -134,7 +134,7 @@ def _parsed(text: str, where: str | Path) -> Any:
     if len(text) > LARGEST:
         raise InputError(where, f"is of more than {LARGEST:,} bytes", "No descriptor is")
     try:
-        return yaml.load(text, Loader)
+        return Loader(text).get_single_data()
     except yaml.YAMLError as error:
         raise InputError(where, f"is no YAML that is taken ({' '.join(str(error).split())[:200]})", "Mend it") from None
     except (ValueError, RecursionError) as error:

@@ -117,6 +117,7 @@ def test_nothing_stands_on_the_road(town: Town) -> None:
     assert cKDTree(town.ground.driven).query(np.array([t.at for t in town.things]))[0].min() > 2.0
 
 
+@pytest.mark.slow
 def test_pixels_agree_with_the_poses(camera: Panorama, trajectory: Trajectory) -> None:
     for i, j in ((60, 63), (150, 147)):
         a, b = (camera.render(trajectory.poses[k], float(trajectory.times[k])) for k in (i, j))

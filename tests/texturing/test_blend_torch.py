@@ -12,8 +12,15 @@ from tests.texturing.corner import CAMERAS, POSES, Street, photograph, points
 pytest.importorskip("torch", reason="torch is not installed (pip install 'scan2sim[segmentation]')")
 
 
-@pytest.mark.parametrize("name", CAMERAS)
-@pytest.mark.parametrize("band", [2, 0, -1])
+WHOLE = [
+    pytest.param(name, band, marks=() if (band, name) in ((2, "pinhole"), (0, "equirectangular")) else pytest.mark.slow)
+    for name in CAMERAS
+    for band in (2, 0, -1)
+]
+"""Two of them at once, the rest when there is time: `test_torch_adds_the_same` has all, of the kernel alone."""
+
+
+@pytest.mark.parametrize(("name", "band"), WHOLE)
 def test_torch_paints_the_same(street: Street, name: str, band: int) -> None:
     camera = CAMERAS[name]
     mask = np.full((camera.height, camera.width), 255, np.uint8)

@@ -27,6 +27,7 @@ while time.monotonic() < end:
 """
 
 
+@pytest.mark.slow
 @on("sqlite")
 def test_workers_of_a_pool_come_and_go(server: Server) -> None:
     pytest.importorskip("cyclonedds", reason="no topics of ROS 2 here")

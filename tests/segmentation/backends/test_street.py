@@ -128,6 +128,7 @@ def colourful(folder: Path, n: int = 6) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_training_learns_and_repeats(tmp_path: Path) -> None:
     from scan2sim.segmentation.train import Recipe, train
 
