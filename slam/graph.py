@@ -60,7 +60,8 @@ class Graph:
         bend: (O, S, 6) how a unit of each shared parameter moves (m) and turns (rad, about world axes) the camera of an
             observation: rolling shutter, lens offset.
         shared: (S,) the shared parameters.
-        shared_sigma: (S,) how far they may well be from that.
+        shared_sigma: (S,) how far they may well be from what is believed.
+        believed: (S,) what that is; None: as they are.
     """
 
     poses: F64
@@ -75,6 +76,7 @@ class Graph:
     bend: F64 = field(default_factory=lambda: np.zeros((0, 0, 6)))
     shared: F64 = field(default_factory=lambda: np.zeros(0))
     shared_sigma: F64 = field(default_factory=lambda: np.zeros(0))
+    believed: F64 | None = None
 
 
 @dataclass(frozen=True)

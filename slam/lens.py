@@ -1,48 +1,150 @@
-"""Lens: whether the focal length that a camera is said to have fits what it sees, and which would fit better.
+"""Lens: whether focal length, centre and distortion that a camera is said to have fit what it sees, or which do.
 
-Where the car turns, a wrong focal length contradicts itself: what crosses the picture turns by more, or less, than the
-picture says. A window's graph is solved again with the focal length as one number more. Straight ahead it is hardly
-told apart from what Lucas-Kanade's own small errors do, so only windows that turn are asked.
+Where the car turns, a wrong lens contradicts itself: what crosses the picture turns by more, or less, than the picture
+says. A window's graph is solved again with the lens as four numbers more; what that says of them is added up over all
+windows. Straight ahead a lens is hardly told apart from what Lucas-Kanade's own small errors do, so only windows that
+turn are asked. Distortion and focal length are hard to tell apart, too: there is none unless there clearly is.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from scan2sim.pipeline.cameras import project_exactly, unproject
+from scan2sim.pipeline.types import F64, Camera
 from scan2sim.slam.geometry import log_so3
-from scan2sim.slam.graph import Graph
+from scan2sim.slam.graph import Graph, errors
 from scan2sim.slam.solvers import lm
 
-TURN = np.radians(30)
+MODELS = ("pinhole", "opencv")
+"""Of cameras that can be asked."""
+TURN = np.radians(20)
 """Between the first and the last camera of a window that is asked."""
-LIKELY = 0.1
-"""Of the focal length, by which it may well be wrong."""
-WORTH = 0.02
-"""Of the focal length, from which on a user is told."""
+LIKELY = np.array([0.5, 0.3, 0.3, 0.3])
+"""By how much each may well be wrong: the focal length's logarithm, the centre's place (in focal lengths), k1."""
+ALIKE = 25.0
+"""Lucas-Kanade's errors are alike from frame to frame and from point to point: a lens is known so many times less well
+than as if they weren't. Found on rendered turns, whose lens is known."""
+WORTH = np.array([0.02, 0.02, 0.02, 0.05])
+"""From which on a user is told."""
+CLEAR = 3.0
+"""Standard deviations from which on something is no chance."""
+ROUNDS = 5
+"""Most often that a window is solved again with the lens that came out."""
+STEP = 1e-5
 
 
-def misfit(graph: Graph) -> float | None:
-    """By which share the focal length of a graph's camera is too short; None where it turns too little to tell."""
+@dataclass(frozen=True)
+class Known:
+    """A lens, as far as a drive tells it.
+
+    Attributes:
+        camera: it.
+        sigma: (4,) standard deviations, of what `LIKELY` names.
+        off: (4,) by how much the camera differs from the one that was asked about.
+    """
+
+    camera: Camera
+    sigma: F64
+    off: F64
+
+
+def changed(camera: Camera, by: F64) -> Camera:
+    """The camera whose focal length, centre and k1 are changed by (4,) of what `LIKELY` names."""
+    k1, *others = camera.distortion or (0.0,)
+    k1 += float(by[3])
+    bent = k1 != 0 or any(others)
+    return replace(
+        camera, model="opencv" if bent else "pinhole", fx=camera.fx * float(np.exp(by[0])),
+        fy=camera.fy * float(np.exp(by[0])), cx=camera.cx + camera.fx * float(by[1]),
+        cy=camera.cy + camera.fy * float(by[2]),
+        distortion=(k1, *others, *[0.0] * (3 - len(others))) if bent else (),
+    )  # fmt: skip
+
+
+def misfit(camera: Camera, graph: Graph) -> F64 | None:
+    """(4, 5) what a graph says of its camera's lens: information of the four numbers, and that times what they are off.
+
+    None where it turns too little to tell, or sees too little.
+    """
     first, last = graph.poses[0, :3, :3], graph.poses[-1, :3, :3]
-    if np.linalg.norm(log_so3(first.T @ last)) < TURN:
+    if camera.model not in MODELS or np.linalg.norm(log_so3(first.T @ last)) < TURN:
         return None
-    R = graph.poses[graph.camera_of, :3, :3]
-    bend = np.zeros((len(graph.bearing), 1, 6))
-    towards = np.cross(graph.bearing, [0.0, 0.0, 1.0]) * graph.bearing[:, 2:]  # a longer one sees nearer the axis
-    bend[:, 0, 3:] = np.einsum("oij,oj->oi", R, towards)
-    free = replace(
-        graph, bend=bend, shared=np.zeros(1), shared_sigma=np.array([LIKELY]), fixed=np.arange(len(graph.poses)) < 1
+    uv, _ = project_exactly(camera, graph.bearing)
+    off = np.zeros(4)
+    graph = replace(graph, fixed=np.arange(len(graph.poses)) < 1, shared_sigma=LIKELY / ALIKE, chords=())
+    for _ in range(ROUNDS):
+        free = _seen_by(changed(camera, off), graph, uv, off)
+        if free is None:
+            return None
+        solved = lm.solve(free, iterations=15)
+        off = off + solved.shared
+        graph = replace(graph, poses=solved.poses, points=solved.points)
+        if np.all(np.abs(solved.shared) < 0.05 * WORTH):
+            break
+    free = _seen_by(changed(camera, off), graph, uv, off)
+    if free is None:
+        return None
+    noise = float(np.median(errors(free, free.poses, free.points))) / 1.18  # of two components each
+    says = lm.information_of_shared(free) / (noise * ALIKE) ** 2
+    return np.concatenate([says, (says @ off)[:, None]], axis=1)
+
+
+def _seen_by(camera: Camera, graph: Graph, uv: F64, off: F64) -> Graph | None:
+    """The graph of pixels (O, 2) as a camera `off` (4,) from the first sees them, its lens free; None: it can't."""
+    bearing = unproject(camera, uv)
+    moves = np.stack(
+        [
+            (unproject(changed(camera, h), uv) - unproject(changed(camera, -h), uv)) / (2 * STEP)
+            for h in STEP * np.eye(4)
+        ],
+        axis=1,
     )
-    return float(lm.solve(free, iterations=15).shared[0])
-
-
-def told(shares: list[float], focal: float) -> str | None:
-    """What a user should read of the windows' misfits; nothing where the focal length (pixels) fits."""
-    if not shares or abs(share := float(np.median(shares))) < WORTH:
+    if not np.isfinite(moves).all():
         return None
+    bend = np.zeros((len(uv), 4, 6))  # another direction is another turn of the camera
+    bend[:, :, 3:] = np.einsum("oij,osj->osi", graph.poses[graph.camera_of, :3, :3], np.cross(bearing[:, None], moves))
+    return replace(graph, bearing=bearing, bend=bend, shared=np.zeros(4), believed=-off)
+
+
+def better(camera: Camera, misfits: Sequence[F64]) -> Known | None:
+    """The lens that fits windows' misfits best, and how well it is known; None without any."""
+    if not len(misfits):
+        return None
+    total = np.sum(misfits, axis=0)
+    says, right = total[:, :4] + np.diag(LIKELY**-2.0), total[:, 4]
+    covariance = np.linalg.inv(says)
+    off, sigma = covariance @ right, np.sqrt(np.diag(covariance))
+    if not camera.distortion and abs(off[3]) < max(CLEAR * sigma[3], WORTH[3]):
+        off[:3], off[3] = np.linalg.solve(says[:3, :3], right[:3]), 0.0
+        sigma[:3], sigma[3] = np.sqrt(np.diag(np.linalg.inv(says[:3, :3]))), 0.0
+    return Known(changed(camera, off), sigma, off)
+
+
+def told(camera: Camera, misfits: Sequence[F64]) -> str | None:
+    """What a user should read of the windows' misfits; nothing where the lens fits."""
+    found = better(camera, misfits)
+    if found is None:
+        return None
+    wrong = np.abs(found.off) > np.maximum(WORTH, CLEAR * found.sigma)
+    if not wrong.any():
+        return None
+    now, sigma = found.camera, found.sigma
+    fits = []
+    if wrong[0] or wrong[3]:
+        fits.append(f"a focal length of {now.fx:.0f} +- {sigma[0] * now.fx:.0f} pixels better than {camera.fx:.0f}")
+    if wrong[1] or wrong[2]:
+        fits.append(
+            f"a centre at {now.cx:.0f}, {now.cy:.0f} (+- {sigma[1] * now.fx:.0f}, {sigma[2] * now.fx:.0f}) better than "
+            f"{camera.cx:.0f}, {camera.cy:.0f}"
+        )
+    if wrong[3]:
+        k1 = camera.distortion[0] if camera.distortion else 0.0
+        fits.append(f"distortion k1 = {now.distortion[0]:.2f} +- {sigma[3]:.2f} better than {k1:.2f}")
     return (
-        f"in turns, the pictures fit a focal length of {focal * (1 + share):.0f} pixels better than {focal:.0f}: "
-        "check --focal, and whether the pictures were cropped or scaled"
+        f"in turns, the pictures fit {', and '.join(fits)}: check --focal and --centre, and whether the pictures were "
+        "cropped or scaled"
     )

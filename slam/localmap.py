@@ -133,7 +133,7 @@ class LocalMap:
         self.landmarks = Landmarks()
         self.retired: list[Landmarks] = []
         self.information = Information(params.window + params.anchors + 1)
-        self.misfits: list[float] = []  # by which share the focal length is too short, as windows that turn say
+        self.misfits: list[F64] = []  # what windows that turn say of the lens
         self._others = 0  # of those retired, how many are of earlier maps
         self.part = 0
         wanted = zip(shared.NAMES, shared.SIGMA, (params.rolling_shutter, params.lens_offset), strict=True)
@@ -154,7 +154,7 @@ class LocalMap:
         self.keyframes.append(keyframe)
         self._new_points()
         self._optimise()
-        if self.camera.model == "pinhole" and len(self.keyframes) % (self.params.window // 2) == 0:
+        if len(self.keyframes) % (self.params.window // 2) == 0:
             self._check_lens()
         self._forget()
         return self._reject()
@@ -305,7 +305,7 @@ class LocalMap:
         self.shared = solved.shared
 
     def _check_lens(self) -> None:
-        """Ask the window whether the focal length fits."""
+        """Ask the window whether the lens fits."""
         window = self.window()
         seen = self.observations(window)
         seen = seen.keep(self.landmarks.find(seen.ids)[1])
@@ -313,8 +313,8 @@ class LocalMap:
         names, seen = names[counts > 2], seen.keep(counts[rows] > 2)
         if len(names) and len(window) > 2:
             xyz = self.landmarks.xyz[self.landmarks.find(names)[0]]
-            share = misfit(self.graph(window, seen, names, xyz, np.zeros(len(window), bool)))
-            self.misfits += [] if share is None else [share]
+            says = misfit(self.camera, self.graph(window, seen, names, xyz, np.zeros(len(window), bool)))
+            self.misfits += [] if says is None else [says]
 
     def _chords(self, window: list[int]) -> tuple[Chord, ...]:
         """GPS distances within the window."""

@@ -6,14 +6,14 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-from scan2sim.flows.commands.slam import publish_path
+from scan2sim.flows.commands.slam import check_sure, publish_path
 from scan2sim.flows.engine.execution import Executor
 from scan2sim.flows.engine.lock import locked
 from scan2sim.flows.engine.planning import STORE, Planned, drop_damaged, plan
 from scan2sim.flows.recipes.drive import Drive, recipe
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.io.remote import is_remote, likeness
-from scan2sim.pipeline.store import Digests, Store
+from scan2sim.pipeline.store import Digests, Manifest, Store
 
 PREPARED, DRIVE = "prepared", "drive.toml"
 SHOWN = {"import_sweeps": "corridor", "cut": "survey"}
@@ -42,6 +42,7 @@ def survey_of(
 
     Raises:
         InputError: it is none of these, or says something impossible.
+        UnsureError: most of the path that SLAM found is unsure; it is there to be looked at.
         ScanError: as SLAM, import and cut.
     """
     if is_remote(place):
@@ -54,18 +55,26 @@ def survey_of(
         if drop_damaged(planned, store, {item.node.id.name for item in planned}):
             planned, store, digests = plan_drive(source, out, length=length, buffer=buffer)
         outcome = run(planned, store)
+        if "place" in outcome.of_tile():
+            publish_path(planned, outcome.of_tile(), store, out / "slam")
+            _check_path(planned, outcome.of_tile(), out / "slam")
         outcome.check()
         for item in planned:
             for text in outcome.done[item.node.id].warnings if item.reason is not None else ():
                 warn(text)
         folders = {item.node.id.name: store.folder(item.node.full_name, item.key) for item in planned}
-        if "place" in folders:
-            publish_path(planned, outcome.of_tile(), store, out / "slam")
         for name in SHOWN.keys() & folders.keys():
             _link(folders[name] / SHOWN[name], out / SHOWN[name])
         store.sweep({item.node.id.name: item.key for item in planned})
         digests.save()
     return str(folders["cut"] / "survey" / "survey.toml")
+
+
+def _check_path(planned: list[Planned], done: dict[str, Manifest], slam: Path) -> None:
+    """Raise an UnsureError where the video's path is mostly unsure, unless the drive says to use it all the same."""
+    if not any(getattr(item.node.params, "keep_unsure", False) for item in planned):
+        remedy = "Give [slam] a gps, or mend what slam.json warns of; or say keep_unsure = true under [sweeps]"
+        check_sure(done["place"].facts["unsure_share"], slam, remedy)
 
 
 def found(place: Path) -> Path:

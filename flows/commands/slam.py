@@ -62,12 +62,9 @@ def slam_a_video(
         warn(text)
     console.print(json.dumps(figures, indent=1), highlight=False, markup=False)
     console.print(f"Trajectory: {out / 'trajectory.csv'}", highlight=False, soft_wrap=True, markup=False)
-    if figures["unsure_share"] > MOSTLY:
-        share = f"{100 * figures['unsure_share']:.0f} %"
-        raise UnsureError(
-            out / "trajectory.csv", f"{share} of the poses are unsure: they were carried on",
-            "Give --gps, more frames a second, or a part of the video that is lit and goes on",
-        )  # fmt: skip
+    check_sure(
+        figures["unsure_share"], out, "Give --gps, more frames a second, or a part of the video that is lit and goes on"
+    )
 
 
 @app.command("evaluate")
@@ -143,6 +140,13 @@ def publish_path(planned: Iterable[Planned], done: Mapping[str, Manifest], store
         if source is not None:
             shutil.copytree(source, place, copy_function=link) if source.is_dir() else link(str(source), str(place))
     (out / "slam.json").write_text(json.dumps(_figures(done), indent=1) + "\n", encoding="utf-8")
+
+
+def check_sure(unsure: float, out: Path, remedy: str) -> None:
+    """Raise an UnsureError where more of the poses of `out`'s trajectory are unsure than makes a path."""
+    if unsure > MOSTLY:
+        share = f"{100 * unsure:.0f} %"
+        raise UnsureError(out / "trajectory.csv", f"{share} of the poses are unsure: they were carried on", remedy)
 
 
 def _figures(done: Mapping[str, Manifest]) -> dict[str, Any]:

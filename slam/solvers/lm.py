@@ -64,6 +64,21 @@ def information(graph: Graph, *, points: bool = True) -> F64:
     return _reduce(H, g, V, gp, W, starts, graph.camera_of, free, 0, 0.0)[0] if points else H
 
 
+def information_of_shared(graph: Graph) -> F64:
+    """(S, S) what the observations say of the shared parameters; points and cameras eliminated, sigma taken as 1."""
+    S = graph.bend.shape[1]
+    size = 6 * len(graph.poses) + S
+    free, starts = np.arange(len(graph.poses)), np.searchsorted(graph.point_of, np.arange(len(graph.points) + 1))
+    H, g, V, gp, W = _accumulate(
+        graph.poses, graph.points, starts, graph.camera_of, graph.bearing, graph.bend, graph.shared, free, size,
+        graph.sigma,
+    )  # fmt: skip
+    H = _reduce(H, g, V, gp, W, starts, graph.camera_of, free, S, 0.0)[0] * graph.sigma**2
+    between = H[:-S, -S:]
+    out = H[-S:, -S:] - between.T @ np.linalg.pinv(H[:-S, :-S], rcond=1e-9, hermitian=True) @ between
+    return np.asarray(out, np.float64)
+
+
 def _moved(poses: F64, shared: F64, step: F64, fixed: Bools) -> tuple[F64, F64]:
     out = poses.copy()
     n = int((~fixed).sum())
@@ -73,6 +88,11 @@ def _moved(poses: F64, shared: F64, step: F64, fixed: Bools) -> tuple[F64, F64]:
     return out, shared + step[6 * n :]
 
 
+def _away(graph: Graph, shared: F64) -> F64:
+    """(S,) of the shared parameters from what is believed of them."""
+    return shared - (graph.shared if graph.believed is None else graph.believed)
+
+
 def _cost(graph: Graph, poses: F64, xyz: F64, shared: F64) -> float:
     total = _robust_cost(
         poses, xyz, graph.point_of, graph.camera_of, graph.bearing, graph.bend, shared, graph.sigma
@@ -80,7 +100,7 @@ def _cost(graph: Graph, poses: F64, xyz: F64, shared: F64) -> float:
     for chord in graph.chords:
         r = (np.linalg.norm(poses[chord.second, :3, 3] - poses[chord.first, :3, 3]) - chord.distance) / chord.sigma
         total += math.log1p(r * r)
-    total += float((((shared - graph.shared) / graph.shared_sigma) ** 2).sum())
+    total += float(((_away(graph, shared) / graph.shared_sigma) ** 2).sum())
     for factor in graph.factors:
         residual = np.asarray(factor.residual(*(poses[c] for c in factor.cameras), factor.measured))
         total += float((residual**2).sum())
@@ -96,7 +116,7 @@ def _normal(
     )
     last = np.arange(size - len(shared), size)
     H[last, last] += 1 / graph.shared_sigma**2
-    g[last] += (shared - graph.shared) / graph.shared_sigma**2
+    g[last] += _away(graph, shared) / graph.shared_sigma**2
     for chord in graph.chords:
         between = poses[chord.second, :3, 3] - poses[chord.first, :3, 3]
         length = max(float(np.linalg.norm(between)), 1e-9)

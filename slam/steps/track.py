@@ -81,7 +81,7 @@ def track_video(inputs: Inputs, params: TrackParams, out: Path, report: Report, 
             video, start, every=params.every, until=params.until or None, state=checkpoint / "state.npz",
             watch=recorder, report=report,
         )  # fmt: skip
-    wrong = lens.told(run.odometry.map.misfits, camera.fx)
+    wrong = lens.told(camera, run.odometry.map.misfits)
     warnings += [] if wrong is None else [wrong]
     files = {"mapped": Mapped.of(run.odometry, run.names).write(out / "mapped.npz")}
     films = {"view": film} if params.view else {}

@@ -8,6 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -17,7 +19,7 @@ from scan2sim.flows.commands.drive import survey_of as made_of
 from scan2sim.flows.engine.execution import execute
 from scan2sim.flows.engine.lock import locked
 from scan2sim.flows.recipes.drive import Drive
-from scan2sim.pipeline.errors import BusyError, InputError
+from scan2sim.pipeline.errors import BusyError, InputError, UnsureError
 from scan2sim.pipeline.io.survey import read_survey
 from scan2sim.pipeline.steps.cut import CUT
 from scan2sim.pipeline.steps.import_sweeps import IMPORT_SWEEPS
@@ -108,6 +110,19 @@ def test_a_survey_is_itself(corridor: Path, tmp_path: Path) -> None:
     assert survey_of(survey, tmp_path / "other") == survey
     assert survey_of(Path(survey).parent, tmp_path / "other") == survey
     assert survey_of("s3://bucket/survey", tmp_path) == "s3://bucket/survey"
+
+
+def test_no_world_is_made_along_a_path_that_was_mostly_guessed(tmp_path: Path) -> None:
+    (tmp_path / "frames").mkdir()
+    (tmp_path / "velodyne").mkdir()
+    np.zeros((9, 4), np.float32).tofile(tmp_path / "velodyne" / "0.bin")
+    light = np.random.default_rng(0).integers(0, 255, (64, 128), np.uint8)
+    for k in range(8):
+        cv2.imwrite(str(tmp_path / "frames" / f"{k}.png"), light if k < 2 else np.full_like(light, 9))
+    place = drive(tmp_path, '[slam]\nvideo = "frames"\n[sweeps]\nfolder = "velodyne"\n')
+    with pytest.raises(UnsureError, match=r"of the poses are unsure.*keep_unsure"):
+        survey_of(place, tmp_path / "out")
+    assert (tmp_path / "out" / "prepared" / "slam" / "trajectory.csv").is_file()
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from scan2sim.pipeline.cameras import project_exactly, unproject
 from scan2sim.pipeline.similarity import umeyama
 from scan2sim.pipeline.types import F64, Bools, Camera, GpsTrack
 from scan2sim.slam.geometry import exp_so3, rigid
@@ -160,18 +161,19 @@ def ate(found: F64, truth: F64) -> float:
     return float(np.sqrt((off**2).sum(axis=1).mean()))
 
 
-def misfits_of(wrong: float, seed: int, focal: float = 700.0) -> list[float]:
-    """What a turn's windows say of a focal length that is `wrong` times the true one (pixels)."""
+LENS = Camera("pinhole", 1240, 1240, 700.0, 700.0, 619.5, 619.5)
+
+
+def mistaken(given: Camera, seed: int, turn: float = 0.3) -> Odometry:
+    """Odometry in a turn of a camera that is `LENS`, and is said to be `given`."""
 
     class Mistaken(Narrow):
         def _seen(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             bearing, seen = super()._seen(points)
-            bearing = bearing * [1 / wrong, 1 / wrong, 1]
-            return bearing / np.linalg.norm(bearing, axis=1, keepdims=True), seen
+            return unproject(given, project_exactly(LENS, bearing)[0]), seen
 
-    times, poses = drive(8, turn=0.3)
-    camera = Camera("pinhole", 1240, 1240, wrong * focal, wrong * focal, 619.5, 619.5)
-    odometry = Odometry(camera, OdometryParams(), tracker=Mistaken(poses, scatter(poses, 12000, seed), seed=seed))
+    times, poses = drive(8, turn=turn)
+    odometry = Odometry(given, OdometryParams(), tracker=Mistaken(poses, scatter(poses, 12000, seed), seed=seed))
     for time in times:
         odometry.add(float(time), np.zeros((4, 8), np.uint8))
-    return odometry.map.misfits
+    return odometry

@@ -1,17 +1,36 @@
-"""Whether a wrong focal length is noticed, and a right one isn't doubted."""
+"""Whether a wrong lens is noticed, and a right one isn't doubted."""
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
-from scan2sim.slam.lens import told
-from tests.slam.made_up import misfits_of
+from scan2sim.slam.lens import better, changed, told
+from tests.present import present
+from tests.slam.made_up import LENS, mistaken
 
 
-@pytest.mark.parametrize(("wrong", "noticed"), [(1.0, False), (0.95, True), (1.05, True)])
-def test_five_percent_are_noticed_in_a_turn(wrong: float, noticed: bool) -> None:
-    said = told(misfits_of(wrong, seed=1), 700 * wrong)
-    assert (said is not None) == noticed
-    if said is not None:
-        better = float(said.split("length of ")[1].split()[0])
-        assert abs(better - 700) < 15
+@pytest.mark.parametrize(
+    ("off", "said"),
+    [
+        ((0, 0, 0, 0), None), ((-0.05, 0, 0, 0), "a focal length of"), ((-0.7, 0, 0, 0), "a focal length of"),
+        ((0, 0.1, 0, 0), "a centre at"), ((0, 0, 0, 0.15), "distortion k1"),
+    ],
+    ids=("right", "short", "half", "cropped", "bent"),
+)  # fmt: skip
+def test_a_lens_that_is_wrong_is_noticed_in_a_turn_and_a_better_one_named(
+    off: tuple[float, ...], said: str | None
+) -> None:
+    given = changed(LENS, np.array(off))
+    misfits = mistaken(given, seed=1).map.misfits
+    text = told(given, misfits)
+    assert (text is None) == (said is None)
+    assert said is None or said in present(text)
+    found = present(better(given, misfits))
+    wrong = np.array([np.log(found.camera.fx / LENS.fx), (found.camera.cx - LENS.cx) / LENS.fx])
+    assert np.all(np.abs(wrong) < max(0.02, 0.4 * np.abs(off).max()))
+
+
+def test_straight_ahead_nothing_is_said_of_the_lens() -> None:
+    given = changed(LENS, np.array([0.3, 0, 0, 0]))
+    assert told(given, mistaken(given, seed=1, turn=0.0).map.misfits) is None
