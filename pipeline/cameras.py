@@ -25,6 +25,8 @@ MODEL_ID: dict[str, int] = {
 }
 ALIKE = 1000.0
 """An orthographic camera is rated as a photo of so many pixels' focal length whose pixels are as large."""
+FEW = 10_000
+"""Points, and pixels, for which one thread takes less time than to wake others."""
 # layout of the parameter array: fx fy cx cy, k1 k2 p1 p2 k3 k4 k5 k6, width height, limit
 _WIDTH, _HEIGHT, _LIMIT = 12, 13, 14
 
@@ -75,12 +77,15 @@ def project(camera: Camera, points_cam: npt.ArrayLike) -> tuple[F32, Bools]:
 def project_exactly(camera: Camera, points_cam: npt.ArrayLike) -> tuple[F64, Bools]:
     """`project` in float64, for differences of pixels."""
     points = np.ascontiguousarray(points_cam, np.float64).reshape(-1, 3)
-    return _project(MODEL_ID[camera.model], parameters(camera), points)
+    kernel = _project if len(points) > FEW else _project_few
+    return kernel(MODEL_ID[camera.model], parameters(camera), points)
 
 
 def unproject(camera: Camera, uv: npt.ArrayLike) -> F64:
     """(N, 3) unit rays in camera axes through pixels (N, 2); NaN for a pixel that no ray reaches."""
-    return _unproject(MODEL_ID[camera.model], parameters(camera), np.ascontiguousarray(uv, np.float64).reshape(-1, 2))
+    pixels = np.ascontiguousarray(uv, np.float64).reshape(-1, 2)
+    kernel = _unproject if len(pixels) > FEW else _unproject_few
+    return kernel(MODEL_ID[camera.model], parameters(camera), pixels)
 
 
 def pixel_rays(camera: Camera) -> F32:
@@ -236,10 +241,28 @@ def _project(model: int, p: F64, points: F64) -> tuple[F64, Bools]:
     return uv, valid
 
 
+@njit(cache=True)
+def _project_few(model: int, p: F64, points: F64) -> tuple[F64, Bools]:
+    uv = np.empty((len(points), 2))
+    valid = np.empty(len(points), np.bool_)
+    for i in range(len(points)):
+        u, v, ok = project_point(model, p, points[i, 0], points[i, 1], points[i, 2])
+        uv[i, 0], uv[i, 1], valid[i] = u, v, ok
+    return uv, valid
+
+
 @njit(cache=True, parallel=True)
 def _unproject(model: int, p: F64, uv: F64) -> F64:
     rays = np.empty((len(uv), 3))
     for i in prange(len(uv)):
+        rays[i, 0], rays[i, 1], rays[i, 2] = unproject_pixel(model, p, uv[i, 0], uv[i, 1])
+    return rays
+
+
+@njit(cache=True)
+def _unproject_few(model: int, p: F64, uv: F64) -> F64:
+    rays = np.empty((len(uv), 3))
+    for i in range(len(uv)):
         rays[i, 0], rays[i, 1], rays[i, 2] = unproject_pixel(model, p, uv[i, 0], uv[i, 1])
     return rays
 

@@ -15,6 +15,7 @@ from scan2sim.pipeline.types import U8, Camera
 from scan2sim.slam.features import Found
 from scan2sim.slam.localmap import Keyframe, Landmarks
 from scan2sim.slam.odometry import Odometry, Placed
+from scan2sim.slam.patches import Patches
 from scan2sim.slam.relocalise import Remembered, Seen
 from scan2sim.slam.state import WrongState, load, save
 from scan2sim.slam.trackers import Tracks
@@ -26,7 +27,7 @@ VERSION = 7
 interrupted run or a trajectory that is kept, is begun anew then."""
 KEEP_EVERY = 60.0
 """Seconds between states kept."""
-VALUES = (Found, Keyframe, Landmarks, Placed, Remembered, Seen, SeenInFacet, Tracks)
+VALUES = (Found, Keyframe, Landmarks, Patches, Placed, Remembered, Seen, SeenInFacet, Tracks)
 """What states consist of."""
 
 

@@ -1,7 +1,8 @@
 """Corners, followed from frame to frame by pyramidal Lucas-Kanade, each in its facet of the sphere.
 
 Needs no weights. A corner is followed there and back; one that doesn't return to where it was is lost. Pictures are
-brought to one exposure before (`exposure.py`).
+brought to one exposure before (`exposure.py`). What is found is laid onto what the corner looked like at first
+(`patches.py`): a corner that looks otherwise is lost, too.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import numpy as np
 from scan2sim.pipeline.types import F32, F64, I64, U8
 from scan2sim.slam import exposure
 from scan2sim.slam.facets import Facets
+from scan2sim.slam.patches import Patches
 from scan2sim.slam.trackers import Tracks
 
 WINDOW, FINE = 17, 9
@@ -37,7 +39,7 @@ def load(facets: Facets, mask: U8 | None, count: int, features: None = None, mat
 class CornerTracker:
     """See `slam.trackers.Tracker`."""
 
-    STATE: tuple[str, ...] = ("tracks", "pictures", "_next")
+    STATE: tuple[str, ...] = ("tracks", "pictures", "_next", "_patches")
 
     def __init__(self, facets: Facets, mask: U8 | None, count: int) -> None:
         """`mask` (H, W): 0 where the car itself is; `count`: corners to keep alive."""
@@ -46,6 +48,7 @@ class CornerTracker:
         self._masks = None if mask is None else facets.pictures(np.where(mask > 0, np.uint8(255), np.uint8(0)))
         self.pictures: list[U8] = []
         self._next = 0
+        self._patches = Patches()
 
     def track(self, grey: U8, expected: F64 | None = None) -> float:
         """Follow all tracks into the next frame; returns the share that could be followed.
@@ -68,6 +71,7 @@ class CornerTracker:
                 bearing[rows] = self._follow(
                     facet, before[facet], pictures[facet], tracks.bearing[rows], expected[rows]
                 )
+        bearing = self._laid(tracks.ids, bearing)
         found = np.isfinite(bearing[:, 0])
         self.tracks = Tracks(tracks.ids[found], bearing[found])
         return float(found.mean())
@@ -93,6 +97,28 @@ class CornerTracker:
             good[good] = self._masks[facet][at[:, 1], at[:, 0]] > 0
         out = np.full((len(bearing), 3), np.nan)
         out[good] = self.facets.bearings(facet, there[good])
+        return out
+
+    def _laid(self, ids: I64, bearing: F64) -> F64:
+        """Bearings (N, 3) of features that have been followed to such, where they look as at first; NaN: they don't."""
+        found = np.isfinite(bearing[:, 0])
+        self._patches.keep(ids[found])
+        out = np.full_like(bearing, np.nan)
+        facet_of = np.full(len(ids), -1)
+        rows, known = self._patches.find(ids)
+        facet_of[known] = self._patches.facet[rows[known]]
+        for facet, picture in enumerate(self.pictures):
+            mine = np.flatnonzero(facet_of == facet)
+            if len(mine):
+                uv = self.facets.pixels(facet, bearing[mine])
+                out[mine] = self.facets.bearings(facet, self._patches.lay(ids[mine], facet, picture, uv))
+        found = np.isfinite(out[:, 0])
+        goes_on = np.full(len(ids), -1)
+        goes_on[found] = self.facets.place(out[found])
+        for facet, picture in enumerate(self.pictures):
+            come = (goes_on == facet) & (facet_of != facet)
+            if come.any():
+                self._patches.take(ids[come], facet, picture, self.facets.pixels(facet, out[come]))
         return out
 
     def drop(self, ids: I64) -> None:
@@ -122,6 +148,11 @@ class CornerTracker:
         self.tracks = Tracks(
             np.concatenate([self.tracks.ids, ids]), np.concatenate([self.tracks.bearing, bearing[chosen]])
         )
+        facet_of = self.facets.place(bearing[chosen])
+        for facet, picture in enumerate(self.pictures):
+            mine = facet_of == facet
+            if mine.any():
+                self._patches.take(ids[mine], facet, picture, self.facets.pixels(facet, bearing[chosen[mine]]))
         return len(chosen)
 
     def _corners(self, facet: int) -> tuple[F64, F32]:
@@ -141,7 +172,6 @@ class CornerTracker:
             return np.zeros((0, 3)), np.zeros(0, np.float32)
         uv: F32 = np.asarray(found, np.float32).reshape(-1, 2)
         strength = np.linspace(1, 0, len(uv), dtype=np.float32)  # they come strongest first
-        cv2.cornerSubPix(picture, uv, (3, 3), (-1, -1), (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 10, 0.03))
         bearing = self.facets.bearings(facet, uv)
         ok = np.isfinite(bearing[:, 0])
         ok[ok] = self.facets.place(bearing[ok]) == facet

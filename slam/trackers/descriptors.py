@@ -126,6 +126,7 @@ class DescriptorTracker(CornerTracker):
                     bearing[rows] = self._follow(
                         facet, old[facet], self.pictures[facet], tracks.bearing[rows], expected[rows]
                     )
+        bearing = self._laid(tracks.ids, bearing)
         found = np.flatnonzero(np.isfinite(bearing[:, 0]))
         self.tracks = Tracks(tracks.ids[found], bearing[found])
         self._settle([known[row] for row in found.tolist()])
