@@ -84,14 +84,15 @@ writes. Who passes on an environment (an image, an appliance, an installer) pass
 {attention}
 
 Nothing that is GPL without an exception comes with the core. To ship without any GPL, leave out the extra `meshlab`,
-one of four libraries that decimate, and the extras `slam` and `toolboxes`: what they do needs PyAV to read and write
-videos (built against an FFmpeg without x264 and x265 it still reads them), and pycolmap for `slam --adjust` alone. Of
-the toolboxes' containers, that of `movement` alone holds PyAV ([toolboxes.md](toolboxes.md#containers)).
+one of four libraries that decimate, and the extras `slam`, `teleop` and `toolboxes`: what they do needs PyAV to read
+and write videos (built against an FFmpeg without x264 and x265 it still reads them, and makes VP8), and pycolmap for
+`slam --adjust` alone. Of the toolboxes' containers, that of `movement` alone holds PyAV
+([toolboxes.md](toolboxes.md#containers)).
 """
 
 ATTENTION = (
     ("x264, x265, and with them PyAV's whole FFmpeg", "GPL-2.0-or-later (GPL-3.0 in this combination)",
-     "`slam`, `toolboxes` (by supervision): av",
+     "`slam`, `teleop`, `toolboxes` (by supervision): av",
      "source code of these libraries beside the binaries, and the GPL for what is linked with them; H.264 and H.265 "
      "may also need patent licences"),
     ("SuiteSparse in pycolmap's binary", "GPL-2.0-or-later", "`slam`: pycolmap",
@@ -105,7 +106,7 @@ ATTENTION = (
      "the licence's text and the source; a shared library"),
     ("libgfortran, libgomp", "GPL-3.0 with the GCC Runtime Library Exception", "core: numpy, scipy",
      "nothing: the exception allows any use in compiled programs"),
-    ("mp3lame, GnuTLS, nettle, GMP, libunistring, ALSA", "LGPL", "`slam`, `toolboxes`: av",
+    ("mp3lame, GnuTLS, nettle, GMP, libunistring, ALSA", "LGPL", "`slam`, `teleop`, `toolboxes`: av",
      "the licence's text and the source; shared libraries"),
     ("GEOS", "LGPL-2.1-or-later", "`rasters`: rasterio", "likewise"),
     ("Intel MKL, IPP", "Intel Simplified Software License", "core: open3d, opencv-python-headless",

