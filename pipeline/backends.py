@@ -1,17 +1,18 @@
 """Backends and formats: a file each, found by its name in its package; each says what it needs to run here.
 
 To add one: a file in the package. It has what the package's protocol asks for, and, where that takes more than the
-project's own dependencies, `NEEDS`, their import names. Files are formats by `SUFFIXES`, ends of their names.
+project's own dependencies, `NEEDS`, their import names. Files are formats by `SUFFIXES`, ends of their names. Where one
+of several is chosen unasked, `RANK` says which are better, and `lacking()` what of the machine isn't there.
 """
 
 from __future__ import annotations
 
 import importlib
 import pkgutil
-from typing import Any
+from typing import Any, NamedTuple
 
 from scan2sim.pipeline import extras
-from scan2sim.pipeline.errors import SettingError
+from scan2sim.pipeline.errors import SettingError, UnavailableError
 
 
 def names(package: str) -> list[str]:
@@ -53,6 +54,46 @@ def find(package: str, name: str, setting: str) -> Any:
     backend = module(package, name)
     extras.need(f"{setting} {name}", *needs(backend))
     return backend
+
+
+class Lacking(NamedTuple):
+    """Why a backend can't run here, and what to do about it."""
+
+    cause: str
+    remedy: str
+
+
+def best(package: str, name: str | None, setting: str, what: str) -> Any:
+    """The module of a backend that can run here: of that name, or the one of least `RANK`.
+
+    Args:
+        package: its full name.
+        name: of the backend, as the user gave it; None: the best.
+        setting: that named it, for errors.
+        what: needs one, for errors.
+
+    Raises:
+        SettingError: there is no such backend.
+        UnavailableError: it can't run here, or none can.
+    """
+    asked = [find(package, name, setting)] if name else [module(package, one) for one in names(package)]
+    why = {}
+    for backend in sorted(asked, key=lambda one: one.RANK):
+        lacking = _lacking(backend)
+        if lacking is None:
+            return backend
+        why[backend.__name__.rpartition(".")[2]] = lacking
+    causes = "; ".join(f"{one} {lacking.cause}" for one, lacking in why.items())
+    raise UnavailableError(what, causes, " or ".join(dict.fromkeys(lacking.remedy for lacking in why.values())))
+
+
+def _lacking(backend: Any) -> Lacking | None:
+    packages = extras.missing(*needs(backend))
+    if packages:
+        error = extras.unavailable(backend.__name__, packages)
+        return Lacking(error.cause, error.remedy)
+    lacking: Lacking | None = backend.lacking()
+    return lacking
 
 
 def by_suffix(package: str) -> dict[str, str]:

@@ -24,6 +24,7 @@ from scan2sim.pipeline.io.gltf import geometry, textures
 from scan2sim.pipeline.types import Camera
 from scan2sim.segmentation import backends as networks
 from scan2sim.services.qos import links
+from scan2sim.services.teleoperation import cameras, video
 from scan2sim.slam import features, matchers, solvers, trackers
 from tests.conftest import ROOT
 from tests.pipeline import made_up
@@ -45,6 +46,8 @@ PROTOCOLS: dict[ModuleType, tuple[type, ...]] = {
     geometry: (geometry.Codec,),
     decimation: (decimation.Backend,),
     links: (links.Backend,),
+    video: (video.Backend,),
+    cameras: (cameras.Backend,),
 }
 """Packages of backends, and what their modules are: one of these."""
 ALL = [(package, name) for package in PROTOCOLS for name in backends.names(package.__name__)]

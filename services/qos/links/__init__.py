@@ -4,19 +4,12 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 from scan2sim.pipeline import backends
-from scan2sim.pipeline.errors import UnavailableError
+from scan2sim.pipeline.backends import Lacking
 from scan2sim.services.qos.namespaces import WHAT, Namespace
 from scan2sim.services.qos.shape import Shape
-
-
-class Lacking(NamedTuple):
-    """Why a backend can't run here, and what to do about it."""
-
-    cause: str
-    remedy: str
 
 
 class Wire(Protocol):
@@ -49,18 +42,8 @@ def find(name: str | None = None) -> Backend:
         SettingError: there is none of that name.
         UnavailableError: it can't run here, or none can.
     """
-    asked = (name,) if name else backends.names(__name__)
-    ranked: list[tuple[str, Backend]] = sorted(
-        ((one, backends.find(__name__, one, "link")) for one in asked), key=lambda one: one[1].RANK
-    )
-    why = {}
-    for one, backend in ranked:
-        lacking = backend.lacking()
-        if lacking is None:
-            return backend
-        why[one] = lacking
-    causes = "; ".join(f"{one} {lacking.cause}" for one, lacking in why.items())
-    raise UnavailableError(WHAT, causes, " or ".join(lacking.remedy for lacking in why.values()))
+    found: Backend = backends.best(__name__, name, "link", WHAT)
+    return found
 
 
 def programs(**packages: str) -> Lacking | None:

@@ -10,8 +10,9 @@ import socket
 import time
 from pathlib import Path
 
+from scan2sim.pipeline.backends import Lacking
 from scan2sim.pipeline.errors import UnavailableError
-from scan2sim.services.qos.links import Lacking, programs
+from scan2sim.services.qos.links import programs
 from scan2sim.services.qos.namespaces import WHAT, Namespace
 from scan2sim.services.qos.shape import Shape
 

@@ -14,11 +14,11 @@ from typing import Any
 import pytest
 
 from scan2sim.pipeline import backends
+from scan2sim.pipeline.backends import Lacking
 from scan2sim.pipeline.errors import SettingError, UnavailableError
 from scan2sim.services.qos import links, namespaces
 from scan2sim.services.qos.counters import Counter
 from scan2sim.services.qos.link import Link
-from scan2sim.services.qos.links import Lacking
 from scan2sim.services.qos.shape import Shape
 from tests.services.qos.needed import need_link
 

@@ -1,0 +1,321 @@
+"""Encrypted packets to frames in their order: each is given out as soon as it and its predecessors are whole.
+
+Packets of several links come in any order, some twice. One that lacks is waited for as long as such have come late
+lately; then what follows is left out up to the next key frame, which is wanted at once.
+"""
+
+from __future__ import annotations
+
+import statistics
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from typing import NamedTuple
+
+from scan2sim.services.teleoperation import rtp
+from scan2sim.services.teleoperation.messages import Key, Malformed, Report
+from scan2sim.services.teleoperation.srtp import Opener
+
+SHORTEST, FIRST, LONGEST = 0.015, 0.04, 0.15
+"""Seconds that a packet is waited for: at least, in the beginning, at most."""
+FORGETS = 0.98
+"""What is left after each frame of how late packets came: half after a second of 30 frames."""
+AGAIN = 0.25
+"""Seconds after which a key frame is wanted again: about the time there, to encode it, and back."""
+HELD = 1024
+"""Packets of a camera that wait for others, at most."""
+
+
+class Frame(NamedTuple):
+    """A frame of VP8.
+
+    Attributes:
+        captured: nanoseconds of the vehicle's monotonic clock.
+        key: whether it is a key frame.
+        width, height: pixels, of it or of the last key frame.
+    """
+
+    camera: int
+    captured: int
+    key: bool
+    data: bytes
+    width: int
+    height: int
+
+
+class Patience:
+    """How long a packet is waited for: half longer than those that came late lately."""
+
+    def __init__(self) -> None:
+        self.seconds = FIRST
+
+    def came(self, late: float) -> None:
+        """A packet came so many seconds after one that was sent after it."""
+        self.seconds = min(LONGEST, max(self.seconds, 1.5 * late))
+
+    def pass_by(self) -> None:
+        """A frame came as it should."""
+        self.seconds = max(SHORTEST, self.seconds * FORGETS)
+
+
+class _Gap(NamedTuple):
+    """The packet that is waited for, None: any key frame; `since`: when a later one came."""
+
+    sequence: int | None
+    since: float
+
+
+class Assembly:
+    """Frames of one source (SSRC), from its packets, each of which comes once; knows no encryption and no clock.
+
+    A frame is given out if it follows the last one, or is a key frame.
+
+    Attributes:
+        frames, broken: that were given out, and that weren't, by their numbers.
+        received: packets.
+        wants: whether it can't go on without a key frame, and none is coming.
+    """
+
+    def __init__(self, patience: Patience) -> None:
+        self.frames = self.broken = self.received = 0
+        self.wants = False
+        self._patience = patience
+        self._held: dict[int, rtp.Packet] = {}
+        self._keys: set[int] = set()
+        self._next: int | None = None  # what follows the last frame
+        self._coming: int | None = None  # where the frame begins that is to be next
+        self._number = 0
+        self._lowest = self._highest = 0  # sequences of all packets, which go on beyond 16 bits
+        self._gap: _Gap | None = None
+
+    def add(self, packet: rtp.Packet, now: float) -> Iterator[list[rtp.Packet]]:
+        """Take a packet; gives the frames that are whole by it."""
+        sequence = self._unwrapped(packet.sequence)
+        self.received += 1
+        if self._gap and sequence == self._gap.sequence:
+            self._patience.came(now - self._gap.since)
+        if self._next is not None and sequence < self._next:
+            return
+        self._hold(sequence, packet)
+        while whole := self._whole():
+            yield self._give_out(*whole)
+        if not self.wants:
+            self._wait(now)
+
+    def _unwrapped(self, sequence: int) -> int:
+        if self.received == 0:
+            self._lowest = self._highest = sequence
+        near = self._highest + (sequence - self._highest + 0x8000 & 0xFFFF) - 0x8000
+        self._lowest, self._highest = min(self._lowest, near), max(self._highest, near)
+        return near
+
+    @property
+    def counts(self) -> Counter[str]:
+        """As numbers by name; `lost`: packets between the first and the last that didn't come."""
+        lost = self._highest - self._lowest + 1 - self.received if self.received else 0
+        return Counter(frames=self.frames, broken=self.broken, received=self.received, lost=lost)
+
+    def _hold(self, sequence: int, packet: rtp.Packet) -> None:
+        self._held[sequence] = packet
+        if packet.key:
+            self._keys.add(sequence)
+            if self.wants or self._coming is None:
+                self.wants, self._coming, self._gap = False, sequence, None
+        if len(self._held) > HELD:
+            self._drop(min(self._held))
+
+    def _drop(self, sequence: int) -> None:
+        del self._held[sequence]
+        self._keys.discard(sequence)
+
+    def _whole(self) -> tuple[int, list[rtp.Packet]] | None:
+        """The next frame that can be given out, and its sequence."""
+        following = () if self._next is None else (self._next,)
+        for sequence in (*following, *sorted(self._keys)):
+            frame = self._frame_at(sequence)
+            if frame:
+                return sequence, frame
+        return None
+
+    def _frame_at(self, sequence: int) -> list[rtp.Packet]:
+        frame: list[rtp.Packet] = []
+        while packet := self._held.get(sequence + len(frame)):
+            if packet.first != (not frame):
+                return []
+            frame.append(packet)
+            if packet.last:
+                return frame
+        return []
+
+    def _give_out(self, sequence: int, frame: list[rtp.Packet]) -> list[rtp.Packet]:
+        """All up to the frame's end is done with."""
+        number = frame[0].number
+        if self.frames:
+            self.broken += (number - self._number & 0x7FFF) - 1
+        self.frames += 1
+        self.wants, self._number = False, number
+        self._next = self._coming = sequence + len(frame)
+        for old in [one for one in self._held if one < self._next]:
+            self._drop(old)
+        self._patience.pass_by()
+        return frame
+
+    def _wait(self, now: float) -> None:
+        """See which packet lacks, and whether it has been waited for long enough."""
+        lacking = self._coming
+        while lacking is not None and lacking in self._held:
+            lacking += 1
+        if lacking is not None and lacking > self._highest:
+            return  # none: the frame's end isn't there yet
+        if self._gap is None or self._gap.sequence != lacking:
+            self._gap = _Gap(lacking, now)
+        elif now > self._gap.since + self._patience.seconds:
+            self.wants = True
+
+
+class _View:
+    """A camera, as it comes: by one source, and from the next key of the encryption on by another."""
+
+    def __init__(self, camera: int) -> None:
+        self._camera = camera
+        self._patience = Patience()
+        self._source, self._past = -1, -1
+        self._assemblies: dict[int, Assembly] = {}  # of the source, and of the one that is coming
+        self._before: Counter[str] = Counter()  # counts of sources that are past
+        self._told: Counter[str] = Counter()
+        self._wanted = -AGAIN
+        self._delays: list[float] = []
+        self._size = (0, 0)
+        self.links: Counter[str] = Counter()
+
+    def add(self, packet: rtp.Packet, now: float) -> Iterator[Frame]:
+        """Take a packet; gives the frames that are whole by it."""
+        source = packet.source
+        if source == self._past:
+            return
+        if source not in self._assemblies:
+            self._close(other for other in self._assemblies if other != self._source)
+            self._assemblies[source] = Assembly(self._patience)
+        for parts in self._assemblies[source].add(packet, now):
+            if source != self._source:
+                self._close([self._source])
+                self._past, self._source = self._source, source
+            yield self._frame(parts)
+
+    def _close(self, sources: Iterable[int]) -> None:
+        for source in set(sources) & self._assemblies.keys():
+            self._before.update(self._assemblies.pop(source).counts)
+
+    def _frame(self, parts: list[rtp.Packet]) -> Frame:
+        data = b"".join([packet.data for packet in parts])
+        first = parts[0]
+        if first.key:
+            self._size = rtp.size(data)
+        return Frame(self._camera, first.captured, first.key, data, *self._size)
+
+    def wants(self, now: float) -> bool:
+        """Whether a key frame is to be asked for now."""
+        if now < self._wanted + AGAIN or not any(one.wants for one in self._assemblies.values()):
+            return False
+        self._wanted = now
+        return True
+
+    @property
+    def counts(self) -> Counter[str]:
+        """Since the beginning."""
+        total = self._before.copy()
+        for assembly in self._assemblies.values():
+            total.update(assembly.counts)
+        return total
+
+    def delayed(self, milliseconds: float) -> None:
+        """A frame took so long."""
+        self._delays.append(milliseconds)
+
+    def report(self, seconds: float) -> Report:
+        """Of so many seconds, those since the last report."""
+        total, told = self.counts, self._told
+        delay = statistics.median(self._delays) if self._delays else 0.0
+        links = {name: amount / seconds for name, amount in self.links.items()}
+        self._told = total
+        self._delays.clear()
+        self.links.clear()
+        received, lost = (max(0, total[what] - told[what]) for what in ("received", "lost"))
+        return Report(self._camera, received, lost, round(delay, 1), links)
+
+
+class Watcher:
+    """What a vehicle's cameras send, on the station's side. May be fed by several threads.
+
+    Attributes:
+        counts: packets that were dropped, by why: see `srtp.Opener`.
+    """
+
+    def __init__(
+        self,
+        frame: Callable[[Frame], None],
+        want: Callable[[int], None],
+        age: Callable[[int], float],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Of what is called in the thread that feeds it, and returns at once.
+
+        Args:
+            frame: is given each frame.
+            want: is given the number of a camera of which a key frame is wanted.
+            age: milliseconds since a moment of the vehicle's monotonic clock, in nanoseconds.
+            clock: seconds.
+        """
+        self._frame, self._want, self._age, self._clock = frame, want, age, clock
+        self._opener = Opener()
+        self._views: dict[int, _View] = {}
+        self._reported = clock()
+        self._lock = threading.Lock()
+
+    @property
+    def counts(self) -> Counter[str]:
+        """Packets that were dropped, by why."""
+        return self._opener.counts
+
+    def frames(self) -> dict[int, Counter[str]]:
+        """By camera: `frames` that were given out, `broken` ones that weren't, packets `received` and `lost`."""
+        with self._lock:
+            return {camera: view.counts for camera, view in self._views.items()}
+
+    def learn(self, key: Key) -> None:
+        """Take a key of the vehicle's."""
+        with self._lock:
+            self._opener.learn(key)
+
+    def feed(self, packet: bytes, link: str) -> None:
+        """Take a packet that came by a link."""
+        now = self._clock()
+        with self._lock:
+            plain = self._opener.open(packet, now)
+            known = self._views.get(packet[11]) if len(packet) > 11 else None
+            if known:
+                known.links[link] += len(packet)
+            if plain is not None:
+                self._take(plain, now)
+
+    def _take(self, plain: bytes, now: float) -> None:
+        try:
+            packet = rtp.parse(plain)
+            camera = packet.source & 0xFF
+            view = self._views.get(camera) or self._views.setdefault(camera, _View(camera))
+            for frame in view.add(packet, now):
+                view.delayed(self._age(frame.captured))
+                self._frame(frame)
+        except Malformed:
+            self._opener.counts["malformed"] += 1
+            return
+        if view.wants(now):
+            self._want(camera)
+
+    def reports(self) -> list[Report]:
+        """How all cameras came since the last call; to be called once a second or so."""
+        with self._lock:
+            now = self._clock()
+            seconds, self._reported = max(now - self._reported, 1e-3), now
+            return [view.report(seconds) for view in self._views.values()]
