@@ -1,10 +1,12 @@
 """Visual SLAM against a rendered drive's truth, KITTI's, pycolmap, and the mission's own method.
 
-`python -m bench.slam [--parts drive kitti turn trust pano memory] [--length 1500] [--out bench-out/slam]`
+`python -m bench.slam [--parts drive hard kitti turn trust solvers pano memory] [--length 1500] [--out bench-out/slam]`
 
 - drive: 360-degree video (1024 px high, 10 Mbit/s, 15 fps) along a real path (KITTI 00; without the data a made-up one)
   through a synthetic town with traffic, odometry alone, a consumer receiver's GPS for the scale: D3.2's two errors;
   frames a second; the first 40 seconds by the mission's method, too (`--backend adam`, adjacent distances).
+- hard: drives of 150 m with hills, sharp turns, motion blur, rolling shutter, offset lenses and glare, each alone and
+  all together: drift, the share of unsure frames, rolling shutter and lens offset estimated against what was rendered.
 - kitti: 51 frames of KITTI odometry 06 (perspective, real): ATE after a similarity, odometry alone and with the
   global adjustment; pycolmap's incremental mapping of the same frames, and the ratio of the times.
 - turn: 51 frames of a rendered turn of 98 degrees (perspective, 52 m): ATE, and pycolmap's; what it costs there and on
@@ -13,7 +15,8 @@
   what GPS of 10 cm leaves of the error of a turn whose scale drifts as KITTI's did (step lengths .885, 1.001, 1.048);
   on how many drives a focal length 5 % off, or a centre off by as much, is noticed.
 - pano: rotation and direction of motion between two real 360 frames, against their reference.
-- memory: peak of the process over ever more frames.
+- solvers: `adam` against `lm` with equal chords and equal GPS over ten simulated drives, a paired test.
+- memory: peak of the process over 10,000 frames.
 
 Ends with `RESULT {json}`; null where a part was left out.
 """
@@ -22,79 +25,27 @@ from __future__ import annotations
 
 import argparse
 import json
-import shutil
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from bench.measure import measure
+from bench.slam_drive import DATA, drive
 from bench.slam_frames import Sequence, lit, odometry, places, pycolmap
+from bench.slam_hard import hard
+from bench.slam_memory import memory
+from bench.slam_solvers import solvers
 from bench.slam_trust import covariance, gps_gain, lens
-from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.types import Camera
-from scan2sim.slam.evaluate import Evaluation, evaluate, plot
 from scan2sim.slam.facets import Facets
 from scan2sim.slam.geometry import log_so3, relative_pose
 from scan2sim.slam.relocalise import describe, matches
 from scan2sim.slam.trackers import named
 
 ROOT = Path(__file__).resolve().parent.parent
-DATA = ROOT.parent / "shared" / "data"
-PARTS = ("drive", "kitti", "turn", "trust", "pano", "memory")
-
-
-def drive_of(out: Path, path: str, length: float) -> Path:
-    """The rendered drive along a KITTI path, or a made-up one; made if absent."""
-    from scan2sim.data_samples import paths
-    from scan2sim.data_samples.drive import generate_drive
-
-    folder, file = out / f"drive_{path}", DATA / "kitti_gt_poses" / f"{path}.txt"
-    if not (folder / "video.mp4").is_file():
-        print(f"rendering {length:.0f} m of {path}: about a second a frame", flush=True)
-        way = paths.kitti_path(file, length) if file.is_file() else paths.town_path(0, length)
-        shutil.rmtree(folder, ignore_errors=True)
-        generate_drive(folder, way, length=length, speed=15, fps=15, height=1024, bitrate=10e6, samples=4)
-    return folder
-
-
-def slam(drive: Path, out: Path, *options: object) -> tuple[Evaluation, dict[str, Any]]:
-    """Run `scan2sim slam` on a drive; how far it is from the truth, and its facts."""
-    shutil.rmtree(out, ignore_errors=True)
-    command = [str(Path(sys.executable).parent / "scan2sim"), "slam", str(drive / "video.mp4"), "--out", str(out)]
-    command += ["--gps", str(drive / "gps.csv"), "--gps-offset", "0", "--mask", str(drive / "mask.png")]
-    measured = measure([*command, *map(str, options)])
-    if measured.status:
-        sys.exit(f"scan2sim slam failed with exit status {measured.status}")
-    found = evaluate(trajectory_io.read(out / "trajectory.csv"), trajectory_io.read(drive / "truth.csv"))
-    plot(found, out / "plot.png")
-    return found, json.loads((out / "slam.json").read_text()) | {"peak_gb": measured.peak_gb}
-
-
-def drive(out: Path, path: str, length: float, stretch: float) -> dict[str, float | None]:
-    """The two errors on the rendered drive; on its first `stretch` seconds by both solvers."""
-    made = drive_of(out, path, length)
-    adjacent = ("--backend", "adam", "--set", "slam.gps_chords=adjacent")
-    kinds: list[tuple[str, tuple[object, ...]]] = [("lm", ())]
-    if stretch:
-        kinds += [("lm_start", ("--until", stretch)), ("adam_start", ("--until", stretch, *adjacent))]
-    found = {}
-    for kind, options in kinds:
-        result, facts = slam(made, out / f"slam_{path}_{kind}", *options)
-        local = "-" if result.local_median is None else f"{result.local_median:.2f}"
-        mean = f"global mean {result.global_mean:.2f} m ({result.drift_percent:.3f} %), local median 400 {local} m"
-        cost = f"{facts['fps']:.1f} frames/s, {facts['unsure_share']:.1%} unsure, {facts['peak_gb']:.2f} GB"
-        print(f"{path}, {result.length:.0f} m, {kind}: {mean}, {cost}", flush=True)
-        found[kind] = (result, facts)
-    whole, facts = found["lm"]
-    return {
-        "drift_percent": whole.drift_percent, "local400_m": whole.local_median, "fps": facts["fps"],
-        "adam_drift_percent": found["adam_start"][0].drift_percent if stretch else None,
-    }  # fmt: skip
+PARTS = ("drive", "hard", "kitti", "turn", "trust", "solvers", "pano", "memory")
+USUAL = ("drive", "kitti", "turn", "trust", "pano")
 
 
 def kitti(out: Path) -> dict[str, float | None]:
@@ -193,33 +144,10 @@ def pano() -> None:
         )
 
 
-def memory(out: Path, path: str, length: float) -> None:
-    """Peak memory over ever more frames."""
-    made = drive_of(out, path, length)
-    code = """
-import sys, resource
-from pathlib import Path
-from scan2sim.pipeline.types import Camera
-from scan2sim.slam.video import open_video
-video = open_video(Path(sys.argv[1]))
-odometry, offset, count = Odometry(Camera("equirectangular", 512, 256), OdometryParams(count=300)), 0.0, 0
-import cv2
-while count < 10000:
-    for frame in video.frames():
-        odometry.add(offset + frame.time, cv2.resize(frame.grey, (512, 256), interpolation=cv2.INTER_AREA))
-        count += 1
-        if count in (1000, 3000, 10000):
-            peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-            print(f"{count} frames: {peak:.3f} GB", flush=True)
-    offset += frame.time + 1
-"""
-    subprocess.run([sys.executable, "-c", code, str(made / "video.mp4")], check=True, cwd=ROOT)
-
-
 def main() -> None:
     """Run the parts, print tables and the result."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--parts", nargs="+", choices=PARTS, default=["drive", "kitti", "turn", "trust", "pano"])
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=USUAL)
     parser.add_argument("--path", default="00", help="of kitti_gt_poses")
     parser.add_argument("--length", type=float, default=1500.0)
     parser.add_argument("--adam", type=float, default=40.0, help="seconds for the mission's method; 0: leave it out")
@@ -230,7 +158,7 @@ def main() -> None:
     keys = (
         "drift_percent", "local400_m", "adam_drift_percent", "kitti06_ate_m", "pycolmap_time_ratio", "fps",
         "turn_ate_m", "turn_pycolmap_ratio", "gain_ate_ratio", "covariance_95", "gps_gain", "focal_noticed",
-        "centre_noticed", "focal_false_alarms",
+        "centre_noticed", "focal_false_alarms", "hard_drift_percent", "adam_lm_p", "memory_10000_growth",
     )  # fmt: skip
     result: dict[str, float | None] = dict.fromkeys(keys)
     if "drive" in arguments.parts:
@@ -248,8 +176,12 @@ def main() -> None:
             result |= kitti(out)
         else:
             pano()
+    if "hard" in arguments.parts:
+        result |= hard(out)
+    if "solvers" in arguments.parts:
+        result |= solvers()
     if "memory" in arguments.parts:
-        memory(out, arguments.path, arguments.length)
+        result |= memory(out)
     print("RESULT " + json.dumps({k: None if v is None else round(v, 4) for k, v in result.items()}))
 
 

@@ -1,17 +1,18 @@
-"""The town's flat ground: where the road is, and how far from it everything else.
+"""The town's ground: where the road is, and how far from it everything else.
 
 The road's centre line runs `LANE` to the left of the driven path (traffic keeps right). Where a path
-comes by again, the road that is there already serves. Heights: road 0, all else `KERB` above.
+comes by again, the road that is there already serves. Heights: road 0, all else `KERB` above, and hills below both.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
 
+from scan2sim.data_samples.hills import FLAT
 from scan2sim.data_samples.paths import chainage, extended, heading, smooth
 from scan2sim.pipeline.types import F32, F64, I32
 
@@ -36,6 +37,7 @@ class Ground:
         nearest: (Y, X) index into `line` of the nearest point.
         line: (P, 6) points of the centre lines: x, y, direction (unit), chainage, 1 where markings are painted.
         driven: (N, 2) the smoothed path itself.
+        hills: see `hills.draw`.
     """
 
     origin: F64
@@ -43,6 +45,7 @@ class Ground:
     nearest: I32
     line: F64
     driven: F64
+    hills: F64 = field(default_factory=lambda: FLAT)
 
     def at(self, xy: npt.ArrayLike) -> F64:
         """(...) metres from points (..., 2) to the nearest centre line (bilinear), `FAR` outside the raster."""
@@ -59,7 +62,7 @@ class Ground:
         return list(pairwise(edges))
 
 
-def lay_ground(path: F64) -> Ground:
+def lay_ground(path: F64, hills: F64 = FLAT) -> Ground:
     """The ground around a path (N, 2) that is driven once from its start to its end."""
     from scipy.spatial import cKDTree
 
@@ -73,7 +76,7 @@ def lay_ground(path: F64) -> Ground:
         nodes = np.stack(np.meshgrid(x, y[j : j + 64]), axis=-1)
         d, i = tree.query(nodes, distance_upper_bound=FAR, workers=2)
         distance[j : j + 64], nearest[j : j + 64] = np.minimum(d, FAR), np.where(i < len(line), i, 0)
-    return Ground(low, distance, nearest, line, driven)
+    return Ground(low, distance, nearest, line, driven, hills)
 
 
 def _centre(driven: F64) -> F64:

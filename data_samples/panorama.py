@@ -16,6 +16,7 @@ import numpy.typing as npt
 from scan2sim.data_samples import rays as tracing
 from scan2sim.data_samples import shader, signs, sky
 from scan2sim.data_samples.ground import CELL, KERB
+from scan2sim.data_samples.hills import heights, seen_from
 from scan2sim.data_samples.scene import srgb
 from scan2sim.data_samples.shapes import Part
 from scan2sim.data_samples.town import Town
@@ -28,6 +29,10 @@ ROOF = -60.0  # degrees of elevation below which the camera sees its own car
 GAIN = (0.6, 1.4)
 ROUGH = 20  # of 255: pixels that differ more from a neighbour are sampled again
 LENS = 0.55  # pixels, standard deviation
+GLARE = ((40.0, 0.8), (1.5, 5.0), (0.25, 30.0))
+"""Linear light that a low sun adds, and degrees away from it in which that falls to 1/e: the disc, a glow, a veil."""
+TABLE = srgb(np.linspace(0, 1, 8192) ** 2)
+"""By the root of the light."""
 
 Index = npt.NDArray[Any]
 
@@ -57,6 +62,7 @@ class Panorama:
         height: rows of a picture; it has twice as many columns.
         seed: of the light's changes.
         samples: rays of a pixel where neighbours differ; 1 is fastest.
+        lens: metres of the front lens before the camera's place, and of the back one behind it.
         radius: metres around the camera in which things are seen.
     """
 
@@ -67,16 +73,16 @@ class Panorama:
         height: int = 1024,
         seed: int = 0,
         samples: int = 3,
+        lens: float = 0.0,
         radius: float = RADIUS,
     ) -> None:
-        self.samples, self.radius = samples, radius
+        self.samples, self.lens, self.radius = samples, lens, radius
         self.town, self.traffic, self.height, self.width = town, traffic, height, 2 * height
         self._centre = np.full(2, np.inf)
         self._static: tuple[Any, ...] = ()
         self._caster: Any = None
         self._pictures = signs.pictures()
         self._sky = _sky(town)
-        self._table = srgb(np.linspace(0, 1, 8192) ** 2)  # by the root of the light
         self.mask, self._own = own_car(height), _roof(height)
         self._seen = int(np.flatnonzero(self.mask.any(axis=1))[-1]) + 1  # rows that see anything
         rng = np.random.default_rng([seed, 41])
@@ -114,6 +120,8 @@ class Panorama:
         )
         image[:seen], depth[:seen], moving[:seen] = (a.reshape(seen, w, *a.shape[1:]) for a in (rgb, distance, moved))
         image = _through_lens(image)
+        if self.town.low_sun:
+            image = self._dazzled(image, rows[len(rows) // 2], time)
         low = slice(int(np.flatnonzero((self.mask == 0).any(axis=1))[0]), None)
         own = self.mask[low] == 0
         image[low][own], depth[low][own], moving[low][own] = self._own[low][own], np.nan, False
@@ -124,15 +132,19 @@ class Panorama:
         origins = (rows[:, :3, 3] - [*self._centre, 0]).astype(np.float32)
         turns = np.ascontiguousarray(rows[:, :3, :3], np.float32)
         moving, boxes = self.traffic.near(time, self._centre) if self.traffic else (None, np.zeros((0, 6), np.float32))
+        moving = None if moving is None else self.town.lifted(moving, self._centre)
         caster = None if moving is None else _scene(moving)
         other = self._static if moving is None else _arrays(moving)
-        there = _around(boxes, rows, self._centre, self.width, self.height)
         g = self.town.ground
-        ground = (g.distance, g.nearest, g.line, g.origin - self._centre, CELL, KERB, g.line[:, :2] - self._centre)
+        hills = seen_from(g.hills, self._centre)
+        up = heights(boxes[:, :2], hills)
+        there = _around(boxes, up, rows, self._centre, self.width, self.height)
+        lines = g.line[:, :2] - self._centre
+        ground = (g.distance, g.nearest, g.line, g.origin - self._centre, CELL, KERB, lines, hills)
         sun, gain = self.town.sun.astype(np.float32), self.gain(time)
 
         def trace(index: Index, right: float, down: float) -> tuple[U8, F32, Index]:
-            rays = tracing.rays(turns, origins, self.width, self.height, index, right, down)
+            rays = tracing.rays(turns, origins, self.width, self.height, index, right, down, self.lens)
             distance, face, uv = _cast(self._caster, rays)
             moved = np.zeros(len(rays), bool)
             if caster is not None:
@@ -145,11 +157,27 @@ class Panorama:
             dark = self._caster.test_occlusions(_tensor(shadow)).numpy()
             rgb = shader.paint(
                 rays, distance, face, uv, moved, kind, normal, dark, self._static, other, ground, boxes, sun, self._sky,
-                self._centre, self._pictures, np.pi / self.height, gain, self._table, self.town.seed % 1000,
+                self._centre, self._pictures, np.pi / self.height, gain, TABLE, self.town.seed % 1000,
             )  # fmt: skip
             return rgb, distance, moved
 
         return trace
+
+    def _dazzled(self, image: U8, pose: F64, time: float) -> U8:
+        """What a lens makes of a sun that shines into it: a glow and a veil, as much of them as houses let through."""
+        around = np.random.default_rng(0).normal(0, np.radians(0.6), (32, 3))
+        ray = np.concatenate(
+            [np.broadcast_to(pose[:3, 3] - [*self._centre, 0], around.shape), self.town.sun + around], 1
+        )
+        free = 1 - self._caster.test_occlusions(_tensor(ray.astype(np.float32))).numpy().mean()
+        to = self.town.sun @ pose[:3, :3]
+        lon = ((np.arange(self.width) + 0.5) / self.width - 0.5) * 2 * np.pi
+        lat = ((np.arange(self.height) + 0.5) / self.height - 0.5) * np.pi
+        level = to[0] * np.sin(lon) + to[2] * np.cos(lon)
+        cosine = np.cos(lat)[:, None] * level + (np.sin(lat) * to[1])[:, None]
+        away = np.degrees(np.arccos(np.clip(cosine, -1, 1))).astype(np.float32)
+        glow = sum(strength * np.exp(-away / width) for strength, width in GLARE)
+        return shown(light_of(image) + (free * self.gain(time) * glow)[..., None] * np.array(shader.SUN, np.float32))
 
     def _gather(self, centre: F64) -> None:
         """Make the triangles around a place, unless those there are will do."""
@@ -158,6 +186,18 @@ class Panorama:
         self._centre = np.round(centre)
         part = self.town.near(self._centre, self.radius)
         self._static, self._caster = _arrays(part), _scene(part)
+
+
+def light_of(image: U8) -> F32:
+    """Linear light of sRGB."""
+    x = np.arange(256, dtype=np.float32) / 255
+    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4).astype(np.float32)[image]
+
+
+def shown(light: F32) -> U8:
+    """SRGB of linear light, clipped."""
+    roots = np.sqrt(np.clip(light, 0, 1))
+    return TABLE[(roots * (len(TABLE) - 1)).astype(np.int32)]
 
 
 def spread(count: int) -> list[tuple[float, float]]:
@@ -205,13 +245,13 @@ def _sky(town: Town, height: int = 1024) -> F32:
     return light.reshape(height // 2, 2 * height, 3)
 
 
-def _around(boxes: F32, rows: F64, centre: F64, width: int, height: int) -> Index:
+def _around(boxes: F32, up: F64, rows: F64, centre: F64, width: int, height: int) -> Index:
     """(R * W,) bool: pixels in whose direction there may be one of the vehicles."""
     seen = np.zeros((len(rows), width), bool)  # of the rows that see anything
     pose = rows[len(rows) // 2]
-    for x, y, _, _, long, wide in boxes.tolist():
+    for (x, y, _, _, long, wide), z in zip(boxes.tolist(), up.tolist(), strict=True):
         reach = np.hypot(long, wide) + 0.3
-        to = (np.array([*(np.array([x, y]) + centre), 1.5]) - pose[:3, 3]) @ pose[:3, :3]
+        to = (np.array([*(np.array([x, y]) + centre), 1.5 + z]) - pose[:3, 3]) @ pose[:3, :3]
         far = np.hypot(to[0], to[2])
         if far < reach + 0.5:
             seen[:] = True

@@ -1,6 +1,6 @@
 """Where a car drives: real paths (KITTI) and made-up ones, and the camera's motion along them.
 
-Paths are planar, (N, 2) metres. The ground is flat: height comes from the suspension alone.
+Paths are planar, (N, 2) metres. The ground is flat here (`hills` lifts it): height comes from the suspension alone.
 """
 
 from __future__ import annotations
@@ -56,13 +56,20 @@ def town_path(seed: int, length: float) -> F64:
     return path[chainage(path) <= length]
 
 
-def _through(corners: F64) -> F64:
+def zigzag_path(length: float, block: float = 55.0) -> F64:
+    """(N, 2) metres: a right angle every `block` metres, to the right and to the left, sharper than in a town."""
+    corners = block * np.array([((k + 1) // 2, k // 2) for k in range(int(length / block) + 3)], float)
+    path = _through(corners, 4.0)
+    return path[chainage(path) <= length]
+
+
+def _through(corners: F64, rounded: float = 6.5) -> F64:
     """A smooth path near the corners, 0.5 m a point; streets are bent alike wherever they are passed."""
     s = chainage(corners)
     at = np.arange(0, s[-1], 0.5)
     path = np.stack([np.interp(at, s, corners[:, k]) for k in range(2)], axis=1)
     path = path + 5.0 * np.stack([np.sin(path[:, 1] / 31.0), np.sin(path[:, 0] / 37.0 + 1.0)], axis=1)
-    return _smoothed(path, 0.5, 6.5)
+    return _smoothed(path, 0.5, rounded)
 
 
 def chainage(path: F64) -> F64:

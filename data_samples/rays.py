@@ -10,6 +10,7 @@ import numpy.typing as npt
 from numba import njit, prange
 
 from scan2sim.data_samples.ground import HALF
+from scan2sim.data_samples.hills import reach, rise
 
 Array = npt.NDArray[Any]
 
@@ -18,13 +19,16 @@ BLOCK, MIX = 1021, 1_000_003  # pixels of a task, and a prime by which tasks are
 
 
 @njit(cache=True, error_model="numpy", parallel=True)
-def rays(rotations: Array, origins: Array, width: int, height: int, index: Array, right: float, down: float) -> Array:
+def rays(
+    rotations: Array, origins: Array, width: int, height: int, index: Array, right: float, down: float, lens: float
+) -> Array:
     """(N, 6) origins and unit directions through pixels of an equirectangular picture.
 
     Args:
         rotations, origins: (R, 3, 3) and (R, 3) of each row.
         index: (N,) pixels, row by row.
         right, down: where in them, pixels from their centres.
+        lens: metres of the front lens before the origin, and of the back one behind it.
     """
     out = np.empty((len(index), 6), np.float32)
     lon = ((np.arange(width) + 0.5 + right) / width - 0.5) * 2 * math.pi
@@ -36,7 +40,7 @@ def rays(rotations: Array, origins: Array, width: int, height: int, index: Array
         x, y, z = c[row] * around[column], s[row], c[row] * ahead[column]
         m = rotations[row]
         for j in range(3):
-            out[i, j] = origins[row, j]
+            out[i, j] = origins[row, j] + math.copysign(lens, z) * m[j, 2]
             out[i, 3 + j] = m[j, 0] * x + m[j, 1] * y + m[j, 2] * z
     return out
 
@@ -98,14 +102,15 @@ def _ground(
     ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, t: float, ground: Any
 ) -> tuple[int, float, float, float, float]:
     """What of the ground a ray meets before `t` (SKY: nothing), how far away, and the normal."""
-    if dz >= 0:
-        return SKY, t, 0.0, 0.0, 1.0
-    high, low = (ground[5] - oz) / dz, -oz / dz
+    high, nears = reach(ox, oy, oz - ground[5], dx, dy, dz, t, ground[7])
     if high >= t:
         return SKY, t, 0.0, 0.0, 1.0
+    low = high + ground[5] / nears
+    _, to_x, to_y = rise(ox + high * dx, oy + high * dy, ground[7])
+    up = 1 / math.sqrt(1 + to_x * to_x + to_y * to_y)
     d = from_road(ox + high * dx, oy + high * dy, ground)
     if d >= HALF:
-        return PAVEMENT, high, 0.0, 0.0, 1.0
+        return PAVEMENT, high, -to_x * up, -to_y * up, up
     e = from_road(ox + low * dx, oy + low * dy, ground)
     if e >= HALF:
         at = high + (low - high) * (HALF - d) / (e - d)
@@ -113,7 +118,7 @@ def _ground(
             flat = math.sqrt(dx * dx + dy * dy) + 1e-9
             return WALL, at, -dx / flat, -dy / flat, 0.0
     elif low < t:
-        return ROAD, low, 0.0, 0.0, 1.0
+        return ROAD, low, -to_x * up, -to_y * up, up
     return SKY, t, 0.0, 0.0, 1.0
 
 

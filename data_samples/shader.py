@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit, prange
 
 from scan2sim.data_samples.ground import HALF, WALK
+from scan2sim.data_samples.hills import rise
 from scan2sim.data_samples.materials import _asphalt, _colour, noise
 from scan2sim.data_samples.paints import Material
 from scan2sim.data_samples.rays import BLOCK, ROAD, SKY, THING, WALL, Array, from_road, mixed, task
@@ -62,6 +63,7 @@ def _ground_colour(
         f *= 0.15 * (1 - 0.5 * min(max(5 * noise(u, v, 0.9, w, k + 42) - 3.2, 0.0), 1.0))  # oil
         return f + (0.6 - f) * white, f + (0.6 - f) * white, 1.02 * f + (0.57 - f) * white
     if what == WALL or far < HALF + STONE:
+        z -= rise(x, y, ground[7])[0]
         return _colour(KERBSTONE, s, t + z, 0.38, 0.37, 0.35, k, 1.0, 1.0, w, ground[3], pictures)
     return _colour(SLABS, s, t, 0.33, 0.32, 0.30, k, 1.0, 1.0, w, ground[3], pictures)
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scan2sim.data_samples import gps, paths
-from scan2sim.data_samples.drive import generate_drive, row_poses
+from scan2sim.data_samples import gps, hills, paths
+from scan2sim.data_samples.drive import Hardships, exposed, generate_drive, row_poses
 from scan2sim.data_samples.ground import HALF
 from scan2sim.data_samples.panorama import GAIN, Panorama, Picture
 from scan2sim.data_samples.photos import directions
@@ -143,6 +143,64 @@ def test_rows_of_a_rolling_shutter_have_their_own_poses(camera: Panorama, trajec
     assert difference < 0.06
 
 
+def filmed(town: Town, poses: F64, time: float, lens: float = 0.0) -> Picture:
+    return Panorama(town, None, H, seed=3, radius=90.0, lens=lens).render(poses, time)
+
+
+def test_hills_lift_everything_and_tilt_the_car(trajectory: Trajectory) -> None:
+    waves = hills.draw(PATH, 0.08, 3)
+    driven = hills.lifted(trajectory, waves)
+    assert driven.rotations is not None
+    move = np.diff(driven.positions[20:-20], axis=0)
+    climb = np.diff(hills.heights(driven.positions[20:-20, :2], waves)) / np.linalg.norm(move[:, :2], axis=1)
+    assert 0.06 < np.abs(climb).max() < 0.085
+    ahead = driven.rotations[20:-21, :, 2]
+    assert np.abs(ahead[:, 2] - climb).max() < 0.03  # the rest is the suspension's
+    steep = 20 + int(np.abs(climb).argmax())
+    for k in (steep, steep + 3):
+        camera = Panorama(build(PATH, 3, hills=waves), None, H, seed=3, radius=90.0)
+        picture = camera.render(driven.poses[k], k / 15)
+        pixels, points = points_of(picture, driven.poses[k])
+        above = points[:, 2] - hills.heights(points[:, :2], waves)
+        road = (camera.town.ground.at(points[:, :2]) < HALF - 0.5) & (pixels[:, 1] > 0.6 * H)
+        assert road.sum() > 500
+        assert np.quantile(np.abs(above[road]), 0.8) < 0.01  # what isn't the road is a parked car
+        assert above.min() > -0.05
+
+
+def test_lenses_have_places_of_their_own(town: Town, trajectory: Trajectory) -> None:
+    pose, time = trajectory.poses[70], float(trajectory.times[70])
+    both = filmed(town, pose, time, lens=0.5)
+    for side in (1, -1):
+        moved = pose.copy()
+        moved[:3, 3] += side * 0.5 * pose[:3, 2]
+        columns = slice(H // 2 + 2, 3 * H // 2 - 2) if side == 1 else slice(0, H // 2 - 2)
+        alone = filmed(town, moved, time)
+        same = np.isclose(both.depth[:, columns], alone.depth[:, columns], rtol=1e-3, equal_nan=True)
+        assert same.mean() > 0.995
+
+
+def test_an_exposure_blurs_what_passes_and_keeps_its_light(town: Town, trajectory: Trajectory) -> None:
+    camera, i = Panorama(town, None, H, seed=3, samples=1, radius=90.0), 70
+    sharp, blurred = (light(exposed(camera, trajectory, i, Hardships(exposure=s)), 1.0) for s in (0.0, 0.04))
+    rows, beside = slice(H * 2 // 5, H * 3 // 5), np.r_[H // 2 - 10 : H // 2 + 10, 3 * H // 2 - 10 : 3 * H // 2 + 10]
+    edges = [np.nanmean(np.abs(np.diff(picture[rows], axis=1))[:, beside]) for picture in (sharp, blurred)]
+    assert edges[1] < 0.8 * edges[0]
+    assert np.nanmean(blurred[rows]) == pytest.approx(np.nanmean(sharp[rows]), rel=0.02)
+
+
+def test_a_low_sun_dazzles_unless_a_house_is_before_it(trajectory: Trajectory) -> None:
+    camera = Panorama(build(PATH, 3, low_sun=True), None, H, seed=3, radius=90.0)
+    assert np.degrees(np.arccos(camera.town.sun @ trajectory.poses[30, :3, 2])) < 25  # ahead, at first
+    spots = []
+    for k in range(15, 240, 15):
+        picture = camera.render(trajectory.poses[k], k / 15)
+        to = camera.town.sun @ trajectory.poses[k, :3, :3]
+        column, row = (np.arctan2(to[0], to[2]) / np.pi + 1) * H, (np.arcsin(to[1]) / np.pi + 0.5) * H
+        spots.append(int(picture.rgb[int(row), int(column) % (2 * H)].min()))
+    assert max(spots) > 240 and min(spots) < 150
+
+
 def test_the_picture_closes_at_the_seam_and_hides_its_own_car(camera: Panorama, trajectory: Trajectory) -> None:
     picture = camera.render(trajectory.poses[90], 6.0)
     rgb = picture.rgb.astype(int)
@@ -248,6 +306,13 @@ def test_a_drive_is_written(tmp_path: Path) -> None:
     mask = cv2.imread(str(out / "mask.png"), cv2.IMREAD_UNCHANGED)
     assert mask.shape == (64, 128)
     assert set(np.unique(mask)) == {0, 255}
-    assert sorted(p.name for p in out.iterdir()) == ["frames", "gps.csv", "mask.png", "truth.csv", "video.mp4"]
+    assert sorted(p.name for p in out.iterdir()) == [
+        "camera.json",
+        "frames",
+        "gps.csv",
+        "mask.png",
+        "truth.csv",
+        "video.mp4",
+    ]
     with pytest.raises(SettingError):
         generate_drive(out, PATH, seconds=1.0, height=64)
