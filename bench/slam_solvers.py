@@ -11,7 +11,7 @@ from scan2sim.slam.gps import smooth
 from scan2sim.slam.odometry import Odometry, OdometryParams
 from tests.slam.made_up import Follower, ate, drive, scatter
 
-SEEDS, SECONDS, TRACKS = 10, 9.0, 250
+SEEDS, SECONDS, TRACKS, PARALLAX = 10, 8.0, 150, 6.0
 WANDER, MEMORY, JITTER = 1.5, 60.0, 0.15
 """Of a receiver: metres of its slow error, seconds until that has decayed to 1/e, metres of its white one."""
 
@@ -35,7 +35,8 @@ def error(seed: int, backend: str, chords: Chords) -> float:
     truth = poses[:, :3, 3]
     follower = Follower(poses, scatter(poses, 5000, seed), count=TRACKS, noise=np.radians(0.05), seed=seed)
     odometry = Odometry(
-        Camera("equirectangular", 2048, 1024), OdometryParams(gps_chords=chords, seed=seed), tracker=follower,
+        Camera("equirectangular", 2048, 1024), OdometryParams(gps_chords=chords, parallax=PARALLAX, seed=seed),
+        tracker=follower,
         gps=receiver(times, truth, seed), backend=backend,
     )  # fmt: skip
     for time in times:
