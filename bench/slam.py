@@ -5,7 +5,7 @@
 - drive: 360-degree video (1024 px high, 10 Mbit/s, 15 fps) along a real path (KITTI 00; without the data a made-up one)
   through a synthetic town with traffic, odometry alone, a consumer receiver's GPS for the scale: D3.2's two errors;
   frames a second; the first 40 seconds by the mission's method, too (`--backend adam`, adjacent distances).
-- hard: drives of 150 m with hills, sharp turns, motion blur, rolling shutter, offset lenses and glare, each alone and
+- hard: drives of 100 m with hills, sharp turns, motion blur, rolling shutter, offset lenses and glare, each alone and
   all together: drift, the share of unsure frames, rolling shutter and lens offset estimated against what was rendered.
 - kitti: 51 frames of KITTI odometry 06 (perspective, real): ATE after a similarity, odometry alone and with the
   global adjustment; pycolmap's incremental mapping of the same frames, and the ratio of the times.

@@ -10,7 +10,7 @@ from scan2sim.data_samples import paths
 from scan2sim.data_samples.drive import Hardships, generate_drive
 from scan2sim.pipeline.types import F64
 
-LENGTH, HEIGHT, FPS = 150.0, 512, 15.0
+LENGTH, HEIGHT, FPS = 100.0, 512, 15.0
 ALL = Hardships(hills=0.08, exposure=0.01, rolling_shutter=0.016, lens_offset=0.03, glare=True)
 NONE = Hardships()
 DRIVES: dict[str, tuple[bool, Hardships]] = {

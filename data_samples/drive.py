@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -220,7 +220,7 @@ def main() -> None:
     parser.add_argument("--lossless", action="store_true", help="also write PNG frames")
     parser.add_argument("--overwrite", action="store_true")
     a = parser.parse_args()
-    made_up = {
+    made_up: dict[str, Callable[[], F64]] = {
         "town": lambda: paths.town_path(a.seed, a.length or 600.0), "loop": paths.loop_path,
         "zigzag": lambda: paths.zigzag_path(a.length or 600.0),
     }  # fmt: skip
