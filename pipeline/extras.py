@@ -14,6 +14,7 @@ EXTRA_OF = {
     "av": "slam",
     "matplotlib": "slam",
     "pycolmap": "slam",
+    "kiss_icp": "lidar",
     "fast_simplification": "decimation",
     "pymeshlab": "meshlab",
     "pye57": "e57",

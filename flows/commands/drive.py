@@ -71,8 +71,9 @@ def survey_of(
 
 
 def _check_path(planned: list[Planned], done: dict[str, Manifest], slam: Path) -> None:
-    """Raise an UnsureError where the video's path is mostly unsure, unless the drive says to use it all the same."""
-    if not any(getattr(item.node.params, "keep_unsure", False) for item in planned):
+    """Raise an UnsureError where the video's path is mostly unsure, and neither more tells it nor the drive wants it."""
+    names = {item.node.id.name for item in planned}
+    if "fuse" not in names and not any(getattr(item.node.params, "keep_unsure", False) for item in planned):
         remedy = "Give [slam] a gps, or mend what slam.json warns of; or say keep_unsure = true under [sweeps]"
         check_sure(done["place"].facts["unsure_share"], slam, remedy)
 

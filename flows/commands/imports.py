@@ -11,7 +11,8 @@ import typer
 from scan2sim.flows.commands.app import App, Classes, Crs, Link, Name, Overwrite, TileOut
 from scan2sim.flows.commands.display import progress
 from scan2sim.flows.commands.options import options
-from scan2sim.flows.recipes.drive import Sweeps
+from scan2sim.flows.commands.sweeps import scanner_path
+from scan2sim.flows.recipes.sweeps import Sweeps, path, placed
 from scan2sim.pipeline.classes import parse
 from scan2sim.pipeline.io.import_model import import_model
 from scan2sim.pipeline.io.kitti import import_kitti_raw
@@ -142,20 +143,27 @@ def import_plain_clouds(
 @options(Sweeps, folder="SWEEPS")
 def import_sweeps_and_poses(
     sweeps: Sweeps,
-    poses: Annotated[Path, typer.Argument(help="Trajectory, of `slam` for example: .csv, .tum, .kitti; z-up.")],
+    poses: Annotated[
+        Path | None, typer.Argument(metavar="[TRAJECTORY]", help="Of `slam` for example: .csv, .tum, .kitti; z-up.")
+    ] = None,
+    *,
     out: TileOut,
     name: Name = None,
     link: Link = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """A scanner's sweeps placed by a trajectory, with photos if there are any."""
+    """A scanner's sweeps placed by a trajectory, by GPS and each other, with photos if there are any."""
     warnings: list[str] = []
+    files, params = placed(sweeps, Path(), sweeps.poses)
+    nodes = path(sweeps, Path(), sweeps.poses)
+    if nodes:
+        files["poses"] = scanner_path(nodes, out.with_name(f"{out.name}-path"))
+    inputs = {key: file for key, file in files.items() if isinstance(file, Path)}
     with progress("import") as report:
-        path = tile_of(
-            sweeps.inputs(Path()), sweeps.params(), out, link=link, overwrite=overwrite, name=name,
-            warn=warnings.append, report=report,
-        )  # fmt: skip
-    _imported(path, warnings)
+        tile = tile_of(
+            inputs, params, out, link=link, overwrite=overwrite, name=name, warn=warnings.append, report=report
+        )
+    _imported(tile, warnings)
 
 
 def _imported(path: Path, warnings: Sequence[str] = ()) -> None:

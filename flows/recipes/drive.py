@@ -9,50 +9,18 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Self
 
-from pydantic import Field
-
-from scan2sim.flows.recipes import video
+from scan2sim.flows.recipes import sweeps, video
 from scan2sim.flows.recipes.graph import Node, NodeId, Output
 from scan2sim.flows.recipes.settings import Settings
+from scan2sim.flows.recipes.sweeps import Sweeps
 from scan2sim.pipeline.corridor import CutParams
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.io import toml
 from scan2sim.pipeline.io.tile import sources_of
 from scan2sim.pipeline.step import Params, Step
 from scan2sim.pipeline.steps.cut import CUT
-from scan2sim.pipeline.steps.import_sweeps import IMPORT_SWEEPS, SweepsParams
 
-STEPS: tuple[Step, ...] = (IMPORT_SWEEPS, CUT)
-
-
-class Sweeps(SweepsParams):
-    """Sweeps and what is beside them: the options of `scan2sim import sweeps`, and `[sweeps]` of a `drive.toml`."""
-
-    folder: Path = Field(description="Folder of sweeps in scanner axes: .bin, .pcd, .ply, .las, .laz.")
-    poses: Path | None = Field(None, description="Trajectory, of `slam` for example: .csv, .tum, .kitti; z-up.")
-    extrinsics: Path | None = Field(
-        None, description="T_camera_scanner, 3 or 4 rows, or KITTI's calibration: poses are the camera's."
-    )
-    times: Path | None = Field(None, description="Of sweeps, seconds, one a line; default: names, or order.")
-    photos: Path | None = Field(None, description="Folder of photos: they colour the points.")
-    photo_times: Path | None = Field(None, description="Of photos, likewise.")
-    mask: Path | None = Field(None, description="Of all photos: 0 where the car itself is seen.")
-
-    @property
-    def camera_file(self) -> Path | None:
-        """Where the photos' camera is described, if `camera` is no model's name."""
-        return Path(self.camera) if self.camera.endswith(".toml") or Path(self.camera).is_file() else None
-
-    def inputs(self, here: Path) -> dict[str, Path]:
-        """Of the import; files are relative to `here`."""
-        beside = ("poses", "extrinsics", "times", "photos", "photo_times", "mask")
-        files = {"sweeps": self.folder, "camera": self.camera_file} | {name: getattr(self, name) for name in beside}
-        return {name: here / path for name, path in files.items() if path is not None}
-
-    def params(self) -> SweepsParams:
-        """Of the import: what isn't a file."""
-        given = {name: getattr(self, name) for name in SweepsParams.model_fields}
-        return SweepsParams(**given | ({"camera": "auto"} if self.camera_file else {}))
+STEPS: tuple[Step, ...] = (*sweeps.STEPS, CUT)
 
 
 class Drive(Params):
@@ -74,8 +42,6 @@ class Drive(Params):
         drive = toml.read(path, cls, absent=absent, fields="docs/scale.md lists the fields")
         if (drive.corridor is None) == (drive.sweeps is None):
             raise InputError(path, "says neither or both of `corridor` and `[sweeps]`", "Give one: what is to be cut")
-        if drive.sweeps and not (drive.sweeps.poses or drive.slam):
-            raise InputError(path, "has sweeps, but nothing that places them", "Give sweeps.poses, or [slam]")
         return drive
 
 
@@ -88,8 +54,8 @@ def recipe(drive: Drive, here: Path) -> list[Node]:
     nodes = [] if drive.slam is None else video.recipe(_at(drive.slam, here), Settings())
     corridor: dict[str, Any] = {}
     if drive.sweeps is not None:
-        path = {"poses": Output(NodeId("place"), "trajectory")} if nodes else {}
-        nodes.append(Node(IMPORT_SWEEPS, drive.sweeps.params(), {**drive.sweeps.inputs(here), **path}))
+        given = None if drive.sweeps.poses is None else here / drive.sweeps.poses
+        nodes += sweeps.recipe(drive.sweeps, here, Output(NodeId("place"), "trajectory") if nodes else given)
         corridor["corridor"] = Output(NodeId("import_sweeps"), "corridor")
     elif drive.corridor is not None:
         place = here / drive.corridor

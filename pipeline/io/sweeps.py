@@ -1,8 +1,9 @@
 """A moving scanner's sweeps and a trajectory (visual SLAM's, for example) as a tile.
 
 A sweep is a file of points in the scanner's axes: .bin (float32 x, y, z, reflectance, as KITTI's), .pcd, .ply, .las or
-.laz. Each is placed by the pose of its time. Poses are the scanner's, or those of a camera beside it whose place is
-known (`T_camera_scanner`). Photos become posed views, and colour the points of the sweeps that were taken beside them.
+.laz. Each is placed by the pose of its time; where there is no trajectory, the room `slam` makes one of them. Poses
+are the scanner's, or those of a camera beside it whose place is known (`T_camera_scanner`). Photos become posed views,
+and colour the points of the sweeps that were taken beside them.
 
 What belongs to a stretch where poses were bridged, not seen (`unsure`), is left out: it would smear the walls that
 other sweeps have drawn sharply.
@@ -14,7 +15,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -45,6 +46,8 @@ BESIDE = 2.0
 """Metres between the places of a sweep and of the photo that colours it: nothing is to stand between."""
 PENDING = 20_000_000
 """Points that are gathered before they are thinned."""
+RATE = 10.0
+"""Sweeps a second, where nothing tells."""
 NANOSECONDS = 1e17
 """A file's name that is so large a whole number is a time in nanoseconds, otherwise a frame's number."""
 
@@ -69,16 +72,31 @@ class Pictures:
     extrinsics: F64 | None = None
 
 
-class Placing(Params):
+class Turning(Params):
+    """When a sweep's points were measured.
+
+    Attributes:
+        deskew: place each point by the pose of its own moment, for sweeps that aren't compensated for motion. "kitti":
+            the scanner turns clockwise and faces forward (x) at the sweep's time; "times": as the points' own times say
+            (.pcd, .ply, .las, .laz), in the clock of the sweeps' times, or counted from the sweep's.
+        period: seconds of a turn, for `deskew`; by default the time between sweeps.
+    """
+
+    deskew: Literal["none", "kitti", "times"] = Field(
+        "none", description="Points by the pose of their own moment: kitti, or times (the points' own); or none."
+    )
+    period: Annotated[float, Field(ge=0.0001, le=1000)] | None = Field(
+        None, description="Seconds of the scanner's turn; default: between sweeps."
+    )
+
+
+class Placing(Turning):
     """How sweeps are placed.
 
     Attributes:
         scanner_poses: the poses are the scanner's; by default they are the camera's if there are extrinsics.
         time_offset: seconds to add to all times of sweeps and photos.
         max_range, min_range: metres from the scanner: farther returns, and those of the car itself, are left out.
-        deskew: "kitti": place each point by the pose of its own moment, for sweeps as KITTI's, which aren't
-            compensated for motion: the scanner turns clockwise and faces forward (x) at the sweep's time.
-        period: seconds of a turn, for `deskew`; by default the time between sweeps.
         voxel: keep one point a voxel of so many metres (that which was measured from nearest by), or None: all.
         keep_unsure: keep what was taken where poses are unsure.
         crs: of the trajectory, a projected one; "local" without georeference.
@@ -88,12 +106,6 @@ class Placing(Params):
     time_offset: Shift = Field(0.0, description="Seconds to add to times of sweeps and photos.")
     max_range: Range = Field(50.0, description="Metres; returns from further away are left out.")
     min_range: Metres = Field(1.0, description="Metres; nearer returns, the car's own, are left out.")
-    deskew: Literal["none", "kitti"] = Field(
-        "none", description="kitti: points by the pose of their own moment; or none."
-    )
-    period: Annotated[float, Field(ge=0.0001, le=1000)] | None = Field(
-        None, description="Seconds of the scanner's turn; default: between sweeps."
-    )
     voxel: Voxel | None = Field(None, description="Keep one point in so many metres.")
     keep_unsure: bool = Field(False, description="Take unsure stretches of the path, too.")
     crs: str = Field("local", description='CRS of the poses: "EPSG:32633", or "local".')
@@ -140,8 +152,8 @@ def import_sweeps(
         DataError: nothing is left.
     """
     _check(placing, extrinsics, photos)
-    files = _files(sweeps, SWEEPS, "sweeps")
-    path, frame = _read_poses(poses, placing.crs)
+    files = files_of(sweeps, SWEEPS, "sweeps")
+    path, frame = read_poses(poses, placing.crs)
     T_camera_scanner = np.eye(4) if extrinsics is None else extrinsics
     T = path.poses if placing.scanner_poses else path.poses @ T_camera_scanner  # scanner to world
     if T[:, 2, 2].mean() < 0.3:
@@ -150,9 +162,9 @@ def import_sweeps(
             "(the scanner's axes to the camera's)?"
         )
     way = _Way(path, T, placing.keep_unsure)
-    moments = _moments(files, times, path, sweeps, "sweeps", placing.time_offset)
-    half = _half_turn(placing, moments, path.times)
-    good = way.judge(moments, half, f"{len(files)} sweeps", poses, warn)
+    seconds = moments(files, times, path, sweeps, offset=placing.time_offset)
+    half = half_turn(placing, seconds, path.times)
+    good = way.judge(seconds, half, f"{len(files)} sweeps", poses, warn)
     shots = (
         _shots(photos, way, path, poses, placing.time_offset, T_camera_scanner, warn) if photos is not None else _NONE
     )
@@ -161,7 +173,7 @@ def import_sweeps(
     chosen = np.flatnonzero(good)
     for done, i in enumerate(chosen):
         report(0.8 * done / len(chosen), files[i].name)
-        merged.add(_placed(files[i], float(moments[i]), half, way, shots, photos, placing))
+        merged.add(_placed(files[i], float(seconds[i]), half, way, shots, photos, placing))
     whole = merged.all()
     if not len(whole["xyz"]):
         raise DataError(sweeps, "has no points within range", "Widen --max-range, or look at the files")
@@ -301,7 +313,7 @@ def camera_of_photos(
     """
     if model not in ("auto", "pinhole", "equirectangular"):
         raise SettingError("camera", f"there is no model {model!r}", "Use auto, pinhole, equirectangular, or a file")
-    first = _files(photos, SUFFIXES, "photos")[0]
+    first = files_of(photos, SUFFIXES, "photos")[0]
     width, height = size_of(first)
     if file is not None:
         return read_camera(file, width, height)
@@ -325,21 +337,49 @@ def _check(placing: Placing, extrinsics: F64 | None, photos: Pictures | None) ->
         raise SettingError("max_range", f"{far:g} m doesn't exceed min_range, {near:g} m", "Widen the range")
 
 
-def _half_turn(placing: Placing, moments: F64, poses: F64) -> float:
+def half_turn(placing: Turning, sweeps: F64, poses: F64) -> float:
     """Seconds by which a sweep's points are older and younger than its time, by times of sweeps and of poses."""
     if placing.deskew == "none":
         return 0.0
     if placing.period is not None:
         return placing.period / 2
-    spacing = np.diff(np.unique(moments)) if len(moments) > 1 else np.diff(poses)
-    return (float(np.median(spacing)) if len(spacing) else 0.1) / 2
+    spacing = np.diff(np.unique(sweeps)) if len(sweeps) > 1 else np.diff(poses)
+    return (float(np.median(spacing)) if len(spacing) else 1 / RATE) / 2
+
+
+def ages(sweep: Sweep, moment: float, half: float, deskew: str, file: Path) -> F64:
+    """(N,) seconds after the sweep's `moment` at which each of its points was measured, as `Placing.deskew` says.
+
+    Points' own times are in the clock of `moment`, or count from it (or from a moment shortly before).
+
+    Raises:
+        InputError: they are to tell, but there are none, or they are of another clock.
+    """
+    if deskew == "none" or not len(sweep.xyz):
+        return np.zeros(len(sweep.xyz))
+    if deskew == "kitti":
+        return (2 * phase_of(sweep.xyz) - 1) * half
+    if sweep.time is None:
+        raise InputError(file, "has no times of its points", "Use --deskew kitti, or none")
+    for since in (sweep.time - moment, sweep.time):
+        if np.abs(since).max() < GAP:
+            return since
+    raise InputError(
+        file, f"its points are of {sweep.time.min():.2f} to {sweep.time.max():.2f} s, the sweep of {moment:.2f} s",
+        "Give the sweeps' times in the points' clock, or --deskew none",
+    )  # fmt: skip
 
 
 def _natural(path: Path) -> list[Any]:
     return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)]
 
 
-def _files(folder: Path, suffixes: Sequence[str], what: str) -> list[Path]:
+def files_of(folder: Path, suffixes: Sequence[str] = SWEEPS, what: str = "sweeps") -> list[Path]:
+    """Files of these suffixes in a folder, in the order of their names (2 before 10); or the one that is named.
+
+    Raises:
+        InputError: there are none.
+    """
     if folder.is_file() and folder.suffix.lower() in suffixes:
         return [folder]
     if not folder.exists():
@@ -350,8 +390,12 @@ def _files(folder: Path, suffixes: Sequence[str], what: str) -> list[Path]:
     return sorted(found, key=_natural)
 
 
-def _read_poses(poses: Path, crs: str) -> tuple[Trajectory, Frame]:
-    """The trajectory, local to a frame whose origin is near its first pose."""
+def read_poses(poses: Path, crs: str) -> tuple[Trajectory, Frame]:
+    """The trajectory, local to a frame whose origin is near its first pose.
+
+    Raises:
+        InputError: it can't be read, knows positions alone, or `crs` is no projected CRS.
+    """
     if not poses.is_file():
         raise InputError(poses, "is missing", "Put it there, or mend the name")
     known, unit = crs_io.common(poses, crs, None, (), ())
@@ -363,10 +407,12 @@ def _read_poses(poses: Path, crs: str) -> tuple[Trajectory, Frame]:
     return Trajectory(path.times, path.positions - frame.origin, path.rotations, path.unsure), frame
 
 
-def _moments(
-    files: Sequence[Path], times: Path | None, path: Trajectory, folder: Path, what: str, offset: float
-) -> F64:
-    """(N,) seconds of each file, in the trajectory's clock."""
+def told_times(files: Sequence[Path], times: Path | None, what: str = "sweeps") -> F64 | None:
+    """(N,) seconds of each file, by a file of them or by their names; None where neither tells.
+
+    Raises:
+        InputError: the file is none of so many times.
+    """
     if times is not None:
         try:
             seconds = np.loadtxt(times, ndmin=1).astype(np.float64)
@@ -378,18 +424,31 @@ def _moments(
             raise InputError(
                 times, f"has {seconds.size} times for {len(files)} {what}", "Write a time for each, in order"
             )
-        return seconds + offset
+        return seconds
     names = [file.stem for file in files]
-    whole = all(name.isdigit() for name in names)
-    numbers = [int(name) for name in names] if whole else []
-    if whole and min(numbers) > NANOSECONDS:
-        return np.array([1e-9 * number for number in numbers]) + offset
-    if not whole and all(re.fullmatch(r"-?\d+\.\d+", name) for name in names):
-        return np.array([float(name) for name in names]) + offset
+    if all(name.isdigit() for name in names):
+        numbers = [int(name) for name in names]
+        return np.array([1e-9 * number for number in numbers]) if min(numbers) > NANOSECONDS else None
+    fractions = all(re.fullmatch(r"-?\d+\.\d+", name) for name in names)
+    return np.array([float(name) for name in names]) if fractions else None
+
+
+def moments(
+    files: Sequence[Path], times: Path | None, path: Trajectory, folder: Path, what: str = "sweeps", offset: float = 0.0
+) -> F64:
+    """(N,) seconds of each file, in the trajectory's clock: as `told_times`, or those of its poses.
+
+    Raises:
+        InputError: nothing tells them.
+    """
+    told = told_times(files, times, what)
+    if told is not None:
+        return told + offset
     if len(files) == len(path):
         return path.times + offset
-    if whole and max(numbers) < len(path):
-        return path.times[numbers] + offset
+    names = [file.stem for file in files]
+    if all(name.isdigit() for name in names) and max(map(int, names)) < len(path):
+        return path.times[[int(name) for name in names]] + offset
     raise InputError(
         folder, f"has {len(files)} {what} for {len(path)} poses, and their names are no times",
         "Give their times in a file, seconds, one a line",
@@ -473,9 +532,9 @@ def _shots(
     T_camera_scanner: F64,
     warn: Callable[[str], None],
 ) -> _Shots:
-    files = _files(photos.folder, SUFFIXES, "photos")
-    moments = _moments(files, photos.times, path, photos.folder, "photos", offset)
-    good = np.flatnonzero(way.judge(moments, 0.0, f"{len(files)} photos", poses, warn))
+    files = files_of(photos.folder, SUFFIXES, "photos")
+    seconds = moments(files, photos.times, path, photos.folder, "photos", offset)
+    good = np.flatnonzero(way.judge(seconds, 0.0, f"{len(files)} photos", poses, warn))
     mask = None
     if photos.mask is not None:
         picture = read_rgb(photos.mask)
@@ -484,8 +543,8 @@ def _shots(
             raise InputError(photos.mask, f"is no picture of {size[1]}x{size[0]}", "Give a mask of the photos' size")
         mask = picture[..., 0]
     own = T_camera_scanner if photos.extrinsics is None else photos.extrinsics
-    T = np.concatenate([way.at(moments[i : i + 1]) for i in good]) @ np.linalg.inv(own)
-    return _Shots([files[i] for i in good], moments[good], T, mask)
+    T = np.concatenate([way.at(seconds[i : i + 1]) for i in good]) @ np.linalg.inv(own)
+    return _Shots([files[i] for i in good], seconds[good], T, mask)
 
 
 def _entries(shots: _Shots, photos: Pictures | None, frame: Frame, work: Path, link: bool) -> list[dict[str, Any]]:
@@ -519,21 +578,18 @@ def _placed(
     placing: Placing,
 ) -> dict[str, Any]:
     """A sweep's points in local coordinates, coloured by the photo that was taken beside it."""
-    xyz, intensity, own = read_sweep(file)
-    distance = np.linalg.norm(xyz, axis=1)
-    near = (distance <= placing.max_range) & (distance >= placing.min_range)
-    xyz, intensity, distance = xyz[near], intensity[near], distance[near]
+    sweep = read_sweep(file).between(placing.min_range, placing.max_range)
+    xyz, own = sweep.xyz, sweep.rgb
     here = way.at(np.array([moment]))[0]
-    times = np.full(len(xyz), moment)
+    times = moment + ages(sweep, moment - placing.time_offset, half, placing.deskew, file)
     if half and len(xyz):
-        times += (2 * phase_of(xyz) - 1) * half
         at = way.at(times)
         world = np.einsum("nij,nj->ni", at[:, :3, :3], xyz) + at[:, :3, 3]
     else:
         world = xyz @ here[:3, :3].T + here[:3, 3]
     rgb, seen = np.zeros((len(xyz), 3), np.uint8), np.zeros(len(xyz), bool)
     if photos is None and own is not None:
-        rgb, seen = own[near], np.ones(len(xyz), bool)
+        rgb, seen = own, np.ones(len(xyz), bool)
     elif photos is not None and shots.files and len(xyz):
         k = int(np.abs(shots.times - moment).argmin())
         if np.linalg.norm(shots.T[k, :3, 3] - here[:3, 3]) < BESIDE:
@@ -543,13 +599,32 @@ def _placed(
         "rgb": rgb,
         "seen": seen,
         "time": times,
-        "intensity": intensity,
-        "range": distance.astype(np.float32),
+        "intensity": sweep.intensity,
+        "range": np.linalg.norm(xyz, axis=1).astype(np.float32),
     }
 
 
-def read_sweep(path: Path) -> tuple[F32, npt.NDArray[np.uint16], U8 | None]:
-    """(N, 3) points in scanner axes, (N,) intensities, 0 where there are none, and (N, 3) colours if there are.
+class Sweep(NamedTuple):
+    """`xyz` (N, 3) in scanner axes, `intensity` (N,), 0 where there is none, `rgb` (N, 3), `time` (N,) s, or None."""
+
+    xyz: F32
+    intensity: npt.NDArray[np.uint16]
+    rgb: U8 | None = None
+    time: F64 | None = None
+
+    def between(self, near: float, far: float) -> Sweep:
+        """The points so many metres from the scanner."""
+        distance = np.linalg.norm(self.xyz, axis=1)
+        return self.take((distance >= near) & (distance <= far))
+
+    def take(self, keep: Bools) -> Sweep:
+        """The points that a mask (N,) selects."""
+        rgb = None if self.rgb is None else self.rgb[keep]
+        return Sweep(self.xyz[keep], self.intensity[keep], rgb, None if self.time is None else self.time[keep])
+
+
+def read_sweep(path: Path) -> Sweep:
+    """A sweep's points, those alone that are somewhere.
 
     Raises:
         InputError: missing, damaged, or of an unknown format.
@@ -557,12 +632,10 @@ def read_sweep(path: Path) -> tuple[F32, npt.NDArray[np.uint16], U8 | None]:
     kind = path.suffix.lower()
     if kind == ".bin":
         xyz, reflectance = read_bin(path)
-        return xyz, _sixteen_bits(reflectance), None
+        return Sweep(xyz, _sixteen_bits(reflectance))
     cloud = cloud_io.read(path, Frame())
-    xyz, rgb = cloud.xyz, cloud.rgb
-    levels = np.zeros(len(xyz), np.uint16) if cloud.intensity is None else cloud.intensity
-    finite = np.isfinite(xyz).all(axis=1)
-    return xyz[finite], levels[finite], None if rgb is None else rgb[finite]
+    levels = np.zeros(len(cloud), np.uint16) if cloud.intensity is None else cloud.intensity
+    return Sweep(cloud.xyz, levels, cloud.rgb, cloud.time).take(np.isfinite(cloud.xyz).all(axis=1))
 
 
 def _sixteen_bits(levels: npt.NDArray[Any]) -> npt.NDArray[np.uint16]:

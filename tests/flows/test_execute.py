@@ -364,7 +364,8 @@ def test_versions_are_told_of_all_that_computes(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(importlib.metadata, "version", lambda name: f"1 of {name}")
     found = versions.__wrapped__()
     computing = {"numpy", "numba", "scipy", "pyproj", "torch", "onnxruntime", "pycolmap", "opencv-python-headless"}
-    computing |= {package for package, extra in EXTRA_OF.items() if extra not in APART} - {"pxr"} | {"usd-core"}
+    computing |= {package for package, extra in EXTRA_OF.items() if extra not in APART} - {"pxr", "kiss_icp"}
+    computing |= {"usd-core", "kiss-icp"}
     assert computing <= found.keys()
     assert found["scan2sim"] == scan2sim.__version__ and not {"prefect", "ray", "s3fs", "pytest"} & found.keys()
 

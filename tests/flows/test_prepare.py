@@ -83,7 +83,8 @@ def test_steps_of_a_drive_are_done_again_by_newer_code_and_of_other_files(
 
     assert changed() == {"track", "place", "import_sweeps", "cut"} and changed() == set()
     for step in (CUT, IMPORT_SWEEPS):
-        monkeypatch.setattr(f"scan2sim.flows.recipes.drive.{step.name.upper()}", replace(step, version=1000))
+        recipe = "drive" if step is CUT else "sweeps"
+        monkeypatch.setattr(f"scan2sim.flows.recipes.{recipe}.{step.name.upper()}", replace(step, version=1000))
         assert changed() == ({"cut"} if step is CUT else {"import_sweeps", "cut"})
     for name in ("camera.toml", "velodyne/0.bin", "image/0.png"):
         (tmp_path / name).write_text("another")
@@ -130,7 +131,6 @@ def test_no_world_is_made_along_a_path_that_was_mostly_guessed(tmp_path: Path) -
     [
         ("", "neither or both"),
         ('corridor = "a"\n[sweeps]\nfolder = "b"\nposes = "c"', "neither or both"),
-        ('[sweeps]\nfolder = "b"', "nothing that places them"),
         ('corridor = "a"\nspeed = 3', "`speed`"),
         ("corridor = [", "TOML"),
     ],

@@ -92,6 +92,7 @@ USES = {
     "av": ["slam video.mp4", "slam FRAMES --view", "slam FRAMES --gps video.mp4", "view world --film flight.mp4"],
     "matplotlib": ["slam evaluate truth.csv truth.csv", "slam study FRAMES --truth truth.csv"],
     "pycolmap": ["slam FRAMES --adjust"],
+    "kiss_icp": ["import sweeps FRAMES"],
     "fast_simplification": ["run TILE --set decimate.backend=fast_simplification"],
     "pymeshlab": ["run TILE --set decimate.backend=pymeshlab"],
     "pye57": ["import clouds cloud.e57"],
