@@ -433,7 +433,7 @@ def _marginals(D: F64, above: F64) -> F64:
     left[0] = D[0]
     for k in range(1, len(D)):
         left[k] = D[k] - above[k - 1].T @ np.linalg.solve(left[k - 1], above[k - 1])
-    out: F64 = np.linalg.inv(left)
+    out = np.asarray(np.linalg.inv(left), np.float64)
     for k in range(len(D) - 2, -1, -1):
         G = out[k] @ above[k]
         out[k] += G @ out[k + 1] @ G.T

@@ -71,7 +71,7 @@ def survey_of(
 
 
 def _check_path(planned: list[Planned], done: dict[str, Manifest], slam: Path) -> None:
-    """Raise an UnsureError where the video's path is mostly unsure, and neither more tells it nor the drive wants it."""
+    """Raise an UnsureError where the video's path is mostly unsure, alone, and not asked for all the same."""
     names = {item.node.id.name for item in planned}
     if "fuse" not in names and not any(getattr(item.node.params, "keep_unsure", False) for item in planned):
         remedy = "Give [slam] a gps, or mend what slam.json warns of; or say keep_unsure = true under [sweeps]"

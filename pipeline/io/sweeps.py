@@ -615,7 +615,7 @@ class Sweep(NamedTuple):
     def between(self, near: float, far: float) -> Sweep:
         """The points so many metres from the scanner."""
         distance = np.linalg.norm(self.xyz, axis=1)
-        return self.take((distance >= near) & (distance <= far))
+        return self.take(np.logical_and(distance >= near, distance <= far))
 
     def take(self, keep: Bools) -> Sweep:
         """The points that a mask (N,) selects."""
@@ -635,7 +635,7 @@ def read_sweep(path: Path) -> Sweep:
         return Sweep(xyz, _sixteen_bits(reflectance))
     cloud = cloud_io.read(path, Frame())
     levels = np.zeros(len(cloud), np.uint16) if cloud.intensity is None else cloud.intensity
-    return Sweep(cloud.xyz, levels, cloud.rgb, cloud.time).take(np.isfinite(cloud.xyz).all(axis=1))
+    return Sweep(cloud.xyz, levels, cloud.rgb, cloud.time).take(np.asarray(np.isfinite(cloud.xyz).all(axis=1)))
 
 
 def _sixteen_bits(levels: npt.NDArray[Any]) -> npt.NDArray[np.uint16]:

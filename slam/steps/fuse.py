@@ -187,10 +187,8 @@ def _told(fused: Fused, lidar: Steps | None, camera: Steps | None, gps: bool, wa
         both = lidar.sure & camera.sure
         against = both & (np.minimum(fused.trust["lidar"], fused.trust["camera"]) < BELIEVED)
         if both.any() and against.sum() > 0.5 * both.sum():
-            share = f"{100 * against.sum() / both.sum():.0f} %"
-            warn(
-                f"sweeps and trajectory contradict each other at {share} of the steps: are extrinsics and times right?"
-            )
+            part = f"{100 * against.sum() / both.sum():.0f} %"
+            warn(f"sweeps and trajectory contradict each other at {part} of the steps: are extrinsics, times right?")
     if gps:
         parts.append(f"GPS ({int((fused.trust['gps'] > BELIEVED).sum())} of {len(fused.trust['gps'])} places)")
     return "placed by " + ", ".join(parts)
