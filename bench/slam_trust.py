@@ -9,7 +9,7 @@ import numpy as np
 from scan2sim.pipeline.types import F64, GpsTrack
 from scan2sim.slam import scale
 from scan2sim.slam.gps import smooth
-from scan2sim.slam.lens import changed, told
+from scan2sim.slam.lens import better, changed, told
 from scan2sim.slam.mapped import Mapped
 from scan2sim.slam.uncertainty import covariances
 from tests.slam.made_up import LENS, Follower, Narrow, ate, drifting_turn, drive, inside, mistaken, off, run, scatter
@@ -59,7 +59,10 @@ def lens() -> dict[str, float | None]:
 
     def alarms(*off: float) -> list[bool]:
         cameras = [changed(LENS, np.array([*off, 0, 0]) * (1, -1)[seed % 2]) for seed in range(10)]
-        return [told(camera, mistaken(camera, seed).map.misfits) is not None for seed, camera in enumerate(cameras)]
+        return [
+            told(camera, better(camera, mistaken(camera, seed).map.misfits)) is not None
+            for seed, camera in enumerate(cameras)
+        ]
 
     focal, centre, false = alarms(np.log(0.95), 0), alarms(0, 0.05), alarms(0, 0)
     print(

@@ -39,17 +39,10 @@ STEP = 1e-5
 
 @dataclass(frozen=True)
 class Known:
-    """A lens, as far as a drive tells it.
-
-    Attributes:
-        camera: it.
-        sigma: (4,) standard deviations, of what `LIKELY` names.
-        off: (4,) by how much the camera differs from the one that was asked about.
-    """
+    """A lens: `camera`, and `sigma` (4,), standard deviations of what `LIKELY` names."""
 
     camera: Camera
     sigma: F64
-    off: F64
 
 
 def changed(camera: Camera, by: F64) -> Camera:
@@ -63,6 +56,13 @@ def changed(camera: Camera, by: F64) -> Camera:
         cy=camera.cy + camera.fy * float(by[2]),
         distortion=(k1, *others, *[0.0] * (3 - len(others))) if bent else (),
     )  # fmt: skip
+
+
+def difference(camera: Camera, other: Camera) -> F64:
+    """(4,) what changes a camera into the other."""
+    k1, other_k1 = ((one.distortion or (0.0,))[0] for one in (camera, other))
+    centre = (other.cx - camera.cx) / camera.fx, (other.cy - camera.cy) / camera.fy
+    return np.array([np.log(other.fx / camera.fx), *centre, other_k1 - k1])
 
 
 def misfit(camera: Camera, graph: Graph) -> F64 | None:
@@ -121,15 +121,14 @@ def better(camera: Camera, misfits: Sequence[F64]) -> Known | None:
     if not camera.distortion and abs(off[3]) < max(CLEAR * sigma[3], WORTH[3]):
         off[:3], off[3] = np.linalg.solve(says[:3, :3], right[:3]), 0.0
         sigma[:3], sigma[3] = np.sqrt(np.diag(np.linalg.inv(says[:3, :3]))), 0.0
-    return Known(changed(camera, off), sigma, off)
+    return Known(changed(camera, off), sigma)
 
 
-def told(camera: Camera, misfits: Sequence[F64]) -> str | None:
-    """What a user should read of the windows' misfits; nothing where the lens fits."""
-    found = better(camera, misfits)
+def told(camera: Camera, found: Known | None) -> str | None:
+    """What a user should read of a lens that was found; nothing where the camera's own fits."""
     if found is None:
         return None
-    wrong = np.abs(found.off) > np.maximum(WORTH, CLEAR * found.sigma)
+    wrong = np.abs(difference(camera, found.camera)) > np.maximum(WORTH, CLEAR * found.sigma)
     if not wrong.any():
         return None
     now, sigma = found.camera, found.sigma
@@ -142,9 +141,9 @@ def told(camera: Camera, misfits: Sequence[F64]) -> str | None:
             f"{camera.cx:.0f}, {camera.cy:.0f}"
         )
     if wrong[3]:
-        k1 = camera.distortion[0] if camera.distortion else 0.0
-        fits.append(f"distortion k1 = {now.distortion[0]:.2f} +- {sigma[3]:.2f} better than {k1:.2f}")
+        k1, better_k1 = ((one.distortion or (0.0,))[0] for one in (camera, now))
+        fits.append(f"distortion k1 = {better_k1:.2f} +- {sigma[3]:.2f} better than {k1:.2f}")
     return (
-        f"in turns, the pictures fit {', and '.join(fits)}: check --focal and --centre, and whether the pictures were "
-        "cropped or scaled"
+        f"in turns, the pictures fit {', and '.join(fits)}: check --focal, --centre and --k1, and whether the pictures "
+        "were cropped or scaled; --calibrate finds them"
     )

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from scan2sim.pipeline.errors import DataError, InputError
+from scan2sim.pipeline.errors import DataError
 from scan2sim.pipeline.step import Report, silent
-from scan2sim.pipeline.types import U8, Camera
+from scan2sim.pipeline.types import U8
 from scan2sim.slam.features import Found
 from scan2sim.slam.localmap import Keyframe, Landmarks
 from scan2sim.slam.odometry import Odometry, Placed
@@ -22,7 +22,7 @@ from scan2sim.slam.trackers import Tracks
 from scan2sim.slam.trackers.descriptors import SeenInFacet
 from scan2sim.slam.video import Video
 
-VERSION = 7
+VERSION = 8
 """Raised whenever the same video comes to another trajectory with the same options: what older code left, a state of an
 interrupted run or a trajectory that is kept, is begun anew then."""
 KEEP_EVERY = 60.0
@@ -121,22 +121,3 @@ def _begin(start: Callable[[Callable[[str], None]], Odometry], state: Path | Non
         run = Run(start)
         run.warnings.append(f"what an interrupted run left in {state.name} is damaged: begun anew")
     return run
-
-
-def camera_of(video: Video, model: str, focal: float | None, centre: tuple[float, float] | None) -> Camera:
-    """The camera of a video: equirectangular if it is twice as wide as high and nothing else is said.
-
-    Raises:
-        InputError: a perspective video without a focal length, a 360 video of another shape.
-    """
-    w, h = video.width, video.height
-    if model == "auto":
-        model = "equirectangular" if w == 2 * h and focal is None else "pinhole"
-    if model == "equirectangular":
-        if abs(w - 2 * h) > 2:
-            raise InputError(video.path, f"is {w}x{h}, not twice as wide as high", "Name its camera: --camera pinhole")
-        return Camera("equirectangular", w, h)
-    if focal is None:
-        raise InputError(video.path, "needs a camera", "Give --focal (pixels), or a tile whose camera it is")
-    cx, cy = centre or ((w - 1) / 2, (h - 1) / 2)
-    return Camera("pinhole", w, h, focal, focal, cx, cy)

@@ -37,6 +37,8 @@ class Video:
         count: of frames, as the file says; None if it doesn't.
         fps: frames a second, as the file says, or as was given for a folder.
         start: UNIX time of the first frame where the file tells it, else None.
+        times: (N,) seconds of a folder's pictures, where they are given.
+        focal_35mm: millimetres, of film as large, where a file's metadata tell it.
     """
 
     path: Path
@@ -46,6 +48,12 @@ class Video:
     fps: float
     start: float | None
     times: F64 | None = None
+    focal_35mm: float | None = None
+
+    @property
+    def first(self) -> Path:
+        """The first picture of a folder."""
+        return _files(self.path)[0]
 
     def frames(self, *, every: int = 1, warn: Callable[[str], None] = lambda _: None) -> Iterator[Frame]:
         """Every so manieth frame; frames that are damaged, of another size or out of order are left out, and told."""
@@ -90,7 +98,9 @@ def open_video(path: Path, *, fps: float = 10.0, times: Path | None = None) -> V
             rate = float(stream.average_rate or stream.base_rate or 30)
             count = stream.frames or (round(stream.duration * stream.time_base * rate) if stream.duration else None)
             start = _start(container.metadata.get("creation_time") or stream.metadata.get("creation_time"))
-            return Video(path, stream.codec_context.width, stream.codec_context.height, count, rate, start)
+            focal = _focal(container.metadata | stream.metadata)
+            size = stream.codec_context.width, stream.codec_context.height
+            return Video(path, *size, count, rate, start, None, focal)
     except (av.error.FFmpegError, UnicodeDecodeError) as error:
         raise InputError(path, f"is no readable video ({error})", "Copy or convert it again") from None
 
@@ -100,6 +110,15 @@ def _av() -> Any:
     import av
 
     return av
+
+
+def _focal(metadata: dict[str, str]) -> float | None:
+    """Millimetres on 35 mm film, as telephones write it."""
+    told = [text for name, text in metadata.items() if name.lower().endswith("focal_length.35mm_equivalent")]
+    try:
+        return next((focal for text in told if (focal := float(text)) > 1), None)
+    except ValueError:
+        return None
 
 
 def _start(written: str | None) -> float | None:

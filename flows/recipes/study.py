@@ -14,8 +14,10 @@ from pydantic import AfterValidator, Field
 from scan2sim.flows.recipes.graph import Node, NodeId, Output
 from scan2sim.flows.recipes.settings import Settings
 from scan2sim.flows.recipes.video import STEPS as VIDEO
+from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.step import Params, Step
 from scan2sim.pipeline.types import GpsTrack, Trajectory
+from scan2sim.slam.camera import camera_of
 from scan2sim.slam.encoding import scaled
 from scan2sim.slam.evaluate import SEGMENT, way
 from scan2sim.slam.gps import smooth
@@ -23,7 +25,6 @@ from scan2sim.slam.steps.encode import ENCODE
 from scan2sim.slam.steps.evaluate import EVALUATE
 from scan2sim.slam.steps.place import PLACE
 from scan2sim.slam.steps.track import TRACK
-from scan2sim.slam.track import camera_of
 from scan2sim.slam.video import Video, open_video
 
 STEPS: tuple[Step, ...] = (ENCODE, EVALUATE)
@@ -117,7 +118,10 @@ def recipe(study: Study, video: Video, segment: float, settings: Settings) -> li
 
 def _of_cell(cell: Cell, study: Study, video: Video, segment: float, settings: Settings) -> list[Node]:
     """A cell's video made, followed, placed and compared with the truth."""
-    name, camera = cell.name, scaled(camera_of(video, "auto", None, None), cell.height)
+    camera = camera_of(video, "auto", None, None)
+    if camera is None:
+        raise InputError(video.path, "is no 360 video: its camera isn't known", "Give one twice as wide as high")
+    name, camera = cell.name, scaled(camera, cell.height)
     size = (camera.width, camera.height)
     beside: dict[str, Path | Output] = {key: path for key, path in (("gps", study.gps), ("mask", study.mask)) if path}
 

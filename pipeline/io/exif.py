@@ -1,4 +1,4 @@
-"""Where a photo's EXIF says that it was taken."""
+"""Where a photo's EXIF says that it was taken, and with what lens."""
 
 from __future__ import annotations
 
@@ -6,8 +6,11 @@ import math
 from pathlib import Path
 from typing import Any
 
-GPS = 0x8825
+GPS, EXIF = 0x8825, 0x8769
 LATITUDE_REF, LATITUDE, LONGITUDE_REF, LONGITUDE, ALTITUDE_REF, ALTITUDE = 1, 2, 3, 4, 5, 6
+FOCAL, FOCAL_35MM, WIDE, PLANE_X, PLANE_UNIT = 37386, 41989, 40962, 41486, 41488
+MILLIMETRES = {2: 25.4, 3: 10.0, 4: 1.0}
+"""Of units in which EXIF gives a sensor's resolution."""
 
 
 def place(photo: Path) -> tuple[float, float, float | None] | None:
@@ -25,6 +28,23 @@ def place(photo: Path) -> tuple[float, float, float | None] | None:
     if null or not (abs(latitude) <= 84 and abs(longitude) <= 180):
         return None
     return latitude, longitude, _altitude(tags)
+
+
+def focal_35mm(photo: Path) -> float | None:
+    """Millimetres that a photo's focal length would be on film of 36 x 24 mm, by its diagonal; None without EXIF."""
+    from PIL import Image
+
+    try:
+        with Image.open(photo) as image:
+            tags, size = image.getexif().get_ifd(EXIF), image.size
+        focal = float(tags.get(FOCAL_35MM, 0))
+        if not focal:
+            dense = float(tags[PLANE_X]) / MILLIMETRES[tags.get(PLANE_UNIT, 2)]  # pixels a millimetre, as it was taken
+            smaller = size[0] / float(tags.get(WIDE, size[0]))
+            focal = float(tags[FOCAL]) * dense * smaller / math.hypot(*size) * math.hypot(36, 24)
+    except Exception:  # as above
+        return None
+    return focal if 1 < focal < 5000 else None
 
 
 def _degrees(value: Any) -> float:

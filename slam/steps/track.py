@@ -17,12 +17,14 @@ from scan2sim.pipeline.io import image
 from scan2sim.pipeline.ranges import Focal, Pixels, Rate, Shift
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.types import U8, Camera, GpsTrack
-from scan2sim.slam import features, lens, matchers, solvers, trackers
+from scan2sim.slam import calibrate, features, lens, matchers, solvers, trackers
+from scan2sim.slam.camera import Found, camera_of, found
 from scan2sim.slam.facets import Facets
 from scan2sim.slam.gps import smooth
 from scan2sim.slam.mapped import Mapped
 from scan2sim.slam.odometry import Odometry, OdometryParams
-from scan2sim.slam.track import VERSION, camera_of, track
+from scan2sim.slam.recording import Recording, record
+from scan2sim.slam.track import VERSION, track
 from scan2sim.slam.trackers import Tracker
 from scan2sim.slam.video import Video, open_video
 from scan2sim.slam.view import Recorder
@@ -32,8 +34,10 @@ class Filmed(Params):
     """How a video was filmed, and what follows it."""
 
     camera: str = Field("auto", description="auto, equirectangular or pinhole.")
-    focal: Focal | None = Field(None, description="Pixels, of a pinhole camera.")
+    focal: Focal | None = Field(None, description="Pixels, of a pinhole camera; default: EXIF's, or what fits best.")
     centre: tuple[Pixels, Pixels] | None = Field(None, description="Pixels; default: the middle.")
+    k1: Annotated[float, Field(ge=-1, le=1)] | None = Field(None, description="Radial distortion, OpenCV's.")
+    calibrate: bool = Field(False, description="Find focal length, centre and k1 that fit the whole drive.")
     fps: Rate = Field(10.0, description="Of a folder of pictures.")
     every: Annotated[int, Field(ge=1, le=1_000_000)] = Field(1, description="Take every Nth frame.")
     until: Annotated[float, Field(ge=0, le=1e7)] = Field(0.0, description="Seconds of the video; 0: all.")
@@ -65,8 +69,13 @@ def track_video(inputs: Inputs, params: TrackParams, out: Path, report: Report, 
         DataError: the video is too short.
     """
     video = open_video(inputs["video"], fps=params.fps, times=inputs.get("times"))
-    camera, mask = video_camera(video, params, inputs), read_mask(video, inputs.get("mask"))
-    warnings: list[str] = []
+    mask = read_mask(video, inputs.get("mask"))
+
+    def recorded() -> Recording:
+        return record(video, mask, every=params.every, until=params.until or None, report=report)
+
+    camera, own = video_camera(video, params, recorded, checkpoint / "lens.json")
+    warnings: list[str] = [own.told()] if own is not None else []
     gps = read_gps(video, inputs.get("gps"), params.gps_offset, warnings.append)
     tracker, about = tracker_of(camera, mask, params, inputs)
 
@@ -81,13 +90,24 @@ def track_video(inputs: Inputs, params: TrackParams, out: Path, report: Report, 
             video, start, every=params.every, until=params.until or None, state=checkpoint / "state.npz",
             watch=recorder, report=report,
         )  # fmt: skip
-    wrong = lens.told(camera, run.odometry.map.misfits)
-    warnings += [] if wrong is None else [wrong]
+    wrong = _doubted(camera, run.odometry, recorded)
+    warnings += [] if wrong is None or params.calibrate else [wrong]
     files = {"mapped": Mapped.of(run.odometry, run.names).write(out / "mapped.npz")}
     films = {"view": film} if params.view else {}
     return Done(
-        files | films, run.facts() | ({"told": about} if about else {}), [*warnings, *dict.fromkeys(run.warnings)]
-    )
+        files | films, run.facts() | ({"told": about} if about else {}) | (own.facts() if own else {}),
+        [*warnings, *dict.fromkeys(run.warnings)],
+    )  # fmt: skip
+
+
+def _doubted(camera: Camera, odometry: Odometry, recorded: Callable[[], Recording]) -> str | None:
+    """What is wrong with the lens, as turns tell; where the path was lost, by looking for it as if it weren't known."""
+    if camera.model not in lens.MODELS:
+        return None
+    said = lens.told(camera, lens.better(camera, odometry.map.misfits))
+    if calibrate.lost(odometry) < calibrate.LOST:
+        return said
+    return lens.told(camera, calibrate.looked_for(recorded())) or said
 
 
 def can_track(params: TrackParams) -> None:
@@ -100,19 +120,32 @@ def can_track(params: TrackParams) -> None:
         need("--view", "av")
 
 
-def video_camera(video: Video, params: TrackParams, inputs: Inputs) -> Camera:
-    """Of the frames: as is said, or the one of a tile's that has their size.
+def video_camera(
+    video: Video, params: TrackParams, recorded: Callable[[], Recording], kept: Path
+) -> tuple[Camera, Found | None]:
+    """Of the frames: as is said, or the one of a tile's that has their size; or as was found, which is `kept`.
 
     Raises:
         InputError: there is none.
     """
-    if not params.cameras:
-        return camera_of(video, params.camera, params.focal, params.centre)
+    said = _tile_camera(video, params) or camera_of(video, params.camera, params.focal, params.centre, params.k1)
+    own = Found.read(kept) or found(video, said, recorded, calibrate=params.calibrate)
+    if own is not None:
+        own.write(kept)
+        return own.camera, own
+    assert said is not None
+    return said, None
+
+
+def _tile_camera(video: Video, params: TrackParams) -> Camera | None:
     for given in params.cameras:
         camera = Camera(**given | {"distortion": tuple(given["distortion"])})
         if (camera.width, camera.height) == (video.width, video.height):
             return camera
-    raise InputError(video.path, f"the tile has no camera of {video.width}x{video.height}", "Give --camera and --focal")
+    if params.cameras:
+        size = f"{video.width}x{video.height}"
+        raise InputError(video.path, f"the tile has no camera of {size}", "Give --camera and --focal")
+    return None
 
 
 def read_gps(video: Video, path: Path | None, offset: float | None, warn: Callable[[str], None]) -> GpsTrack | None:

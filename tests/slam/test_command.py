@@ -197,7 +197,7 @@ def test_an_interrupted_run_goes_on_only_from_what_the_same_code_made_of_the_sam
         (lambda p: (p / "empty").mkdir(), ("empty",), "no pictures"),
         (lambda p: None, ("VIDEO", "--backend", "magic"), "there is no 'magic'"),
         (lambda p: None, ("VIDEO", "--set", "track.windows=3"), "track.windows"),
-        (lambda p: None, ("VIDEO", "--camera", "pinhole"), "needs a camera"),
+        (lambda p: None, ("VIDEO", "--camera", "pinhole", "--until", "1"), "nothing tells its focal length"),
         (lambda p: (p / "m.png").write_bytes(b"x"), ("VIDEO", "--mask", "m.png"), "can't be read"),
         (lambda p: (p / "g.csv").write_text("a,b\n1,2\n"), ("VIDEO", "--gps", "g.csv"), "g.csv"),
     ],

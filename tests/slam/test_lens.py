@@ -23,7 +23,7 @@ def test_a_lens_that_is_wrong_is_noticed_in_a_turn_and_a_better_one_named(
 ) -> None:
     given = changed(LENS, np.array(off))
     misfits = mistaken(given, seed=1).map.misfits
-    text = told(given, misfits)
+    text = told(given, better(given, misfits))
     assert (text is None) == (said is None)
     assert said is None or said in present(text)
     found = present(better(given, misfits))
@@ -33,4 +33,4 @@ def test_a_lens_that_is_wrong_is_noticed_in_a_turn_and_a_better_one_named(
 
 def test_straight_ahead_nothing_is_said_of_the_lens() -> None:
     given = changed(LENS, np.array([0.3, 0, 0, 0]))
-    assert told(given, mistaken(given, seed=1, turn=0.0).map.misfits) is None
+    assert told(given, better(given, mistaken(given, seed=1, turn=0.0).map.misfits)) is None

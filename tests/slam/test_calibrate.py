@@ -1,0 +1,74 @@
+"""A lens that isn't known, or not quite: found in what a turn shows, named by EXIF, and never guessed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from scan2sim.pipeline.cameras import inside, project_exactly
+from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.types import Camera
+from scan2sim.slam.calibrate import calibrated, looked_for
+from scan2sim.slam.camera import Found, found
+from scan2sim.slam.lens import changed
+from scan2sim.slam.recording import Recording
+from scan2sim.slam.video import open_video
+from tests.present import present
+from tests.slam.made_up import LENS, drive, scatter
+
+
+def seen(camera: Camera, turn: float = 0.3) -> Recording:
+    """What a camera sees of a turn."""
+    times, poses = drive(7, turn=turn)
+    rng, points = np.random.default_rng(0), scatter(poses, 3000)
+    out = Recording((camera.width, camera.height))
+    for time, pose in zip(times, poses, strict=True):
+        local = (points - pose[:3, 3]) @ pose[:3, :3]
+        uv, valid = project_exactly(camera, local)
+        rows = np.flatnonzero(valid & inside(camera, uv) & (local[:, 2] > 1) & (np.linalg.norm(local, axis=1) < 40))
+        out.times.append(float(time))
+        out.ids.append(rows)
+        out.uv.append(uv[rows] + rng.normal(0, 0.3, (len(rows), 2)))
+    return out
+
+
+@pytest.mark.slow
+def test_a_lens_of_which_nothing_is_known_is_found_in_a_turn() -> None:
+    cropped = changed(LENS, np.array([0, 0.15, 0, 0]))
+    known = present(looked_for(seen(cropped)))
+    assert abs(known.camera.fx / LENS.fx - 1) < 0.02
+    assert abs(known.camera.cx - cropped.cx) < 10
+
+
+def test_a_lens_is_mended_over_the_whole_drive_and_the_next_command_is_told_how() -> None:
+    known = present(calibrated(seen(LENS), changed(LENS, np.array([-0.1, 0, 0, 0]))))
+    facts = Found.of(known, "self-calibration").facts()["lens"]
+    assert abs(facts["focal"] - LENS.fx) < 3 * facts["focal_sigma"] < 60
+    assert facts["options"].startswith(f"--focal {facts['focal']:.2f} --centre ")
+
+
+def pictures(folder: Path, focal: int | None) -> Path:
+    folder.mkdir()
+    for k in range(2):
+        picture = Image.fromarray(np.random.default_rng(0).integers(0, 255, (120, 160), np.uint8))
+        exif = Image.Exif()
+        if focal is not None:
+            exif.get_ifd(0x8769)[41989] = focal
+        picture.save(folder / f"{k}.jpg", exif=exif)
+    return folder
+
+
+def test_a_focal_length_is_taken_from_exif(tmp_path: Path) -> None:
+    video = open_video(pictures(tmp_path / "a", focal=28))
+    own = present(found(video, None, lambda: pytest.fail("not needed"), calibrate=False))
+    assert own.camera.fx == pytest.approx(28 / np.hypot(36, 24) * 200) and "EXIF" in own.told()
+
+
+@pytest.mark.parametrize("said", [None, LENS])
+def test_straight_ahead_no_lens_is_guessed(tmp_path: Path, said: Camera | None) -> None:
+    video = open_video(pictures(tmp_path / "a", focal=None))
+    with pytest.raises(InputError, match="turns too little"):
+        found(video, said, lambda: seen(LENS, turn=0.0).part(0, 25), calibrate=True)
