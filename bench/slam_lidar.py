@@ -214,7 +214,7 @@ def simulated(
         outliers: fixes of 400 that are off by tens of metres; fifteen more, together, by 9 m.
     """
     rng, n = np.random.default_rng(seed), 400
-    times = np.arange(n) * 0.1
+    times: F64 = np.arange(n, dtype=np.float64) * 0.1
     heading = np.cumsum(rng.normal(0, 0.003, n) + 0.01 * np.sin(times / 5))
     truth = np.tile(np.eye(4), (n, 1, 1))
     truth[:, :3, :3] = exp_so3(np.outer(heading, [0, 0, 1]))
