@@ -52,8 +52,8 @@ class Found:
         lens = {
             "focal": round(camera.fx, 2), "focal_sigma": pixels[0],
             "centre": [round(camera.cx, 2), round(camera.cy, 2)], "centre_sigma": pixels[1:],
-            "k1": round(k1, 4), "k1_sigma": round(float(self.sigma[3]), 4), "how": self.how,
-            "options": options + (f" --k1 {k1:.4f}" if k1 else ""),
+            **({"k1": round(k1, 4), "k1_sigma": round(float(self.sigma[3]), 4)} if k1 else {}),
+            "how": self.how, "options": options + (f" --k1 {k1:.4f}" if k1 else ""),
         }  # fmt: skip
         return {"lens": lens}
 

@@ -154,7 +154,7 @@ class LocalMap:
         self.keyframes.append(keyframe)
         self._new_points()
         self._optimise()
-        if len(self.keyframes) % (self.params.window // 2) == 0:
+        if self.camera.model != "equirectangular" and len(self.keyframes) % (self.params.window // 2) == 0:
             self._check_lens()
         self._forget()
         return self._reject()
