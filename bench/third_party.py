@@ -109,6 +109,8 @@ ATTENTION = (
     ("mp3lame, GnuTLS, nettle, GMP, libunistring, ALSA", "LGPL", "`slam`, `teleop`, `toolboxes`: av",
      "the licence's text and the source; shared libraries"),
     ("GEOS", "LGPL-2.1-or-later", "`rasters`: rasterio", "likewise"),
+    ("python-can", "LGPL-3.0", "`can`",
+     "the licence's text and the source, and that users may put another version in its place"),
     ("Intel MKL, IPP", "Intel Simplified Software License", "core: open3d, opencv-python-headless",
      "free to pass on unchanged, with its text; no source"),
     ("certifi, tqdm, orjson, pathspec", "MPL-2.0", "core (by open3d), `segmentation`, `flows`",

@@ -45,6 +45,8 @@ EXTRA_OF = {
     "OpenSSL": "teleop",
     "pylibsrtp": "teleop",
     "websockets": "teleop",
+    "can": "can",
+    "cantools": "can",
 }
 """A package's import name to the extra of `scan2sim` that installs it."""
 

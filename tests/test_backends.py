@@ -24,7 +24,7 @@ from scan2sim.pipeline.io.gltf import geometry, textures
 from scan2sim.pipeline.types import Camera
 from scan2sim.segmentation import backends as networks
 from scan2sim.services.qos import links
-from scan2sim.services.teleoperation import cameras, video
+from scan2sim.services.teleoperation import cameras, translators, video
 from scan2sim.slam import features, matchers, solvers, trackers
 from tests.conftest import ROOT
 from tests.pipeline import made_up
@@ -48,6 +48,7 @@ PROTOCOLS: dict[ModuleType, tuple[type, ...]] = {
     links: (links.Backend,),
     video: (video.Backend,),
     cameras: (cameras.Backend,),
+    translators: (translators.Translator,),
 }
 """Packages of backends, and what their modules are: one of these."""
 ALL = [(package, name) for package in PROTOCOLS for name in backends.names(package.__name__)]

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any, TypeVar, get_args, get_origin
 
 import typer
 from pydantic.fields import FieldInfo
 
+from scan2sim.flows.recipes.settings import parsed
+from scan2sim.pipeline.errors import SettingError
 from scan2sim.pipeline.step import Params
 
 P = TypeVar("P", bound=Params)
@@ -45,6 +47,24 @@ def options(model: type[P], **named: str) -> Callable[[Callable[..., None]], Cal
         return called
 
     return decorate
+
+
+def assigned(assignments: Sequence[str], example: str) -> dict[str, Any]:
+    """Settings by their names, of texts as "threshold=0.4", that a command was given by --set.
+
+    Args:
+        example: what to write instead, where one isn't.
+
+    Raises:
+        SettingError: a text assigns nothing.
+    """
+    given: dict[str, Any] = {}
+    for text in assignments:
+        name, equals, value = text.partition("=")
+        if not equals:
+            raise SettingError("--set", f"{text!r} assigns nothing", f"Write --set {example}")
+        given[name.strip()] = parsed(value.strip())
+    return given
 
 
 def _parameter(name: str, field: FieldInfo, named: str | None) -> inspect.Parameter:

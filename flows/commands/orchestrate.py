@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,7 +15,7 @@ from rich.table import Table
 from scan2sim.flows.commands.app import App
 from scan2sim.flows.commands.display import console, progress
 from scan2sim.flows.commands.options import options
-from scan2sim.flows.commands.spinning import spin
+from scan2sim.flows.commands.spinning import ends, spin
 from scan2sim.pipeline import extras
 from scan2sim.pipeline.errors import ScanError, SettingError
 from scan2sim.services.orchestration import description, placement
@@ -275,24 +274,13 @@ def _apply(params: ApplyParams, path: Path, *, nothing: bool = False) -> None:
     if nothing:
         asked = deployment.Deployment(deployment=asked.deployment)
     stop, pace = threading.Event(), apply.Pace()
-    with _osm(params, pace) as osm, progress(asked.deployment) as report, _ends(stop):
+    with _osm(params, pace) as osm, progress(asked.deployment) as report, ends(stop):
         applied = apply.apply(osm, apply.target(osm, asked, path.parent), params, report, stop, pace)
     _tell(applied)
     if stop.is_set():
         raise KeyboardInterrupt
     if (error := apply.failure(applied)) is not None:
         raise error
-
-
-@contextmanager
-def _ends(stop: threading.Event) -> Iterator[None]:
-    """Ctrl-C, or the machine's end, lets what is begun come to where it can be left."""
-    before = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 @contextmanager

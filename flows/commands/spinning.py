@@ -1,9 +1,11 @@
-"""Nodes of ROS 2 that a command runs."""
+"""What a command runs until it is told to end: nodes of ROS 2, services."""
 
 from __future__ import annotations
 
 import signal
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from scan2sim.services import transport
@@ -23,3 +25,14 @@ def spin(made: Callable[[], Any], finished: Callable[[Any], bool] = lambda _: Fa
             node.destroy_node()
     finally:
         ros.shutdown()
+
+
+@contextmanager
+def ends(stop: threading.Event) -> Iterator[None]:
+    """Ctrl-C, or the machine's end, lets what is begun come to where it can be left."""
+    before = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
 from typing import Annotated
 
@@ -11,15 +12,14 @@ from rich.table import Table
 
 from scan2sim.flows.commands.app import App
 from scan2sim.flows.commands.display import console
+from scan2sim.flows.commands.options import assigned, options
+from scan2sim.flows.commands.spinning import ends
 from scan2sim.pipeline import extras
 from scan2sim.pipeline.errors import SettingError
+from scan2sim.services.teleoperation import translators
+from scan2sim.services.teleoperation.translating import TranslateParams, Translating
 
 app = App("Vehicles driven from afar, by several links at once.")
-
-
-@app.callback()
-def _teleoperation() -> None:
-    extras.need("teleop", "OpenSSL", "pylibsrtp", "websockets")
 
 
 @app.command("certificates")
@@ -35,6 +35,7 @@ def teleop_certificates(
     renew: Annotated[bool, typer.Option("--renew", help="Make those named anew, though they still hold.")] = False,
 ) -> None:
     """Make certificates of a gateway, vehicles and stations, and the authority that signs them, or renew them."""
+    extras.need("teleop", "OpenSSL", "pylibsrtp", "websockets")
     from scan2sim.services.teleoperation.authority import certify
 
     if not (gateway or vehicle or station):
@@ -44,3 +45,28 @@ def teleop_certificates(
         state = "made" if one.made else "kept"
         table.add_row(escape(one.party), escape(str(one.folder)), state, f"{one.expires:%Y-%m-%d %H:%M}")
     console.print(table)
+
+
+@app.command("translate")
+@options(TranslateParams)
+def teleop_translate(
+    params: TranslateParams,
+    name: Annotated[
+        str, typer.Argument(metavar="TRANSLATOR", help=f"The vehicle's: {', '.join(translators.names())}.")
+    ],
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", metavar="PARAM=VALUE", help="One of its settings; may be given again.")
+    ] = None,
+) -> None:
+    """Run a vehicle's translator: a car unit's orders in, the vehicle's own commands out."""
+    found = translators.find(name)
+    settings = found.Params.of(name, assigned(set_ or (), "channel=can0"), remedy="docs/teleoperation.md lists them")
+    ended = threading.Event()
+    with ends(ended):
+        translating = Translating(found.connect(settings), params)
+        _say(f"{name}: listens on {translating.address[0]}:{translating.address[1]}; Ctrl-C ends it")
+        translating.run(ended, lambda news: _say(f"the vehicle {news}"))
+
+
+def _say(text: str) -> None:
+    console.print(text, highlight=False, markup=False, soft_wrap=True)

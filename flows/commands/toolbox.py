@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from contextlib import closing
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from scan2sim.flows.commands.app import App
 from scan2sim.flows.commands.display import console, progress, warn
 from scan2sim.flows.commands.monitor import NODE_OPTIONS, Limits
-from scan2sim.flows.commands.options import options
+from scan2sim.flows.commands.options import assigned, options
 from scan2sim.flows.commands.spinning import spin
-from scan2sim.flows.recipes.settings import parsed
 from scan2sim.pipeline import extras
-from scan2sim.pipeline.errors import SettingError
 from scan2sim.services.toolboxes import boxes, offline
 from scan2sim.services.toolboxes.boxes import classify, detect, movement, segment
 from scan2sim.services.toolboxes.engine import Engine
@@ -132,12 +130,7 @@ def _params(box: str, assignments: list[str] | None) -> ToolboxParams:
     Raises:
         SettingError: there is no such toolbox, or setting.
     """
-    given: dict[str, Any] = {}
-    for text in assignments or ():
-        name, equals, value = text.partition("=")
-        if not equals:
-            raise SettingError("--set", f"{text!r} assigns nothing", "Write --set threshold=0.4")
-        given[name.strip()] = parsed(value.strip())
+    given = assigned(assignments or (), "threshold=0.4")
     kind = boxes.find(box).Params
     return kind.of(box, given, remedy=f"`scan2sim toolbox {box} --help` lists its settings")
 

@@ -49,7 +49,7 @@ def find(scene: Scene) -> Start:
             f"nothing says where in {scene.name} one drives: neither a road nor the recording vehicle's path is known",
             "Give the tile a trajectory or posed photos from the ground, or export without the robot",
         )
-    ground, others = _bodies(scene)
+    ground, others = bodies(scene)
     best: tuple[int, Start | None] = (0, None)
     for way in ways:
         stands = _stands(way, ground, others)
@@ -81,7 +81,7 @@ def _paths(scene: Scene) -> list[Course]:
     return found
 
 
-def _bodies(scene: Scene) -> tuple[RaycastingScene, RaycastingScene]:
+def bodies(scene: Scene) -> tuple[RaycastingScene, RaycastingScene]:
     """The ground of all tiles, and all else that bodies collide with, world metres."""
     import open3d as o3d
 
@@ -105,13 +105,13 @@ def _stands(way: Course, ground: RaycastingScene, others: RaycastingScene) -> li
         ahead = np.array([np.cos(heading), np.sin(heading)])
         left = np.array([-ahead[1], ahead[0]])
         under = place[:2] + x.reshape(-1, 1) * ahead + y.reshape(-1, 1) * left
-        height = _heights(ground, under, float(top))
+        height = heights(ground, under, float(top))
         stand = _stand(np.column_stack([x.ravel(), y.ravel(), height]), place, float(heading), way.by)
         found.append(stand if stand is not None and _clear(others, stand) else None)
     return found
 
 
-def _heights(ground: RaycastingScene, xy: F64, top: float) -> F64:
+def heights(ground: RaycastingScene, xy: F64, top: float) -> F64:
     """(N,) heights of the ground at places (N, 2), below `top`; NaN without any."""
     rays = np.zeros((len(xy), 6), np.float32)
     rays[:, :2], rays[:, 2], rays[:, 5] = xy, top, -1.0

@@ -12,14 +12,20 @@ from typing import Any
 import numpy as np
 from cyclonedds.idl import make_idl_struct
 from cyclonedds.idl import types as _types
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from scan2sim.pipeline.errors import SettingError
 from scan2sim.services.transport.names import checked_type, dds_type
 
 STORE: Typestore = get_typestore(Stores.ROS2_KILTED)
-"""Definitions of the types that ROS 2 brings."""
+"""Definitions of the types that ROS 2 brings, and of `ackermann_msgs`, which cars are driven by."""
+_ANGLES = "float32 steering_angle\nfloat32 steering_angle_velocity\nfloat32 speed\nfloat32 acceleration\nfloat32 jerk"
+_STAMPED = "std_msgs/Header header\nackermann_msgs/AckermannDrive drive"
+STORE.register(
+    get_types_from_msg(_ANGLES, "ackermann_msgs/msg/AckermannDrive")
+    | get_types_from_msg(_STAMPED, "ackermann_msgs/msg/AckermannDriveStamped")
+)
 types: Any = _types  # its generics are no generics to type checkers
 _VALUES = {
     "bool": bool,

@@ -123,6 +123,8 @@ USES = {
     "OpenSSL": ["teleop certificates parties --vehicle car"],
     "pylibsrtp": ["teleop certificates parties --vehicle car"],
     "websockets": ["teleop certificates parties --vehicle car"],
+    "can": ["teleop translate can"],
+    "cantools": ["teleop translate can"],
 }  # fmt: skip
 """Commands by a package that they can't do without."""
 
@@ -145,7 +147,7 @@ def test_a_package_that_is_missing_ends_all_commands_alike(
     words = command.replace("TILE", str(TILE)).replace("FRAMES", "frames").split()
     out = "weights.onnx" if "train" in words else "plot.png" if "evaluate" in words else "out"
     monkeypatch.setenv("SCAN2SIM_TRANSPORT", "cyclone")
-    error = CliRunner().invoke(app, [*words, *(["--out", out] if words[0] != "monitor" else [])]).exception
+    error = CliRunner().invoke(app, [*words, *([] if words[0] in ("monitor", "teleop") else ["--out", out])]).exception
     assert isinstance(error, UnavailableError) and exit_code(error) == 7
     assert package in error.cause and f"pip install 'scan2sim[{EXTRA_OF[package]}" in error.remedy
 
@@ -163,7 +165,7 @@ def test_every_extra_is_there_and_brings_its_package() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     core = {re.split(r"[^\w.-]", line)[0] for line in project["dependencies"]}
     for package, extra in EXTRA_OF.items():
-        named = {"pxr": "usd_core", "yaml": "pyyaml", "OpenSSL": "pyopenssl"}.get(package, package)
+        named = {"pxr": "usd_core", "yaml": "pyyaml", "OpenSSL": "pyopenssl", "can": "python_can"}.get(package, package)
         brought = {re.split(r"[^\w.-]", line)[0].replace("-", "_") for line in project["optional-dependencies"][extra]}
         assert named in brought and named not in core
 
