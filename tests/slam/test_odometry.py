@@ -151,26 +151,6 @@ def test_moving_cars_are_left_out() -> None:
     assert error(positions(run(times, Traffic(poses, still))), poses) < 0.6
 
 
-def test_rolling_shutter_is_estimated() -> None:
-    times, poses = drive(12, speed=15)
-    readout = 0.03
-
-    class Rolling(Follower):
-        def _seen(self, points: F64) -> tuple[F64, npt.NDArray[np.bool_]]:
-            pose = self.poses[self._frame]
-            ahead = self.poses[min(self._frame + 1, len(self.poses) - 1)]
-            rate = (ahead[:3, 3] - pose[:3, 3]) / 0.1
-            bearing, seen = super()._seen(points)
-            for _ in range(2):
-                late = (np.arcsin(bearing[:, 1]) / np.pi) * readout
-                local = (points - pose[:3, 3] - late[:, None] * rate) @ pose[:3, :3]
-                bearing = local / np.linalg.norm(local, axis=1, keepdims=True)
-            return bearing, seen
-
-    odometry = run(times, Rolling(poses, scatter(poses)), gps=gps_of(times, poses), rolling_shutter=True)
-    assert odometry.map.shared[0] == pytest.approx(readout, rel=0.25)
-
-
 def test_what_left_the_window_is_forgotten_unless_it_is_to_be_kept() -> None:
     times, poses = drive(25)
     odometry = run(times, Follower(poses, scatter(poses)), window=5, anchors=2)
