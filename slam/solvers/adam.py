@@ -35,6 +35,8 @@ def solve(graph: Graph, *, iterations: int | None = None, points: bool = True) -
     R0, t0, X0 = tensor(graph.poses[:, :3, :3]), tensor(graph.poses[:, :3, 3]), tensor(graph.points)
     seen, camera = tensor(graph.bearing), tensor(graph.camera_of, torch.long)
     point = tensor(graph.point_of, torch.long)
+    first, second = (tensor([getattr(c, end) for c in graph.chords], torch.long) for end in ("first", "second"))
+    distance = tensor([c.distance for c in graph.chords])
     measured = [tensor(f.measured) for f in graph.factors]
     move = torch.zeros_like(t0, requires_grad=True)
     angles = torch.zeros_like(t0, requires_grad=True)
@@ -51,9 +53,8 @@ def solve(graph: Graph, *, iterations: int | None = None, points: bool = True) -
         direction = ((X[point] - t[camera])[:, :, None] * R[camera]).sum(dim=1)
         direction = direction / direction.norm(dim=1, keepdim=True).clamp(min=1e-9)
         loss = torch.linalg.cross(seen, direction).norm(dim=1).sum()
-        for chord in graph.chords:
-            length = (t[chord.second] - t[chord.first]).norm()
-            loss = loss + GPS_WEIGHT * (length - chord.distance) ** 2
+        lengths = (t[second] - t[first]).norm(dim=1)
+        loss = loss + GPS_WEIGHT * ((lengths - distance) ** 2).sum()
         for factor, value in zip(graph.factors, measured, strict=True):
             mine = [_pose(R[c], t[c]) for c in factor.cameras]
             loss = loss + graph.sigma * (factor.residual(*mine, value) ** 2).sum()
