@@ -18,8 +18,6 @@ from scan2sim.slam.odometry import Odometry, OdometryParams
 
 SECONDS, HEIGHT, FPS = 34.0, 256, 15.0
 TOLD = (1000, 3000, 10_000)
-PARAMS = OdometryParams(count=300, parallax=8.0)
-"""So coarse a picture wants keyframes that are further apart: points need ten times the error of a direction."""
 
 
 def memory(out: Path) -> dict[str, float | None]:
@@ -51,7 +49,7 @@ def peaks(folder: Path, frames: int) -> dict[int, float]:
     import cv2
 
     mask, found = cv2.imread(str(folder / "mask.png"), cv2.IMREAD_GRAYSCALE), {}
-    odometry = Odometry(Camera("equirectangular", 2 * HEIGHT, HEIGHT), PARAMS, mask=mask)
+    odometry = Odometry(Camera("equirectangular", 2 * HEIGHT, HEIGHT), OdometryParams(count=300), mask=mask)
     for number, grey in enumerate(islice(there_and_back(folder), frames), 1):
         odometry.add(number / FPS, grey)
         if number in TOLD:
