@@ -7,9 +7,12 @@ import time
 from collections.abc import Callable, Iterator
 from typing import NamedTuple, Protocol
 
+import numpy as np
+
 from scan2sim.pipeline import backends
 from scan2sim.pipeline.errors import ScanError
 from scan2sim.pipeline.types import F64, U8
+from scan2sim.services.teleoperation import marks
 
 SILENT = 1.0
 """Seconds without a picture after which a camera counts as gone."""
@@ -21,12 +24,29 @@ class Picture(NamedTuple):
     """What a camera saw.
 
     Attributes:
-        image: (H, W, 3) RGB.
+        image: (H, W, 3) RGB, which nobody else draws into.
         captured: nanoseconds of this machine's monotonic clock, when it was exposed, or as soon after as is known.
     """
 
     image: U8
     captured: int
+
+
+class Mount(NamedTuple):
+    """Where a simulated camera is on its vehicle, and what it sees of the world.
+
+    Attributes:
+        x, y, z: metres ahead, to the left and above the vehicle's own place.
+        yaw, pitch: degrees to the left, and upwards.
+        field: degrees from the left to the right border of the picture.
+    """
+
+    x: float = 1.2
+    y: float = 0.0
+    z: float = 1.5
+    yaw: float = 0.0
+    pitch: float = -8.0
+    field: float = 80.0
 
 
 class View(NamedTuple):
@@ -36,14 +56,18 @@ class View(NamedTuple):
         where: which it is: what that means says each file here.
         width, height: pixels.
         fps: pictures a second.
-        pose: (4, 4) of the vehicle in the world, now: x forward, y left, z up; None: no world is simulated.
+        marked: have the time drawn into each picture (`marks`).
+        mount: of a simulated camera.
+        pose: (4, 4) of the simulated vehicle in the world, now: x ahead, y to the left, z up.
     """
 
     where: str = ""
     width: int = 640
     height: int = 480
     fps: float = 30.0
-    pose: Callable[[], F64] | None = None
+    marked: bool = False
+    mount: Mount = Mount()
+    pose: Callable[[], F64] = lambda: np.eye(4)
 
 
 class Backend(Protocol):
@@ -57,15 +81,18 @@ class Backend(Protocol):
         """
 
 
-def find(name: str) -> Backend:
-    """A backend of that name.
+def pictures(source: str, view: View) -> Iterator[Picture]:
+    """Pictures of a camera, by the file's name that knows of such; see `Backend.pictures`.
 
     Raises:
-        SettingError: there is none.
+        SettingError: there is no such file.
         UnavailableError: it can't run here.
     """
-    found: Backend = backends.find(__name__, name, "camera")
-    return found
+    backend: Backend = backends.find(__name__, source, "camera")
+    for picture in backend.pictures(view):
+        if view.marked:
+            marks.mark(picture.image, picture.captured)
+        yield picture
 
 
 class Camera:
@@ -78,7 +105,7 @@ class Camera:
     """
 
     def __init__(self, name: str, open_: Callable[[], Iterator[Picture]]) -> None:
-        """Of pictures, as `Backend.pictures` gives them; begins at once."""
+        """Of pictures, as `pictures` gives them; begins at once."""
         self.name, self.fault, self.count = name, "", 0
         self._open = open_
         self._newest: Picture | None = None

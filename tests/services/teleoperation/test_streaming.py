@@ -41,9 +41,7 @@ def test_cameras_are_sent_side_by_side() -> None:
             watcher.feed(packet, "lo")
 
     view = View(width=160, height=120)
-    opened = [
-        Camera(name, lambda: cameras.find("pattern").pictures(view)) for name in ("front", "left", "right", "rear")
-    ]
+    opened = [Camera(name, lambda: cameras.pictures("pattern", view)) for name in ("front", "left", "right", "rear")]
     streamers = [
         Streamer(i, camera, Coder(i, keys, video.find("pyav")), send, Plan(bitrate=300_000))
         for i, camera in enumerate(opened)
