@@ -25,8 +25,10 @@ from scan2sim.slam.scale import MEMORY, SLOW
 
 SMOOTHED = 2.0
 """Seconds of a track that was smoothed whose scatter is the same."""
-SCATTER = 0.05
-"""Metres by which fixes scatter at least."""
+SCATTER = 0.1
+"""Of a receiver's slow error, what its fixes scatter at least: a short track doesn't tell."""
+SHARPEST = 0.01
+"""Metres by which any receiver is off."""
 GAPS = 3.0
 """Times what is usual between two poses: over more, there is none in between."""
 
@@ -141,8 +143,8 @@ def _gps(file: Path, params: FuseParams, frame: Frame, times: F64) -> tuple[Fram
         x, y, z = np.floor(places[np.isfinite(places[:, 0])][0]).tolist()
         frame = Frame(crs, (x, y, z))
     rate = len(times) / max(float(times[-1] - times[0]), 1e-9)
-    scatter = max(track.scatter, SCATTER) * np.sqrt(max(1.0, rate * SMOOTHED))
-    slow = SLOW if track.sigma is None else float(np.median(track.sigma))
+    slow = SLOW if track.sigma is None else max(float(np.median(track.sigma)), SHARPEST)
+    scatter = max(track.scatter, SCATTER * slow) * np.sqrt(max(1.0, rate * SMOOTHED))
     return frame, Fixes(frame.to_local(places), float(scatter), slow, MEMORY)
 
 
@@ -168,7 +170,8 @@ def _georeference(path: Trajectory, times: F64) -> Fixes:
     if path.covariance is not None:
         sigma = float(np.median(np.sqrt(path.covariance[:, 0, 0] + path.covariance[:, 1, 1]) / np.sqrt(2)))
     rate = len(times) / max(float(times[-1] - times[0]), 1e-9)
-    return Fixes(places, SCATTER * float(np.sqrt(max(1.0, rate * SMOOTHED))), max(sigma, SCATTER), MEMORY)
+    sigma = max(sigma, SHARPEST)
+    return Fixes(places, SCATTER * sigma * float(np.sqrt(max(1.0, rate * SMOOTHED))), sigma, MEMORY)
 
 
 def _apart(file: Path, own: F64, times: F64, option: str) -> InputError:
@@ -194,4 +197,4 @@ def _told(fused: Fused, lidar: Steps | None, camera: Steps | None, gps: bool, wa
     return "placed by " + ", ".join(parts)
 
 
-FUSE = Step("fuse", 1, fuse_path, FuseParams)
+FUSE = Step("fuse", 2, fuse_path, FuseParams)
