@@ -20,6 +20,8 @@ from scan2sim.services.teleoperation.srtp import Keys, Sealer
 
 KEY_PAUSE = 150_000_000
 """Nanoseconds between two key frames that are wanted: what was wanted meanwhile, the last may have brought."""
+PAUSE = 0.5
+"""Seconds after an encoder failed, until another is tried."""
 DOWN, UP = 0.9, 1.2
 """An encoder keeps its bit rate while what is planned is between these parts of it: another one costs a key frame."""
 
@@ -120,7 +122,7 @@ class Streamer:
     @property
     def stream(self) -> Stream:
         """What the station is told of it."""
-        gone = self.camera.gone
+        gone = self.camera.gone or self.fault
         return Stream(self.number, self.camera.name, *self.coder.size, 0.0 if gone else self.plan.fps)
 
     def close(self) -> None:
@@ -133,7 +135,14 @@ class Streamer:
             picture = self.camera.read(0.5)
             if picture is None:
                 continue
-            packets = self.coder.code(picture, self.plan, time.monotonic())
+            try:
+                packets = self.coder.code(picture, self.plan, time.monotonic())
+            except Exception as error:  # of any library: the other cameras go on, and this one with another encoder
+                self.fault = str(error)
+                self.coder.close()
+                self._closed.wait(PAUSE)
+                continue
+            self.fault = ""
             if packets:
                 self._send(packets)
         self.coder.close()

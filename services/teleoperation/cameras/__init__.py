@@ -10,7 +10,6 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from scan2sim.pipeline import backends
-from scan2sim.pipeline.errors import ScanError
 from scan2sim.pipeline.types import F64, U8
 from scan2sim.services.teleoperation import marks
 
@@ -141,7 +140,7 @@ class Camera:
             try:
                 self._follow(self._open())
                 self.fault = "it gives no more pictures"
-            except ScanError as error:
+            except Exception as error:  # of any library: it is told, and looked for again
                 self.fault = str(error)
             pause = 0.1 if self.count > count else min(LONGEST_PAUSE, 2 * pause)
             self._closed.wait(pause)

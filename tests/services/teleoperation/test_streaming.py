@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.types import U8
 from scan2sim.services.teleoperation import cameras, video
 from scan2sim.services.teleoperation.adapting import Plan
 from scan2sim.services.teleoperation.cameras import Camera, Picture, View
@@ -118,3 +119,41 @@ def test_an_encoder_is_made_anew_only_where_the_rate_changes_much() -> None:
         drive.send(next(pictures) for _ in range(5))
         assert drive.coder.counts["encoders"] == made
     assert len(drive.frames) == 25 and not drive.wanted
+
+
+def test_an_encoder_that_fails_is_told_and_another_takes_over() -> None:
+    broken = threading.Event()
+
+    class Backend:
+        RANK = 0
+
+        def lacking(self) -> None:
+            return None
+
+        def encoder(self, settings: video.Settings) -> video.Encoder:
+            if broken.is_set():
+                raise OSError("the encoder is hot")
+            made: video.Encoder = video.find("pyav").encoder(settings)
+
+            class Breaks:
+                def encode(self, planes: U8, captured: int, key: bool) -> bytes:
+                    if broken.is_set():
+                        raise OSError("the encoder is hot")
+                    return made.encode(planes, captured, key)
+
+                def close(self) -> None:
+                    made.close()
+
+            return Breaks()
+
+    sent: list[int] = []
+    camera = Camera("front", lambda: cameras.pictures("pattern", View(width=64, height=48)))
+    streamer = Streamer(0, camera, Coder(0, Keys(0.0), Backend()), lambda p: sent.append(len(p)), Plan())
+    wait(lambda: sent)
+    broken.set()
+    wait(lambda: streamer.fault == "the encoder is hot" and streamer.stream.fps == 0.0)
+    broken.clear()
+    before = len(sent)
+    wait(lambda: len(sent) > before and not streamer.fault and streamer.coder.counts["encoders"] == 2)
+    streamer.close()
+    camera.close()
