@@ -20,8 +20,8 @@ from scan2sim.slam.geometry import angles
 from scan2sim.slam.mapped import Mapped
 from scan2sim.slam.sparse import kept, move
 
-LOSS = 1.0
-"""Pixels, of Cauchy's loss."""
+LOSS = 0.3
+"""Pixels, of Cauchy's loss: some twice what bearings are off by."""
 WRONG = 2.0
 """Observations off by more than so many times the odometry's gate are left out."""
 EDGE, POLE = 20.0, 0.9

@@ -19,8 +19,9 @@ AROUND = 17
 """Pixels, of the square about a feature whose mean is taken: Lucas-Kanade's larger one."""
 STEADY = 0.05
 """Gains nearer to 1 than this, and changes of the mean below it, aren't told from none: where the exposure is held,
-what comes nearer looks otherwise by some 2 % (one standard deviation; two real streets and a rendered one), and telling
-that from light cost accuracy on one of them."""
+what comes nearer looks otherwise by some 2 % (one standard deviation; two real streets and a rendered one), which
+isn't light. What is followed is aligned with its first look afterwards, whatever the light (`patches.py`): on three
+real streets, little depends on this number."""
 DARKEST = 50.0
 """A picture whose values spread so many times less shows nothing."""
 OFF = 2.5 * 1.4826

@@ -22,4 +22,4 @@ def can_adjust(params: Params) -> None:
     need("--adjust", "pycolmap")
 
 
-ADJUST = Step("adjust", 1, adjust_all, Params, check=can_adjust)
+ADJUST = Step("adjust", 2, adjust_all, Params, check=can_adjust)
