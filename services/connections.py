@@ -27,12 +27,20 @@ class Impatient(H11Protocol):
         else:
             self._waiting = self.loop.call_later(SILENT, self._close_if_silent)
 
+    def handle_websocket_upgrade(self, event: Any) -> None:
+        """A WebSocket is asked for, which may be silent."""
+        self._wait_no_more()
+        super().handle_websocket_upgrade(event)
+
     def connection_lost(self, exc: Exception | None) -> None:
         """Wait no more."""
+        self._wait_no_more()
+        super().connection_lost(exc)
+
+    def _wait_no_more(self) -> None:
         waiting: asyncio.TimerHandle | None = getattr(self, "_waiting", None)
         if waiting:
             waiting.cancel()
-        super().connection_lost(exc)
 
     def _close_if_silent(self) -> None:
         if self.cycle is None:

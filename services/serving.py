@@ -13,6 +13,7 @@ is in `app.state.registry`. Errors are JSON, {where, cause, remedy}, with the st
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import hmac
 import logging
 import re
@@ -42,6 +43,8 @@ LARGEST = 2**20
 """Bytes of a request's body, unless a service says otherwise."""
 REQUESTS = 256
 """Answered at once; more are sent away (503)."""
+PROTOCOL, TOKEN_PROTOCOL = "scan2sim", "token."
+"""Names of protocols that pages' WebSockets offer: the one that is spoken, and the token (hexadecimal) as another."""
 SENT_WITHIN = 30.0
 """Seconds between two parts of a request's body."""
 OWN_NAME = re.compile(r"(localhost|127(\.\d{1,3}){3}|\[::1\])(:\d+)?", re.IGNORECASE)
@@ -170,14 +173,14 @@ class _Guard:
     def _refused(self, scope: Message) -> Response | None:
         """What who may not ask is told."""
         path, headers = scope["path"], dict(scope["headers"])
-        if _from_elsewhere(scope.get("method", "GET"), headers):
+        if _from_elsewhere(scope.get("method", "POST"), headers):  # a WebSocket has none, and is no mere look
             return _refusal(403, path, "is asked for by another site's page", "Ask from its own page, or a program")
         if self._requests >= REQUESTS and not path.startswith("/health/"):
             return _refusal(503, path, "is asked for by too many at once", "Ask again in a while")
         if path in self._public or path.startswith(PUBLIC):
             return None
         if self._wanted is not None:
-            if hmac.compare_digest(headers.get(b"authorization", b""), self._wanted):
+            if hmac.compare_digest(headers.get(b"authorization", b"") or _bearer(scope), self._wanted):
                 return None
             answer = _refusal(401, path, "needs a token", "Send the header Authorization: Bearer TOKEN")
             answer.headers["WWW-Authenticate"] = "Bearer"
@@ -235,6 +238,20 @@ def _from_elsewhere(method: str, headers: Mapping[bytes, bytes]) -> bool:
     if origin is None or method in ("GET", "HEAD"):
         return False
     return origin.partition(b"://")[2] != headers.get(b"host", b"")
+
+
+def _bearer(scope: Message) -> bytes:
+    """The token that a page's WebSocket brings, as a header: browsers let it name protocols, and nothing else."""
+    for name in scope.get("subprotocols", ()):
+        if name.startswith(TOKEN_PROTOCOL):
+            with contextlib.suppress(ValueError):
+                return b"Bearer " + bytes.fromhex(name.removeprefix(TOKEN_PROTOCOL))
+    return b""
+
+
+def chosen_protocol(scope: Message) -> str | None:
+    """What a WebSocket is accepted with, where it offers it beside its token."""
+    return PROTOCOL if PROTOCOL in scope.get("subprotocols", ()) else None
 
 
 def _with_headers(send: Send) -> Send:

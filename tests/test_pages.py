@@ -151,7 +151,7 @@ def test_the_page_of_drives_names_all_their_fields_and_no_others() -> None:
     block = next(b for b in re.findall(r"```toml\n(.*?)```", page, re.DOTALL) if "[sweeps]" in b)
     parts = {name: Drive.model_fields[name].annotation for name in ("slam", "sweeps", "tiles")}
     fields = {field for part in parts.values() for field in _model(part).model_fields}
-    listed = set(re.findall(r"[a-z_]+", " ".join(re.findall(r"\b[a-z_]+(?:, [a-z_]+){2,}", block))))
+    listed = set(re.findall(r"[a-z_0-9]+", " ".join(re.findall(r"\b[a-z_]+(?:, [a-z_0-9]+){2,}", block))))
     assert listed <= fields, f"no drive has {listed - fields}"
     assert not (missing := {field for field in fields if not re.search(rf"\b{field}\b", block)}), missing
     tomls = {key for key, value in re.findall(r'^(\w+) = "(.*?)"', block, re.MULTILINE) if value.endswith(".toml")}

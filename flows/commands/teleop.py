@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import webbrowser
 from pathlib import Path
 from typing import Annotated
 
@@ -15,11 +16,14 @@ from scan2sim.flows.commands.display import console
 from scan2sim.flows.commands.options import assigned, options
 from scan2sim.flows.commands.spinning import ends
 from scan2sim.pipeline import extras
-from scan2sim.pipeline.errors import SettingError
+from scan2sim.pipeline.errors import SettingError, StepError
 from scan2sim.services.teleoperation import translators
+from scan2sim.services.teleoperation.settings import DemoParams, GatewayParams, StationParams, VehicleParams
 from scan2sim.services.teleoperation.translating import TranslateParams, Translating
 
 app = App("Vehicles driven from afar, by several links at once.")
+NEEDED = ("OpenSSL", "pylibsrtp", "websockets")
+"""Packages that each of these commands needs."""
 
 
 @app.command("certificates")
@@ -35,7 +39,7 @@ def teleop_certificates(
     renew: Annotated[bool, typer.Option("--renew", help="Make those named anew, though they still hold.")] = False,
 ) -> None:
     """Make certificates of a gateway, vehicles and stations, and the authority that signs them, or renew them."""
-    extras.need("teleop", "OpenSSL", "pylibsrtp", "websockets")
+    extras.need("teleop", *NEEDED)
     from scan2sim.services.teleoperation.authority import certify
 
     if not (gateway or vehicle or station):
@@ -66,6 +70,57 @@ def teleop_translate(
         translating = Translating(found.connect(settings), params)
         _say(f"{name}: listens on {translating.address[0]}:{translating.address[1]}; Ctrl-C ends it")
         translating.run(ended, lambda news: _say(f"the vehicle {news}"))
+
+
+@app.command("gateway")
+@options(GatewayParams, certificates="CERTIFICATES")
+def teleop_gateway(params: GatewayParams) -> None:
+    """Be the gateway that vehicles and stations meet at, and serve the fleet's page."""
+    extras.need("teleop", *NEEDED, "fastapi", "uvicorn")
+    from scan2sim.services.teleoperation.management import serve
+
+    serve(params, _say)
+
+
+@app.command("station")
+@options(StationParams, certificates="CERTIFICATES", gateway="GATEWAY")
+def teleop_station(params: StationParams) -> None:
+    """Be a station: show what its vehicle's cameras see, and send what its driver asks for."""
+    extras.need("teleop", *NEEDED, "fastapi", "uvicorn")
+    from scan2sim.services.teleoperation.cockpit import serve
+
+    serve(params, _say)
+
+
+@app.command("vehicle")
+@options(VehicleParams, certificates="CERTIFICATES", gateway="GATEWAY")
+def teleop_vehicle(params: VehicleParams) -> None:
+    """Be a vehicle's car unit: send what its cameras see, and have its translator do what the driver asks for."""
+    extras.need("teleop", *NEEDED, "av")
+    from scan2sim.services.teleoperation.vehicle import serve
+
+    ended = threading.Event()
+    with ends(ended):
+        serve(params, ended, _say)
+
+
+@app.command("demo")
+@options(DemoParams, world="WORLD")
+def teleop_demo(
+    params: DemoParams,
+    browse: Annotated[bool, typer.Option("--browse/--no-browse", help="Open the driver's page.")] = True,
+) -> None:
+    """Drive a simulated car through a finished world: gateway, vehicle and station on this machine."""
+    extras.need("teleop", *NEEDED, "av", "fastapi", "uvicorn")
+    from scan2sim.services.teleoperation.demo import demo
+
+    ended = threading.Event()
+    with ends(ended), demo(params, _say) as made:
+        if browse:
+            webbrowser.open(made.page)
+        while not ended.wait(1.0):
+            if (why := made.ended()) is not None:
+                raise StepError("teleop demo", why, "Start it again; `--help` says what can be changed")
 
 
 def _say(text: str) -> None:

@@ -44,7 +44,7 @@ class Counter:
         if lacking := programs(nft="nftables"):
             raise UnavailableError(WHAT, *lacking)
         self._side = side
-        rules = RULES.format(way=way, of=way[0], interface=side.INTERFACE, least=least, most=most)
+        rules = RULES.format(way=way, of=way[0], interface=side.interface(), least=least, most=most)
         self._nft("-f", "-", rules=rules)
 
     def read(self) -> Counted:

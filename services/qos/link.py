@@ -9,6 +9,7 @@ with Link(Shape(rate=8e6, delay=0.02, loss=0.01)) as link:
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import Self
 
@@ -27,15 +28,23 @@ class Link:
     near: Namespace
     far: Namespace
 
-    def __init__(self, there: Shape, back: Shape | None = None, *, backend: str | None = None) -> None:
-        """A link.
+    def __init__(
+        self,
+        there: Shape,
+        back: Shape | None = None,
+        *,
+        beside: Sequence[tuple[Shape, Shape]] = (),
+        backend: str | None = None,
+    ) -> None:
+        """A link of one wire, or of several.
 
         Args:
             there: what becomes of packets from the near side to the far one.
             back: of those the other way; None: the same.
+            beside: likewise, there and back, of further wires beside the first.
             backend: what shapes it, a file in `links`; None: what is best here.
         """
-        self._shapes, self._backend = (there, back or there), backend
+        self._shapes, self._backend = ((there, back or there), *beside), backend
         self._open = ExitStack()
 
     def __enter__(self) -> Self:
@@ -47,18 +56,20 @@ class Link:
         """
         with ExitStack() as made:
             self.near, self.far, folder = made.enter_context(namespaces.pair())
-            self._wire = links.find(self._backend).connect(self.near, self.far, folder)
-            for side in (self.near, self.far):
-                side.up()
-            self.near.know(self.far)
-            self.far.know(self.near)
-            self._wire.shape(*self._shapes)
+            backend = links.find(self._backend)
+            self._wires = [backend.connect(self.near, self.far, folder, wire) for wire in range(len(self._shapes))]
+            for wire, shapes in enumerate(self._shapes):
+                for side in (self.near, self.far):
+                    side.up(wire)
+                self.near.know(self.far, wire)
+                self.far.know(self.near, wire)
+                self._wires[wire].shape(*shapes)
             self._open = made.pop_all()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._open.close()
 
-    def shape(self, there: Shape, back: Shape | None = None) -> None:
-        """Be another from now on."""
-        self._wire.shape(there, back or there)
+    def shape(self, there: Shape, back: Shape | None = None, *, wire: int = 0) -> None:
+        """A wire is another from now on."""
+        self._wires[wire].shape(there, back or there)

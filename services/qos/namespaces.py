@@ -43,31 +43,43 @@ class Counts:
 
 
 class Namespace:
-    """A namespace with one interface, beside its loopback."""
+    """A namespace with an interface a wire, beside its loopback; wires count from 0."""
 
-    INTERFACE = "wire"
-
-    def __init__(self, name: str, address: str) -> None:
-        """`address`: that its interface is to have (IPv4, 24 bits of network)."""
-        self.name, self.address = name, address
+    def __init__(self, name: str, host: int) -> None:
+        """`host`: the last number of its addresses."""
+        self.name, self._host = name, host
         self._started: list[subprocess.Popen[Any]] = []
         ip("netns", "add", name)
 
-    def up(self) -> None:
-        """Give the interface its address, once it is there."""
+    @property
+    def address(self) -> str:
+        """On the first wire (IPv4)."""
+        return self.address_on(0)
+
+    def address_on(self, wire: int) -> str:
+        """On a wire: each is a network of 24 bits."""
+        return f"10.0.{wire}.{self._host}"
+
+    @staticmethod
+    def interface(wire: int = 0) -> str:
+        """Its name, on both sides."""
+        return f"wire{wire}"
+
+    def up(self, wire: int = 0) -> None:
+        """Give an interface its address, once it is there."""
         ip("-n", self.name, "link", "set", "dev", "lo", "up")
-        ip("-n", self.name, "address", "add", f"{self.address}/24", "dev", self.INTERFACE)
-        ip("-n", self.name, "link", "set", "dev", self.INTERFACE, "up")
+        ip("-n", self.name, "address", "add", f"{self.address_on(wire)}/24", "dev", self.interface(wire))
+        ip("-n", self.name, "link", "set", "dev", self.interface(wire), "up")
 
-    def know(self, other: Namespace) -> None:
+    def know(self, other: Namespace, wire: int = 0) -> None:
         """Never ask for another's hardware address: on a link that loses packets, that takes seconds."""
-        address = json.loads(ip("-j", "-n", other.name, "link", "show", "dev", other.INTERFACE))[0]["address"]
-        known = ["lladdr", address, "dev", self.INTERFACE, "nud", "permanent"]
-        ip("-n", self.name, "neighbour", "replace", other.address, *known)
+        address = json.loads(ip("-j", "-n", other.name, "link", "show", "dev", other.interface(wire)))[0]["address"]
+        known = ["lladdr", address, "dev", self.interface(wire), "nud", "permanent"]
+        ip("-n", self.name, "neighbour", "replace", other.address_on(wire), *known)
 
-    def ready(self) -> bool:
-        """Whether its interface is there."""
-        done = self.run("ip", "link", "show", "dev", self.INTERFACE, capture_output=True)
+    def ready(self, wire: int = 0) -> bool:
+        """Whether an interface is there."""
+        done = self.run("ip", "link", "show", "dev", self.interface(wire), capture_output=True)
         return done.returncode == 0
 
     def inside(self, *command: object) -> list[str]:
@@ -91,9 +103,9 @@ class Namespace:
         """Run a program here to its end, as `subprocess.run` does."""
         return subprocess.run(self.inside(*command), **named)
 
-    def counts(self) -> Counts:
-        """What went through the interface."""
-        told = json.loads(ip("-j", "-s", "-n", self.name, "link", "show", "dev", self.INTERFACE))[0]["stats64"]
+    def counts(self, wire: int = 0) -> Counts:
+        """What went through an interface."""
+        told = json.loads(ip("-j", "-s", "-n", self.name, "link", "show", "dev", self.interface(wire)))[0]["stats64"]
         return Counts(told["rx"]["packets"], told["rx"]["bytes"], told["tx"]["packets"], told["tx"]["bytes"])
 
     def reap(self) -> None:
@@ -121,7 +133,7 @@ def pair() -> Iterator[tuple[Namespace, Namespace, Path]]:
     made: list[Namespace] = []
     try:
         for number, side in enumerate(sides, 1):
-            made.append(Namespace(side, f"10.0.0.{number}"))
+            made.append(Namespace(side, number))
         yield made[0], made[1], folder
     finally:
         clearing.communicate(b"\n")  # not only by closing: a child forked meanwhile would hold it open

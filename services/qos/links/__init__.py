@@ -31,8 +31,8 @@ class Backend(Protocol):
     def lacking(self) -> Lacking | None:
         """What isn't there; None: it can run here."""
 
-    def connect(self, near: Namespace, far: Namespace, folder: Path) -> Wire:
-        """Make the interface of both, and join them; programs' files go to the folder."""
+    def connect(self, near: Namespace, far: Namespace, folder: Path, wire: int) -> Wire:
+        """Make both interfaces of a wire, and join them; programs' files go to the folder."""
 
 
 def find(name: str | None = None) -> Backend:

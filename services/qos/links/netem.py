@@ -35,23 +35,23 @@ def lacking() -> Lacking | None:
     return Lacking(f"needs the kernel's netem ({said})", "modprobe sch_netem")
 
 
-def connect(near: Namespace, far: Namespace, folder: Path) -> Wire:
+def connect(near: Namespace, far: Namespace, folder: Path, wire: int) -> Wire:
     """A pair of interfaces, one in each namespace."""
-    peer = ["peer", "name", far.INTERFACE, "netns", far.name]
-    ip("-n", near.name, "link", "add", "dev", near.INTERFACE, "type", "veth", *peer)
-    return Wire(near, far)
+    name = near.interface(wire)
+    ip("-n", near.name, "link", "add", "dev", name, "type", "veth", "peer", "name", name, "netns", far.name)
+    return Wire(near, far, name)
 
 
 class Wire:
     """Each direction is shaped where it leaves."""
 
-    def __init__(self, near: Namespace, far: Namespace) -> None:
-        self._near, self._far = near, far
+    def __init__(self, near: Namespace, far: Namespace, interface: str) -> None:
+        self._near, self._far, self._interface = near, far, interface
 
     def shape(self, there: Shape, back: Shape) -> None:
         """Replace both queueing disciplines; what they hold is dropped."""
         for side, shape in ((self._near, there), (self._far, back)):
-            command = ("tc", "qdisc", "replace", "dev", side.INTERFACE, "root", "netem", *_settings(shape))
+            command = ("tc", "qdisc", "replace", "dev", self._interface, "root", "netem", *_settings(shape))
             done = side.run(*command, capture_output=True, text=True)
             if done.returncode:
                 raise UnavailableError(WHAT, f"{' '.join(command)} failed ({done.stderr.strip()})", "Update iproute2")

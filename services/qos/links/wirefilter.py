@@ -31,16 +31,16 @@ def lacking() -> Lacking | None:
     return programs(vde_plug="vdeplug", wirefilter="vde-wirefilter")
 
 
-def connect(near: Namespace, far: Namespace, folder: Path) -> Wire:
+def connect(near: Namespace, far: Namespace, folder: Path, wire: int) -> Wire:
     """A tap in each namespace, wirefilter between them."""
-    managed, log = folder / "wirefilter", folder / "wirefilter.log"
+    managed, log = folder / f"wirefilter{wire}", folder / f"wirefilter{wire}.log"
     pipes = [os.pipe() for _ in range(4)]
     (to_near, from_near), (to_far, from_far) = pipes[:2], pipes[2:]
     ends = {"ALTERNATE_STDIN": from_far[0], "ALTERNATE_STDOUT": to_far[1]}
     with log.open("w") as said:
         for side, to, back in ((near, to_near, from_near), (far, to_far, from_far)):
             side.popen(
-                "vde_plug", f"tap://{side.INTERFACE}", stdin=to[0], stdout=back[1], stderr=said, priority=PRIORITY
+                "vde_plug", f"tap://{side.interface(wire)}", stdin=to[0], stdout=back[1], stderr=said, priority=PRIORITY
             )
         started = near.popen(
             *("wirefilter", "-M", managed),
@@ -52,7 +52,7 @@ def connect(near: Namespace, far: Namespace, folder: Path) -> Wire:
     for end in (end for pipe in pipes for end in pipe):
         os.close(end)
     limit = time.monotonic() + STARTS_WITHIN
-    while not (managed.exists() and near.ready() and far.ready()):
+    while not (managed.exists() and near.ready(wire) and far.ready(wire)):
         if started.poll() is not None or time.monotonic() > limit:
             cause = f"wirefilter and its taps didn't start ({log.read_text().strip()[:200]})"
             raise UnavailableError(WHAT, cause, "Look whether they start by hand (man wirefilter)")

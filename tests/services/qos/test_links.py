@@ -35,10 +35,10 @@ for _ in range(int(count) // 4):
 """Sends so many packets of a size, four at once."""
 
 
-def pinged(link: Link, count: int, pause: float) -> tuple[int, float]:
+def pinged(link: Link, count: int, pause: float, wire: int = 0) -> tuple[int, float]:
     """Answers, and seconds there and back: of the quickest, as a busy machine's processors add to the others."""
     said = link.near.run(
-        "ping", "-q", "-c", count, "-i", pause, "-W", "1", link.far.address, capture_output=True, text=True
+        "ping", "-q", "-c", count, "-i", pause, "-W", "1", link.far.address_on(wire), capture_output=True, text=True
     ).stdout
     least = re.search(r"= ([\d.]+)/", said)
     answers = re.search(r"(\d+) received", said)
@@ -136,3 +136,12 @@ def test_what_a_link_needs_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_what_no_link_can_do_is_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(SettingError):
         Shape.of("link", wrong)
+
+
+def test_wires_beside_each_other_are_shaped_each_for_itself() -> None:
+    need_link(None, "ping")
+    slow, fast = Shape(delay=0.04), Shape(delay=0.001)
+    with Link(fast, beside=[(slow, slow)]) as link:
+        assert pinged(link, 20, 0.02)[1] < 0.04 < 0.075 < pinged(link, 20, 0.02, wire=1)[1]
+        link.shape(slow)
+        assert pinged(link, 20, 0.02)[1] > 0.075

@@ -19,7 +19,7 @@ from scan2sim.services.teleoperation.stream import Client, Server, Stream
 from tests.services.teleoperation.parties import OTHER, OWN, identity
 
 
-def until(said: Callable[[], Any], seconds: float = 10) -> None:
+def until(said: Callable[[], Any], seconds: float = 60) -> None:
     """Wait for it."""
     end = time.monotonic() + seconds
     while not said():

@@ -1,0 +1,169 @@
+"""A gateway, a station and a vehicle on this machine, each as its command makes it, and a driver who is a script."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from scan2sim.services.teleoperation import cameras
+from scan2sim.services.teleoperation.adapting import Bounds
+from scan2sim.services.teleoperation.authority import certify
+from scan2sim.services.teleoperation.bundle import Policy
+from scan2sim.services.teleoperation.cameras import Camera, View
+from scan2sim.services.teleoperation.car import CarParams, CarUnit
+from scan2sim.services.teleoperation.control import Address
+from scan2sim.services.teleoperation.controls import Controls, Gear, VehicleState
+from scan2sim.services.teleoperation.dialling import Link
+from scan2sim.services.teleoperation.fleet import Fleet
+from scan2sim.services.teleoperation.gateway import Gateway
+from scan2sim.services.teleoperation.identity import Identity
+from scan2sim.services.teleoperation.listening import Listener
+from scan2sim.services.teleoperation.membership import Membership
+from scan2sim.services.teleoperation.messages import Command
+from scan2sim.services.teleoperation.station import Station
+from scan2sim.services.teleoperation.translating import TranslateParams, Translating
+from scan2sim.services.teleoperation.vehicle import Vehicle
+from scan2sim.services.teleoperation.watching import Frame
+
+HERE = "127.0.0.1"
+LIMIT = 1500.0
+"""Milliseconds: a machine that runs tests is busy."""
+SCRIPT = "script"
+AHEAD = Controls(throttle=0.5, gear=Gear.FORWARD)
+REST = Controls(gear=Gear.FORWARD)
+
+
+def until(true: Callable[[], object], seconds: float = 60) -> None:
+    end = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < end, "never true"
+        time.sleep(0.01)
+
+
+class Wheels:
+    """A vehicle that remembers what it was told last."""
+
+    def __init__(self) -> None:
+        self.controls = Controls()
+
+    def obey(self, controls: Controls) -> None:
+        self.controls = controls
+
+    def state(self) -> VehicleState:
+        return VehicleState(5.0 * self.controls.throttle, gear=self.controls.gear)
+
+    def close(self) -> None:
+        pass
+
+
+class Desk:
+    """A station, as `teleop station` makes it; `frames` are what it was shown."""
+
+    def __init__(self, folder: Path, gateway: int, port: int = 0) -> None:
+        self.frames: list[Frame] = []
+        self.show: Callable[[Frame], None] = self.frames.append
+        identity = Identity.read(folder)
+        self._listener = Listener(identity, [(HERE, port)])
+        self.port = self._listener.port
+        reached = [Address(host=HERE, port=self.port)]
+        self.station = Station(identity, self._listener, reached, lambda frame: self.show(frame))
+        self.membership = Membership(identity, Address(host=HERE, port=gateway), self.station, lambda _: None)
+        self._asks: Callable[[], Command | None] = lambda: None
+        self._ended = threading.Event()
+        self._driver = threading.Thread(target=self._drive, daemon=True)
+        self._driver.start()
+
+    def drive(self, controls: Controls | None, agree: bool = False) -> None:
+        """Ask for controls from now on; None: for nothing."""
+        if controls is None:
+            self._asks = lambda: None
+            return
+        self.station.wheel.take(SCRIPT, time.monotonic())
+        self._asks = lambda: Command(controls, self.stop(), agree)
+
+    def start(self) -> None:
+        """Confirm the stop, as a driver does who sees it, and drive ahead."""
+        self.drive(REST)
+        until(lambda: self.telemetry() is not None and not self.hindered())
+        time.sleep(0.1)
+        self.drive(REST, agree=True)
+        until(lambda: not self.standing())
+        self.drive(AHEAD)
+
+    def telemetry(self) -> object:
+        joined = self.station.joined()
+        return None if joined is None else joined.telemetry
+
+    def stop(self) -> int:
+        joined = self.station.joined()
+        return 0 if joined is None or joined.telemetry is None else joined.telemetry.stop
+
+    def standing(self) -> bool:
+        joined = self.station.joined()
+        return joined is None or joined.telemetry is None or joined.telemetry.standing
+
+    def hindered(self) -> str:
+        joined = self.station.joined()
+        return "" if joined is None else joined.hindrance()
+
+    def close(self) -> None:
+        self._ended.set()
+        self._driver.join()
+        self.membership.close()
+        self.station.close()
+        self._listener.close()
+
+    def _drive(self) -> None:
+        while not self._ended.wait(0.02):
+            if (command := self._asks()) is not None:
+                self.station.wheel.turn(SCRIPT, command, time.monotonic())
+
+
+class Street:
+    """All of it; `desks` are made as tests want them."""
+
+    def __init__(self, folder: Path) -> None:
+        self.parties = folder / "parties"
+        certify(self.parties, [HERE], ["car"], ["desk", "other"], 1, False)
+        self._state = folder / "state"
+        self.gateway, self.fleet = self._start(0)
+        self.wheels, self._ended = Wheels(), threading.Event()
+        translating = Translating(self.wheels, TranslateParams(port=0, limit=LIMIT))
+        self._translator = threading.Thread(target=translating.run, args=(self._ended,), daemon=True)
+        self._translator.start()
+        where = f"{HERE}:{translating.address[1]}"
+        unit = CarUnit(CarParams(translator=where, limit=LIMIT))
+        front = Camera("front", lambda: cameras.pictures("pattern", View(width=160, height=120, fps=10)))
+        links = [Link("one", HERE), Link("two", HERE)]
+        identity = Identity.read(self.parties / "vehicle-car")
+        self.vehicle = Vehicle(identity, unit, links, {"front": front}, Policy.COPY, Bounds())
+        self._member = Membership(identity, Address(host=HERE, port=self.gateway.port), self.vehicle, lambda _: None)
+        self.desks: list[Desk] = []
+
+    def desk(self, name: str = "desk", port: int = 0) -> Desk:
+        """A station that is there."""
+        made = Desk(self.parties / f"station-{name}", self.gateway.port, port)
+        self.desks.append(made)
+        until(lambda: any(one["name"] == name and one["there"] for one in self.fleet.facts()["stations"]))
+        until(lambda: any(one["there"] for one in self.fleet.facts()["vehicles"]))
+        return made
+
+    def restart_gateway(self) -> None:
+        port = self.gateway.port
+        self.gateway.close()
+        self.gateway, self.fleet = self._start(port)
+
+    def _start(self, port: int) -> tuple[Gateway, Fleet]:
+        fleet = Fleet(self._state)
+        return Gateway(Identity.read(self.parties / "gateway"), HERE, port, fleet, lambda _: None), fleet
+
+    def close(self) -> None:
+        for desk in self.desks:
+            desk.close()
+        self._member.close()
+        self.vehicle.close()
+        self._ended.set()
+        self._translator.join()
+        self.gateway.close()
