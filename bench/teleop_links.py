@@ -16,6 +16,7 @@ from typing import Any
 
 from scan2sim.services.teleoperation.authority import Authority
 from scan2sim.services.teleoperation.bundle import Bundle, Policy
+from scan2sim.services.teleoperation.clocks import Clocks
 from scan2sim.services.teleoperation.dialling import Link, dial
 from scan2sim.services.teleoperation.identity import Identity, Peer, Role
 from scan2sim.services.teleoperation.listening import Listener
@@ -29,7 +30,7 @@ class Ages:
     """How old messages were when they came, and the time between them, ms."""
 
     def __init__(self) -> None:
-        self.bundle: Bundle | None = None
+        self.clocks = Clocks()
         self.ages: list[float] = []
         self.gaps: list[float] = []
         self.packets = 0
@@ -41,8 +42,7 @@ class Ages:
         if self._last:
             self.gaps.append((now - self._last) * 1e3)
         self._last = now
-        assert self.bundle is not None
-        self.ages.append(self.bundle.clocks.age_ms(message.sent))
+        self.ages.append(self.clocks.age_ms(message.sent))
 
     def media(self, packet: bytes, link: str) -> None:
         """A packet of video came."""
@@ -63,7 +63,6 @@ class Ages:
 
 def drive(bundle: Bundle, ages: Ages, kind: Kind, given: argparse.Namespace, packets: int) -> dict[str, Any]:
     """Send at the rates for so long."""
-    ages.bundle = bundle
     while sum(link.up for link in bundle.links) < len(LINKS):
         time.sleep(0.01)
     used, begun = resource.getrusage(resource.RUSAGE_SELF), time.monotonic()
@@ -84,7 +83,9 @@ def drive(bundle: Bundle, ages: Ages, kind: Kind, given: argparse.Namespace, pac
 def vehicle(me: Identity, peer: Peer, given: argparse.Namespace, pipe: multiprocessing.connection.Connection) -> None:
     """The process of a vehicle."""
     ages = Ages()
-    bundle = dial(me, peer, LINKS, [("127.0.0.1", pipe.recv())], received=ages.received, media=ages.media)
+    bundle = dial(
+        me, peer, LINKS, [("127.0.0.1", pipe.recv())], received=ages.received, media=ages.media, clocks=ages.clocks
+    )
     pipe.send(drive(bundle, ages, Kind.TELEMETRY, given, given.packets))
     bundle.close()
 
@@ -108,7 +109,7 @@ def main() -> None:
     child.start()
     ages = Ages()
     listener = Listener(desk, [("127.0.0.1", 0)])
-    bundle = listener.expect(car.me, ages.received, ages.media)
+    bundle = listener.expect(car.me, ages.received, ages.media, clocks=ages.clocks)
     here.send(listener.port)
     station = drive(bundle, ages, Kind.COMMAND, given, 0)
     result = {"vehicle": here.recv(), "station": station, "links": [link.name for link in bundle.links]}
