@@ -11,9 +11,11 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
+from scan2sim.flows.commands import verdicts
 from scan2sim.flows.commands.app import App
 from scan2sim.flows.commands.display import console, progress
 from scan2sim.flows.commands.options import options
+from scan2sim.flows.commands.verdicts import or_dash
 from scan2sim.pipeline import extras
 from scan2sim.services.qos import requirements
 from scan2sim.services.qos.encoding import ChoiceParams, Jpeg, choose_h264, choose_jpeg
@@ -58,11 +60,11 @@ def qos_measure(
     with progress(f"{params.toolbox} {params.environment}") as report:
         measured = measure(params, service, report)
     found = rows(required, measured)
-    console.print(_table(f"{service.title}, {params.environment} ({service.source})", found))
+    console.print(verdicts.table(f"{service.title}, {params.environment} ({service.source})", found))
     console.print(_needs_table([needs(measured, rate) for rate in RATES]))
     answers = measured.answers
     done = answers.states.get("done", 0)
-    _say(f"{done} of {answers.sent} images were answered, half of them within {_or_dash(answers.response_p50)} ms")
+    _say(f"{done} of {answers.sent} images were answered, half of them within {or_dash(answers.response_p50)} ms")
     _say(f"images were sent as JPEGs{_told(measured.encoding)}")
     if required.slice:
         _say(f"preferred slice of a 5G network: {required.slice}")
@@ -101,29 +103,13 @@ def _json(row: Row) -> dict[str, object]:
     return asdict(row) | {"required": str(row.required) if row.required else None}
 
 
-def _table(title: str, found: list[Row]) -> Table:
-    table = Table(title=title, title_justify="left")
-    for name in ("metric", "required", "measured", ""):
-        table.add_column(name, justify="right" if name == "measured" else "left")
-    for row in found:
-        unit = UNITS.get(row.metric, "")
-        required = f"{row.required} {unit}" if row.required else "-"
-        verdict = {True: "[green]pass", False: "[red]FAIL", None: ""}[row.passed]
-        table.add_row(row.metric.replace("_", " "), required, f"{_or_dash(row.measured)} {unit}", verdict)
-    return table
-
-
 def _needs_table(found: list[Needs]) -> Table:
     table = Table(title="What rates need (of this machine's cores)", title_justify="left")
     for name in ("images a second", "Mbit/s on the network", "cores"):
         table.add_column(name, justify="right")
     for one in found:
-        table.add_row(f"{one.rate:g}", _or_dash(one.bandwidth), f"{one.cores:.2f}")
+        table.add_row(f"{one.rate:g}", or_dash(one.bandwidth), f"{one.cores:.2f}")
     return table
-
-
-def _or_dash(value: float | None) -> str:
-    return "-" if value is None else f"{value:.4g}"
 
 
 def _say(text: str) -> None:

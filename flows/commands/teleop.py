@@ -12,13 +12,19 @@ from rich.markup import escape
 from rich.table import Table
 
 from scan2sim.flows.commands.app import App
-from scan2sim.flows.commands.display import console
+from scan2sim.flows.commands.display import console, progress
 from scan2sim.flows.commands.options import assigned, options
 from scan2sim.flows.commands.spinning import ends
 from scan2sim.pipeline import extras
 from scan2sim.pipeline.errors import SettingError, StepError
 from scan2sim.services.teleoperation import translators
-from scan2sim.services.teleoperation.settings import DemoParams, GatewayParams, StationParams, VehicleParams
+from scan2sim.services.teleoperation.settings import (
+    DemoParams,
+    GatewayParams,
+    MeasureParams,
+    StationParams,
+    VehicleParams,
+)
 from scan2sim.services.teleoperation.translating import TranslateParams, Translating
 
 app = App("Vehicles driven from afar, by several links at once.")
@@ -121,6 +127,34 @@ def teleop_demo(
         while not ended.wait(1.0):
             if (why := made.ended()) is not None:
                 raise StepError("teleop demo", why, "Start it again; `--help` says what can be changed")
+
+
+@app.command("measure")
+@options(MeasureParams)
+def teleop_measure(params: MeasureParams) -> None:
+    """Drive by a script over a network like the environment's, and hold what is measured against D3.2's table 6."""
+    extras.need("teleop", *NEEDED, "av")
+    extras.need("measuring", "psutil")
+    from scan2sim.flows.commands import verdicts
+    from scan2sim.services.qos import requirements
+    from scan2sim.services.qos.requirements import MACHINE, NETWORK
+    from scan2sim.services.qos.verdict import passed, rows
+    from scan2sim.services.teleoperation.measure import measure, percentile
+
+    service = requirements.read("teleoperation")
+    required = service.of(params.environment)
+    with progress(f"teleoperation {params.environment}") as report:
+        measured = measure(params, required, report)
+    found = rows(required, measured)
+    console.print(verdicts.table(f"{service.title}, {params.environment} ({service.source})", found))
+    times = measured.glass_to_glass
+    _say(
+        f"{len(times)} pictures were shown, half of them within {percentile(times, 50):.0f} ms of their taking, "
+        f"95 % within {percentile(times, 95):.0f} ms; {measured.lost_frames:.2%} were lost"
+    )
+    _say(f"the longest time without a command was {measured.command_gap:.0f} ms")
+    for name, metrics in (("service", NETWORK), ("machine", MACHINE)):
+        _say(f"{name}: {'passed' if passed(found, metrics) else 'FAILED'}")
 
 
 def _say(text: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Protocol
 
 from scan2sim.services.qos.measure import Measured
 from scan2sim.services.qos.requirements import MACHINE, NETWORK, Bound, Requirements
@@ -24,7 +25,14 @@ class Row:
     passed: bool | None
 
 
-def rows(required: Requirements, measured: Measured) -> list[Row]:
+class Valued(Protocol):
+    """Whatever was measured."""
+
+    def values(self) -> dict[str, float | None]:
+        """By the metrics of `Requirements`; None: there is no such thing here."""
+
+
+def rows(required: Requirements, measured: Valued) -> list[Row]:
     """Of all metrics that are asked or measured.
 
     What is asked of a network that isn't there is met; an answer that never came is too late, whatever is asked.

@@ -11,6 +11,7 @@ from pydantic import Field
 from scan2sim.pipeline.errors import SettingError
 from scan2sim.pipeline.ranges import File
 from scan2sim.pipeline.step import Params
+from scan2sim.services.qos.requirements import Environment
 from scan2sim.services.served import Served
 from scan2sim.services.teleoperation.car import CarParams
 from scan2sim.services.teleoperation.control import Address
@@ -106,3 +107,23 @@ class DemoParams(Params):
     rate: Annotated[float, Field(ge=1, le=30, description="Pictures a second, as far as the machine renders them.")] = (
         15.0
     )
+
+
+class MeasureParams(Params):
+    """Of a measurement."""
+
+    environment: Annotated[Environment, Field(description="Where the station is: robot, edge or cloud.")] = (
+        Environment.EDGE
+    )
+    seconds: Annotated[float, Field(ge=1, le=86_400, description="Seconds that it is measured for.")] = 30.0
+    warm: Annotated[
+        float, Field(ge=0, le=600, description="Seconds driven before that: video grows to what the links carry.")
+    ] = 30.0
+    cameras: Annotated[int, Field(ge=1, le=16, description="Of the vehicle, 640x480 at 30 pictures a second.")] = 4
+    bitrate: Annotated[
+        float | None,
+        Field(ge=0.2, le=100, description="Mbit/s of a camera's video, at most; default: as its requirements ask."),
+    ] = None
+    network: Annotated[
+        File | None, Field(description="TOML of a network, in place of what the environment's is assumed to be.")
+    ] = None
