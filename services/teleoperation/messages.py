@@ -10,7 +10,6 @@ import json
 import struct
 from dataclasses import asdict, dataclass
 from enum import IntEnum
-from functools import cache
 from typing import Annotated, Any, Self
 
 from pydantic import Field, TypeAdapter, ValidationError
@@ -184,10 +183,14 @@ class _Told:
         return found
 
 
-@cache
+_ADAPTERS: dict[type[_Told], TypeAdapter[Any]] = {}
+
+
 def _adapter(told: type[_Told]) -> TypeAdapter[Any]:
     """What reads a body: to make it takes longer than a hundred readings."""
-    return TypeAdapter(told)
+    if told not in _ADAPTERS:
+        _ADAPTERS[told] = TypeAdapter(told)
+    return _ADAPTERS[told]
 
 
 def _refuse(constant: str) -> None:
