@@ -40,7 +40,7 @@ from scan2sim.services.teleoperation.messages import (
 from scan2sim.services.teleoperation.safety import LIMIT_MS, MS, Safety
 from scan2sim.services.teleoperation.translating import read_key
 
-WATCHED, TOLD, LISTED = 0.005, 0.05, 1.0
+WATCHED, TOLD, LISTED = 0.005, 0.02, 1.0
 """Seconds between looks of the watchdog, telemetries, and lists of the cameras."""
 ROOM = LARGEST - 64
 """Bytes of a message's body: the rest is its header's, and the links'."""
