@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
@@ -86,11 +87,11 @@ def test_the_bus_is_told_of_a_run(
     assert time.monotonic() - began < 30
     broker.start()
     good(scan2sim(*command))  # sends what the one before couldn't, and what the broker has forgotten
-    steps, runs = dict[str, str](), list[tuple[str, int, int]]()
+    steps, runs = defaultdict[str, set[str]](set), list[tuple[str, int, int]]()
     for told in kafka.read(broker.servers, "bus_events", group="test", from_start=True, wait=0.5):
         event = json.loads(told or "{}")
         if event.get("kind") == "step":
-            steps[event["body"]["step"]] = event["body"]["state"]
+            steps[event["body"]["step"]].add(event["body"]["state"])
         elif event.get("kind") == "run" and event["body"]["state"] == "done":
             runs.append((event["body"]["source"], event["body"]["kept"], event["body"]["done"]))
         if len(runs) == 3 or time.monotonic() - began > 90:
@@ -98,7 +99,7 @@ def test_the_bus_is_told_of_a_run(
     count = len(steps)
     # each run's events are in order, runs may be read in any: a broker parts them
     assert sorted(runs) == [(str(street), count - 1, 1), (str(street), count, 0), (str(street), count, 0)]
-    assert set(steps.values()) == {"kept"} and "preview" in steps
+    assert all("kept" in states for states in steps.values()) and "preview" in steps
 
 
 def test_rasters_are_made_where_they_are_asked_for(street: Path, world: Path, tmp_path: Path) -> None:
