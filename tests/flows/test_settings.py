@@ -30,6 +30,9 @@ from scan2sim.services.monitoring.watched import DatasetParams, TalkerParams, To
 from scan2sim.services.orchestration.settings import ApplyParams, ResizeParams
 from scan2sim.services.qos.encoding import ChoiceParams
 from scan2sim.services.qos.measure import MeasureParams
+from scan2sim.services.teleoperation.settings import DemoParams, VehicleParams
+from scan2sim.services.teleoperation.settings import MeasureParams as DrivenParams
+from scan2sim.services.teleoperation.translating import TranslateParams
 from scan2sim.services.toolboxes.boxes import classify, detect, movement, segment
 from scan2sim.services.toolboxes.settings import CameraParams, NodeParams, ServeParams
 from scan2sim.slam.steps.track import Filmed
@@ -150,10 +153,11 @@ def test_every_number_that_a_command_takes_has_a_range() -> None:
     boxes = (detect.Params, movement.Params, classify.Params, segment.Params, ServeParams, NodeParams, CameraParams)
     bus = (QueryParams, TopicParams, TalkerParams, DatasetParams, TrafficParams, WorkParams, ScaleParams, PageParams)
     osm, qos = (ApplyParams, ResizeParams), (MeasureParams, ChoiceParams)
+    driven = (VehicleParams, DemoParams, TranslateParams, DrivenParams)
     numbers = {name for of in hints for name, kind in of.items() if {int, float} & {kind, *get_args(kind)}}
     assert len(numbers) > 15 and numbers <= {
         name
-        for model in (Numbers, Filmed, CutParams, SweepsParams, *shown, *qos, *osm, *bus, *boxes)
+        for model in (Numbers, Filmed, CutParams, SweepsParams, *shown, *qos, *osm, *bus, *boxes, *driven)
         for name in model.model_fields
     }
 
