@@ -128,6 +128,7 @@ def test_pixels_agree_with_the_poses(camera: Panorama, trajectory: Trajectory) -
         assert wrong > 1.5 * difference  # the measure notices a wrong pose
 
 
+@pytest.mark.slow
 def test_rows_of_a_rolling_shutter_have_their_own_poses(camera: Panorama, trajectory: Trajectory) -> None:
     time = float(trajectory.times[70])
     poses = row_poses(trajectory, time, H, 0.06)
