@@ -17,19 +17,11 @@ const SUMS = [
   ["difference", 3],
 ];
 
-const byId = (id) => document.getElementById(id);
 const chosen = new Set(); // names of nodes that are shown; none: all
 let range = { seconds: 300 }; // or {from, to}
 let held = null; // the window that is shown
 let plots = null;
 let stopped = new AbortController();
-
-function element(tag, text, name) {
-  const made = document.createElement(tag);
-  if (text !== undefined) made.textContent = text;
-  if (name) made.className = name;
-  return made;
-}
 
 // ---- windows
 

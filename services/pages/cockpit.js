@@ -1,7 +1,6 @@
 // The station's page: decodes the vehicle's pictures, tells how old they are, and sends what the driver asks for.
 "use strict";
 
-const byId = (id) => document.getElementById(id);
 const TURNS = 20; // ms between two sendings of what is asked for
 const OLD = 300; // ms from which a picture's age is shown as bad
 const HEADER = 14; // bytes before a picture
@@ -14,13 +13,6 @@ let socket = null,
 const cameras = new Map(),
   pressed = new Set(),
   wheel = { steering: 0, throttle: 0, brake: 0 };
-
-function element(tag, text, name) {
-  const made = document.createElement(tag);
-  if (text !== undefined) made.textContent = text;
-  if (name) made.className = name;
-  return made;
-}
 
 function strip(id, text) {
   byId(id).hidden = !text;

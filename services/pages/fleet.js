@@ -1,15 +1,7 @@
 // Fleet management: who is there, on which links; joins, hands over, takes back and releases.
 "use strict";
 
-const byId = (id) => document.getElementById(id);
 const EVERY = 1000;
-
-function element(tag, text, name) {
-  const made = document.createElement(tag);
-  if (text !== undefined) made.textContent = text;
-  if (name) made.className = name;
-  return made;
-}
 
 function tell(fault) {
   byId("fault").hidden = !fault;
@@ -17,24 +9,13 @@ function tell(fault) {
 }
 
 async function act(vehicle, what, body) {
-  tell(null);
-  const token = sessionStorage.getItem("token");
-  const headers = { "Content-Type": "application/json", ...(token ? { Authorization: `Bearer ${token}` } : {}) };
-  const path = `/api/vehicles/${encodeURIComponent(vehicle)}/${what}`;
-  const answer = await fetch(path, { method: "POST", headers, body: body && JSON.stringify(body) });
-  if (!answer.ok) {
-    const told = await answer.json().catch(() => ({}));
-    tell(told.cause ? `${told.where}: ${told.cause}. ${told.remedy}` : `status ${answer.status}`);
+  try {
+    tell(null);
+    await send("POST", `/api/vehicles/${encodeURIComponent(vehicle)}/${what}`, body && JSON.stringify(body));
+  } catch (error) {
+    tell(error.message);
   }
   await look();
-}
-
-function button(text, pressed, disabled = false) {
-  const made = element("button", text);
-  made.type = "button";
-  made.disabled = disabled;
-  made.addEventListener("click", pressed);
-  return made;
 }
 
 function pill(text, good) {
@@ -78,11 +59,11 @@ function vehicle(one, stations) {
   select.append(...free.map((station) => element("option", station.name)));
   const chosen = () => ({ station: select.value });
   if (free.length && one.there) choice.append(select);
-  if (one.pair === null) choice.append(button("Join", () => act(one.name, "join", chosen()), !free.length || !one.there));
+  if (one.pair === null) choice.append(button("Join", !free.length || !one.there, () => act(one.name, "join", chosen())));
   else {
-    choice.append(button("Hand over", () => act(one.name, "hand-over", chosen()), !free.length));
-    if (one.before) choice.append(button(`Back to ${one.before}`, () => act(one.name, "take-back")));
-    choice.append(button("Release", () => act(one.name, "release")));
+    choice.append(button("Hand over", !free.length, () => act(one.name, "hand-over", chosen())));
+    if (one.before) choice.append(button(`Back to ${one.before}`, false, () => act(one.name, "take-back")));
+    choice.append(button("Release", false, () => act(one.name, "release")));
   }
   line.append(choice);
   return made;

@@ -1,28 +1,11 @@
 // The page of services in OSM: asks how things stand every two seconds, and sends what its buttons are for.
 "use strict";
 
-const byId = (id) => document.getElementById(id);
 const EVERY = 2000;
-
-function element(tag, text, name) {
-  const made = document.createElement(tag);
-  if (text !== undefined) made.textContent = text;
-  if (name) made.className = name;
-  return made;
-}
 
 function tell(fault) {
   byId("fault").hidden = !fault;
   byId("fault").textContent = fault ?? "";
-}
-
-async function send(method, path, body, type) {
-  const token = sessionStorage.getItem("token");
-  const headers = { "Content-Type": type ?? "application/json", ...(token ? { Authorization: `Bearer ${token}` } : {}) };
-  const answer = await fetch(path, { method, headers, body });
-  if (answer.ok) return;
-  const told = await answer.json().catch(() => ({}));
-  throw new Error(told.cause ? `${told.where}: ${told.cause}. ${told.remedy}` : `status ${answer.status}`);
 }
 
 async function act(service, what, body) {
@@ -38,14 +21,6 @@ async function act(service, what, body) {
 function pill(name, state) {
   const made = element("span", `${name} ${state.toLowerCase().replaceAll("_", " ")}`, "pill");
   made.dataset.state = { READY: "done", BROKEN: "failed", BUILDING: "running" }[state] ?? "waiting";
-  return made;
-}
-
-function button(text, disabled, pressed) {
-  const made = element("button", text);
-  made.type = "button";
-  made.disabled = disabled;
-  made.addEventListener("click", pressed);
   return made;
 }
 

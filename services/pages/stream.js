@@ -14,6 +14,16 @@ async function ask(path, signal) {
   return answer;
 }
 
+// Has a service do something, with a body of JSON unless it says otherwise.
+async function send(method, path, body, type) {
+  const token = sessionStorage.getItem("token");
+  const headers = { "Content-Type": type ?? "application/json", ...(token ? { Authorization: `Bearer ${token}` } : {}) };
+  const answer = await fetch(path, { method, headers, body });
+  if (answer.ok) return;
+  const told = await answer.json().catch(() => ({}));
+  throw new Error(told.cause ? `${told.where}: ${told.cause}. ${told.remedy}` : `status ${answer.status}`);
+}
+
 // Calls `taken` with each event of a stream, until it ends or is silent for `longest` ms.
 async function follow(path, signal, taken, longest = 10000) {
   const reader = (await ask(path, signal)).body.pipeThrough(new TextDecoderStream()).getReader();

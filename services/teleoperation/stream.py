@@ -244,7 +244,7 @@ class _Connections(threading.Thread):
 
     def _ready(self, stream: Stream, lines: list[bytes]) -> bool:
         """Whether it is open now."""
-        raise NotImplementedError
+        return stream._channel.established
 
     def _drop(self, stream: Stream, why: str) -> None:
         if self._streams.pop(stream._sock, None) is not None:
