@@ -4,6 +4,8 @@
 const TURNS = 20; // ms between two sendings of what is asked for
 const OLD = 300; // ms from which a picture's age is shown as bad
 const HEADER = 14; // bytes before a picture
+const SEEN = 5, // sendings that name a stop without agreeing, which the vehicle wants first, however quick the driver is
+  AGREED = 10; // sendings that agree
 
 let socket = null,
   facts = {},
@@ -134,7 +136,7 @@ function turn() {
     gamepad = null;
     return leave("the gamepad was unplugged");
   }
-  const agree = agreeing > 0 && now.throttle === 0;
+  const agree = agreeing > 0 && agreeing <= AGREED && now.throttle === 0;
   send({
     do: "turn", ...now, throttle: agreeing > 0 ? 0 : now.throttle, gear, horn: any("KeyH"), lights,
     stop: facts.telemetry?.stop ?? 0, agree,
@@ -215,7 +217,7 @@ byId("take").addEventListener("click", () => {
   send({ do: "take" });
 });
 byId("leave").addEventListener("click", () => leave("the driver left it"));
-byId("agree").addEventListener("click", () => (agreeing = 10));
+byId("agree").addEventListener("click", () => (agreeing = SEEN + AGREED));
 byId("release").addEventListener("click", () => send({ do: "release", vehicle: facts.vehicle }));
 byId("fetch").addEventListener("submit", (event) => {
   event.preventDefault();
