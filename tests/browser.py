@@ -66,7 +66,9 @@ class Page:
         """Wait until an expression is true."""
         end = time.monotonic() + seconds
         while not self.value(script):
-            assert time.monotonic() < end, f"never true: {script}; {self.errors}"
+            if time.monotonic() > end:
+                shown = self.value("document.body.innerText")
+                raise AssertionError(f"never true: {script}; errors: {self.errors}; the page: {shown}")
             time.sleep(0.05)
 
     def click(self, selector: str) -> None:

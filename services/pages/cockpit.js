@@ -185,7 +185,7 @@ function tell(told) {
   byId("vehicle").textContent = told.vehicle ?? "no vehicle";
   byId("station").textContent = told.station;
   byId("fetch").hidden = there;
-  byId("drive").hidden = !there;
+  byId("wheel").hidden = byId("drive").hidden = !there;
   byId("why").textContent = there ? "" : told.why;
   if (!there) {
     for (const one of cameras.values()) one.figure.remove();
