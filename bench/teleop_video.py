@@ -76,7 +76,7 @@ def main() -> None:
     backend = video.find("pyav")
     coders = [Coder(i, keys, backend) for i in range(len(YAWS))]
     frames: list[Frame] = []
-    watcher = Watcher(frames.append, lambda camera: None, lambda captured: 0.0)
+    watcher = Watcher(frames.append, lambda camera: None, lambda captured: 0.0, lambda *_: None, lambda: 0.1)
     watcher.learn(keys.told(0.0)[0])
     plan = Plan(asked.bitrate)
     decoder, read, quality, first = video.Decoder(), 0, [], 0

@@ -159,6 +159,12 @@ class Bundle:
         """All links, also those that are down."""
         return tuple(self._state(name, line) for name, line in list(self._lines.items()))
 
+    @property
+    def round_trip(self) -> float:
+        """Seconds there and back by the quickest link that is up; NaN: unknown."""
+        now = time.monotonic()
+        return min((one.trip for one in self._sending if one.up(now) and one.trip == one.trip), default=float("nan"))
+
     def send(self, kind: Kind, body: bytes) -> int:
         """A message to the peer, over all links there are; never blocks.
 

@@ -29,6 +29,7 @@ from scan2sim.services.teleoperation.messages import (
     LARGEST,
     Command,
     Kind,
+    Lacking,
     Malformed,
     Message,
     Report,
@@ -123,6 +124,9 @@ class Sender(Protocol):
 
     def want_key(self) -> None:
         """Send a key frame next."""
+
+    def send_again(self, source: int, sequences: Sequence[int]) -> None:
+        """Send packets again that didn't come."""
 
     def adapt(self, report: Report) -> None:
         """Follow what the links carry."""
@@ -254,6 +258,11 @@ def _about_video(cameras: Sequence[Sender], message: Message) -> None:
         camera = Wanted.unpack(message.body).camera
         for one in cameras[camera : camera + 1]:
             one.want_key()
+    elif message.kind == Kind.LACKING:
+        lacking = Lacking.unpack(message.body)
+        camera = lacking.source & 0xFF
+        for one in cameras[camera : camera + 1]:
+            one.send_again(lacking.source, lacking.sequences)
     elif message.kind == Kind.REPORT:
         report = Report.unpack(message.body)
         for one in cameras[report.camera : report.camera + 1]:

@@ -86,8 +86,9 @@ class Measured:
 
     @property
     def loss_rate(self) -> float:
-        """Share of all messages and packets of video that came by no link."""
-        came, lost = self.station["frames"].get("received", 0), self.station["frames"].get("lost", 0)
+        """Share of all messages and packets of video that came by no link, or not before they were sent again."""
+        received, missed, mended = (self.station["frames"].get(what, 0) for what in ("received", "lost", "mended"))
+        came, lost = received - mended, missed + mended
         for end in (self.vehicle, self.station):
             came, lost = came + len(end["messages"]), lost + missing(end["messages"])
         return float(max(lost, 0) / max(came + lost, 1))

@@ -36,6 +36,8 @@ class Kind(IntEnum):
     """To the vehicle: `Report` of how the video comes."""
     STREAMS = 8
     """To the station: `Streams`, what cameras there are."""
+    LACKING = 9
+    """To the vehicle: `Lacking`, packets of video that are to be sent again."""
 
 
 HEADER = struct.Struct("<BQq")
@@ -162,6 +164,27 @@ class Wanted:
             raise Malformed(str(error)) from None
 
 
+@dataclass(frozen=True)
+class Lacking:
+    """Packets of a source of video (SSRC) that didn't come, by their sequence."""
+
+    source: int
+    sequences: tuple[int, ...]
+
+    def pack(self) -> bytes:
+        """As a message's body."""
+        return struct.pack(f"<I{len(self.sequences)}H", self.source, *self.sequences)
+
+    @staticmethod
+    def unpack(body: bytes) -> Lacking:
+        """Of a message's body; raises Malformed."""
+        try:
+            source, *sequences = struct.unpack(f"<I{(len(body) - 4) // 2}H", body)
+        except struct.error as error:
+            raise Malformed(str(error)) from None
+        return Lacking(source, tuple(sequences))
+
+
 class _Told:
     """Said seldom, as JSON: easier to read in a capture, and to add to."""
 
@@ -226,7 +249,7 @@ class Report(_Told):
     """How a camera's video came over the last second.
 
     Attributes:
-        received, lost: packets.
+        received, lost: packets; such that had to be sent again are among the lost.
         delay: ms from the camera to here, the median.
         links: bytes a second that came by each link, by its name.
     """

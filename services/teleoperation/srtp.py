@@ -10,6 +10,7 @@ from __future__ import annotations
 import secrets
 import threading
 from collections import Counter
+from collections.abc import Iterable
 from typing import NamedTuple
 
 from pylibsrtp import Error, Policy, Session
@@ -25,12 +26,18 @@ AHEAD = 5.0
 """Seconds that a key is told before it is used, as messages may be lost."""
 LASTING = 5.0
 """Seconds that packets of an earlier key are taken after the first of a later one."""
+RECENT = 512
+"""Packets of a camera that are kept, to be sent again: a second of them, or more."""
+WINDOW = 1024
+"""Packets before the newest that are still taken by a station: more than are kept."""
 KEPT = 3
 """Keys that a station holds at most."""
 
 
 def _policy(key: Key, direction: int) -> Policy:
-    return Policy(key.secret, direction, 0, Policy.SRTP_PROFILE_AEAD_AES_256_GCM)
+    made = Policy(key.secret, direction, 0, Policy.SRTP_PROFILE_AEAD_AES_256_GCM)
+    made.window_size = WINDOW
+    return made
 
 
 class Keys:
@@ -73,6 +80,7 @@ class Sealer:
         self._key: Key | None = None
         self._session: Session | None = None
         self._sequence = self._number = 0
+        self._recent: dict[tuple[int, int], bytes] = {}
 
     def renew(self, now: float) -> bool:
         """Go over to the key that is to be used now; whether it is another: then a key frame is due."""
@@ -87,9 +95,19 @@ class Sealer:
         assert self._key and self._session, "renew() comes first"
         source = self._key.generation << 8 | self._camera
         plain = rtp.packets(data, source, self._sequence, self._number, captured)
+        sealed = [self._session.protect(packet) for packet in plain]
+        for i, packet in enumerate(sealed, self._sequence):
+            self._recent[source, i & 0xFFFF] = packet
+        while len(self._recent) > RECENT:
+            del self._recent[next(iter(self._recent))]
         self._sequence += len(plain)
         self._number += 1
-        return [self._session.protect(packet) for packet in plain]
+        return sealed
+
+    def again(self, source: int, sequences: Iterable[int]) -> list[bytes]:
+        """Packets as they were sent, those that are still kept. May be called in any thread."""
+        found = (self._recent.get((source, sequence)) for sequence in sequences)
+        return [packet for packet in found if packet is not None]
 
 
 class _Open(NamedTuple):

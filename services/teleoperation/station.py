@@ -6,6 +6,7 @@ driver asks goes to the vehicle fifty times a second, as long as the driver goes
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -26,7 +27,17 @@ from scan2sim.services.teleoperation.control import (
 from scan2sim.services.teleoperation.identity import Identity, Peer, Role
 from scan2sim.services.teleoperation.listening import Listener
 from scan2sim.services.teleoperation.membership import Membership
-from scan2sim.services.teleoperation.messages import Key, Kind, Malformed, Message, Report, Streams, Telemetry, Wanted
+from scan2sim.services.teleoperation.messages import (
+    Key,
+    Kind,
+    Lacking,
+    Malformed,
+    Message,
+    Report,
+    Streams,
+    Telemetry,
+    Wanted,
+)
 from scan2sim.services.teleoperation.rates import Rates
 from scan2sim.services.teleoperation.watching import Frame, Watcher
 from scan2sim.services.teleoperation.wheel import Wheel
@@ -35,6 +46,8 @@ RATE = 50.0
 """Commands a second."""
 REPORTS = 1.0
 """Seconds between two reports of how the video comes."""
+TRIP = 0.1
+"""Seconds to the vehicle and back, while nothing is known of it."""
 
 
 class Joined:
@@ -55,7 +68,7 @@ class Joined:
         self.malformed = 0
         self.reports: tuple[Report, ...] = ()
         self.rates = Rates()
-        self.watcher = Watcher(frame=show, want=self.want, age=self.age)
+        self.watcher = Watcher(frame=show, want=self.want, age=self.age, ask=self._ask, trip=self._trip)
         self._listener = listener
         self.bundle: Bundle = listener.expect(vehicle, received=self._received, media=self.watcher.feed)
 
@@ -66,6 +79,14 @@ class Joined:
     def want(self, camera: int) -> None:
         """Ask for a key frame of a camera."""
         self.bundle.send(Kind.WANTED, Wanted(camera).pack())
+
+    def _ask(self, source: int, sequences: Sequence[int]) -> None:
+        self.bundle.send(Kind.LACKING, Lacking(source, tuple(sequences)).pack())
+
+    def _trip(self) -> float:
+        """Seconds to the vehicle and back."""
+        found = self.bundle.round_trip
+        return TRIP if math.isnan(found) else found
 
     def report(self) -> None:
         """Tell how the video comes."""

@@ -31,7 +31,8 @@ class Coder:
 
     Attributes:
         size: width and height of what was sent last.
-        counts: `pictures` that came, `skipped` for the rate, `frames`, `keys`, `packets`, `bytes`, `encoders` made.
+        counts: `pictures` that came, `skipped` for the rate, `frames`, `keys`, `packets`, `bytes`, `encoders` made;
+            packets that were sent `again`.
     """
 
     def __init__(self, camera: int, keys: Keys, backend: video.Backend) -> None:
@@ -49,6 +50,12 @@ class Coder:
     def want_key(self) -> None:
         """The next frame be a key frame, if the last one is some time ago. May be called in any thread."""
         self._wanted = True
+
+    def again(self, source: int, sequences: Sequence[int]) -> list[bytes]:
+        """Packets that didn't come, as far as they are still kept. May be called in one other thread."""
+        packets = self._sealer.again(source, sequences)
+        self.counts["again"] += len(packets)
+        return packets
 
     def code(self, picture: Picture, plan: Plan, now: float) -> list[bytes]:
         """Packets of a picture; none: the plan wants fewer pictures. `now`: the clock of `Keys`."""

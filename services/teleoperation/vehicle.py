@@ -32,15 +32,17 @@ TOLD = 0.5
 class Sent:
     """A camera's video on its way to a station; see `car.Sender`."""
 
-    def __init__(self, number: int, camera: Camera, keys: Keys, send: Callable[[bytes], None], bounds: Bounds) -> None:
-        """Begins at once; `send` is given packets, in the camera's thread."""
+    def __init__(
+        self, number: int, camera: Camera, keys: Keys, bundle: Bundle, policy: Policy, bounds: Bounds
+    ) -> None:
+        """Begins at once."""
         self._coder = Coder(number, keys, video.find())
         self._adapting = Adapting(bounds, Plan(min(Plan().bitrate, bounds.highest)))
-        self._camera = camera
+        self._camera, self._bundle = camera, bundle
 
         def sent(packets: Sequence[bytes]) -> None:
             for packet in packets:
-                send(packet)
+                bundle.send_media(packet, policy)
 
         self._streamer = Streamer(number, camera, self._coder, sent, self._adapting.plan)
 
@@ -57,6 +59,11 @@ class Sent:
     def want_key(self) -> None:
         """Send a key frame next."""
         self._coder.want_key()
+
+    def send_again(self, source: int, sequences: Sequence[int]) -> None:
+        """Send packets again that didn't come, over all links."""
+        for packet in self._coder.again(source, sequences):
+            self._bundle.send_media(packet)
 
     def adapt(self, report: Report) -> None:
         """Follow what the links carry."""
@@ -147,12 +154,9 @@ class Vehicle:
 
         def dialled(received: Callable[[Message], None], began: Callable[[], None]) -> Bundle:
             bundle = dial(self._identity, station, self._links, addresses, received=received, began=began)
-
-            def send(packet: bytes) -> None:
-                bundle.send_media(packet, self._policy)
-
             self._sent = [
-                Sent(number, camera, keys, send, self._bounds) for number, camera in enumerate(self._cameras.values())
+                Sent(number, camera, keys, bundle, self._policy, self._bounds)
+                for number, camera in enumerate(self._cameras.values())
             ]
             with self._lock:
                 self._driving, self._bundle, self._keys = driving, bundle, keys

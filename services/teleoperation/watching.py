@@ -1,7 +1,7 @@
 """Encrypted packets to frames in their order: each is given out as soon as it and its predecessors are whole.
 
 Packets of several links come in any order, some twice. One that lacks is waited for as long as such have come late
-lately; then what follows is left out up to the next key frame, which is wanted at once.
+lately, then asked for again. Where that brings nothing, either, what follows is left out up to the next key frame.
 """
 
 from __future__ import annotations
@@ -10,7 +10,8 @@ import statistics
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 from scan2sim.services.teleoperation import rtp
@@ -18,11 +19,15 @@ from scan2sim.services.teleoperation.messages import Key, Malformed, Report
 from scan2sim.services.teleoperation.srtp import Opener
 
 SHORTEST, FIRST, LONGEST = 0.015, 0.04, 0.15
-"""Seconds that a packet is waited for: at least, in the beginning, at most."""
+"""Seconds that a packet is waited for before it is asked for again: at least, in the beginning, at most."""
 FORGETS = 0.98
 """What is left after each frame of how late packets came: half after a second of 30 frames."""
 AGAIN = 0.25
 """Seconds after which a key frame is wanted again: about the time there, to encode it, and back."""
+ASKED, TRIPS = 2, 1.5
+"""Times that a packet is asked for again; round trips (and `SHORTEST`) that each asking is given."""
+MENDABLE = 32
+"""Packets of a camera that may lack at once: of more, a key frame tells sooner."""
 HELD = 1024
 """Packets of a camera that wait for others, at most."""
 
@@ -59,11 +64,13 @@ class Patience:
         self.seconds = max(SHORTEST, self.seconds * FORGETS)
 
 
-class _Gap(NamedTuple):
-    """The packet that is waited for, None: any key frame; `since`: when a later one came."""
+@dataclass(slots=True)
+class _Lack:
+    """A packet that hasn't come; since when a later one has; how often it was asked for again, and when last."""
 
-    sequence: int | None
     since: float
+    times: int = 0
+    asked: float = 0.0
 
 
 class Assembly:
@@ -73,55 +80,81 @@ class Assembly:
 
     Attributes:
         frames, broken: that were given out, and that weren't, by their numbers.
-        received: packets.
+        received: packets; mended: of these, such that came because they were asked for again.
         wants: whether it can't go on without a key frame, and none is coming.
     """
 
-    def __init__(self, patience: Patience) -> None:
-        self.frames = self.broken = self.received = 0
+    def __init__(self, patience: Patience, trip: Callable[[], float]) -> None:
+        """`trip`: seconds there and back, as far as is known."""
+        self.frames = self.broken = self.received = self.mended = 0
         self.wants = False
-        self._patience = patience
+        self._patience, self._trip = patience, trip
+        self._began = 0.0
+        self._lacks: dict[int, _Lack] = {}
         self._held: dict[int, rtp.Packet] = {}
         self._keys: set[int] = set()
         self._next: int | None = None  # what follows the last frame
         self._coming: int | None = None  # where the frame begins that is to be next
         self._number = 0
         self._lowest = self._highest = 0  # sequences of all packets, which go on beyond 16 bits
-        self._gap: _Gap | None = None
 
     def add(self, packet: rtp.Packet, now: float) -> Iterator[list[rtp.Packet]]:
         """Take a packet; gives the frames that are whole by it."""
-        sequence = self._unwrapped(packet.sequence)
+        sequence = self._unwrapped(packet.sequence, now)
         self.received += 1
-        if self._gap and sequence == self._gap.sequence:
-            self._patience.came(now - self._gap.since)
+        if (lack := self._lacks.pop(sequence, None)) is not None:
+            self._came_late(lack, now)
         if self._next is not None and sequence < self._next:
             return
         self._hold(sequence, packet)
         while whole := self._whole():
             yield self._give_out(*whole)
-        if not self.wants:
-            self._wait(now)
+        self._wait(now)
 
-    def _unwrapped(self, sequence: int) -> int:
+    def lacking(self, now: float) -> list[int]:
+        """Packets, by their sequence, to be asked for again now."""
+        asked = []
+        for sequence, lack in self._lacks.items():
+            due = lack.asked + self._mending() if lack.times else lack.since + self._patience.seconds
+            if lack.times < ASKED and now > due:
+                lack.times, lack.asked = lack.times + 1, now
+                asked.append(sequence & 0xFFFF)
+        return asked
+
+    def _mending(self) -> float:
+        """Seconds that a packet which was asked for is given."""
+        return TRIPS * self._trip() + SHORTEST
+
+    def _came_late(self, lack: _Lack, now: float) -> None:
+        if lack.times and now > lack.asked + self._trip() / 2:
+            self.mended += 1
+        else:  # nobody can have heard yet that it lacks
+            self._patience.came(now - lack.since)
+
+    def _unwrapped(self, sequence: int, now: float) -> int:
         if self.received == 0:
             self._lowest = self._highest = sequence
+            self._began = now
         near = self._highest + (sequence - self._highest + 0x8000 & 0xFFFF) - 0x8000
+        if 0 < near - self._highest - 1 <= MENDABLE - len(self._lacks):
+            self._lacks.update((one, _Lack(now)) for one in range(self._highest + 1, near))
         self._lowest, self._highest = min(self._lowest, near), max(self._highest, near)
         return near
 
     @property
     def counts(self) -> Counter[str]:
-        """As numbers by name; `lost`: packets between the first and the last that didn't come."""
+        """As numbers by name; `lost`: packets between the first and the last that didn't come at all."""
         lost = self._highest - self._lowest + 1 - self.received if self.received else 0
-        return Counter(frames=self.frames, broken=self.broken, received=self.received, lost=lost)
+        return Counter(
+            frames=self.frames, broken=self.broken, received=self.received, lost=lost, mended=self.mended
+        )
 
     def _hold(self, sequence: int, packet: rtp.Packet) -> None:
         self._held[sequence] = packet
         if packet.key:
             self._keys.add(sequence)
             if self.wants or self._coming is None:
-                self.wants, self._coming, self._gap = False, sequence, None
+                self.wants, self._coming = False, sequence
         if len(self._held) > HELD:
             self._drop(min(self._held))
 
@@ -158,27 +191,29 @@ class Assembly:
         self._next = self._coming = sequence + len(frame)
         for old in [one for one in self._held if one < self._next]:
             self._drop(old)
+        for old in [one for one in self._lacks if one < self._next]:
+            del self._lacks[old]
         self._patience.pass_by()
         return frame
 
     def _wait(self, now: float) -> None:
         """See which packet lacks, and whether it has been waited for long enough."""
         lacking = self._coming
-        while lacking is not None and lacking in self._held:
+        if lacking is None:  # there was no key frame yet
+            self.wants = now > self._began + self._patience.seconds
+            return
+        while lacking in self._held:
             lacking += 1
-        if lacking is not None and lacking > self._highest:
-            return  # none: the frame's end isn't there yet
-        if self._gap is None or self._gap.sequence != lacking:
-            self._gap = _Gap(lacking, now)
-        elif now > self._gap.since + self._patience.seconds:
-            self.wants = True
+        if lacking <= self._highest:  # else the frame's end isn't there yet
+            lack = self._lacks.get(lacking)
+            self.wants = lack is None or now > lack.since + self._patience.seconds + self._mending()
 
 
 class _View:
     """A camera, as it comes: by one source, and from the next key of the encryption on by another."""
 
-    def __init__(self, camera: int) -> None:
-        self._camera = camera
+    def __init__(self, camera: int, trip: Callable[[], float]) -> None:
+        self._camera, self._trip = camera, trip
         self._patience = Patience()
         self._source, self._past = -1, -1
         self._assemblies: dict[int, Assembly] = {}  # of the source, and of the one that is coming
@@ -196,7 +231,7 @@ class _View:
             return
         if source not in self._assemblies:
             self._close(other for other in self._assemblies if other != self._source)
-            self._assemblies[source] = Assembly(self._patience)
+            self._assemblies[source] = Assembly(self._patience, self._trip)
         for parts in self._assemblies[source].add(packet, now):
             if source != self._source:
                 self._close([self._source])
@@ -221,6 +256,12 @@ class _View:
         self._wanted = now
         return True
 
+    def lacking(self, now: float) -> Iterator[tuple[int, list[int]]]:
+        """Sources, and their packets that are to be asked for again now."""
+        for source, assembly in self._assemblies.items():
+            if asked := assembly.lacking(now):
+                yield source, asked
+
     @property
     def counts(self) -> Counter[str]:
         """Since the beginning."""
@@ -241,8 +282,8 @@ class _View:
         self._told = total
         self._delays.clear()
         self.links.clear()
-        received, lost = (max(0, total[what] - told[what]) for what in ("received", "lost"))
-        return Report(self._camera, received, lost, round(delay, 1), links)
+        received, lost, mended = (total[what] - told[what] for what in ("received", "lost", "mended"))
+        return Report(self._camera, max(0, received - mended), max(0, lost + mended), round(delay, 1), links)
 
 
 class Watcher:
@@ -257,6 +298,8 @@ class Watcher:
         frame: Callable[[Frame], None],
         want: Callable[[int], None],
         age: Callable[[int], float],
+        ask: Callable[[int, Sequence[int]], None],
+        trip: Callable[[], float],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Of what is called in the thread that feeds it, and returns at once.
@@ -265,9 +308,12 @@ class Watcher:
             frame: is given each frame.
             want: is given the number of a camera of which a key frame is wanted.
             age: milliseconds since a moment of the vehicle's monotonic clock, in nanoseconds.
+            ask: is given a source, and its packets that are to be sent again.
+            trip: seconds there and back, as far as is known.
             clock: seconds.
         """
         self._frame, self._want, self._age, self._clock = frame, want, age, clock
+        self._ask, self._trip = ask, trip
         self._opener = Opener()
         self._views: dict[int, _View] = {}
         self._reported = clock()
@@ -279,7 +325,7 @@ class Watcher:
         return self._opener.counts
 
     def frames(self) -> dict[int, Counter[str]]:
-        """By camera: `frames` that were given out, `broken` ones that weren't, packets `received` and `lost`."""
+        """By camera: `frames` that were given out, `broken` ones that weren't, packets `received`, `mended`, `lost`."""
         with self._lock:
             return {camera: view.counts for camera, view in self._views.items()}
 
@@ -303,13 +349,15 @@ class Watcher:
         try:
             packet = rtp.parse(plain)
             camera = packet.source & 0xFF
-            view = self._views.get(camera) or self._views.setdefault(camera, _View(camera))
+            view = self._views.get(camera) or self._views.setdefault(camera, _View(camera, self._trip))
             for frame in view.add(packet, now):
                 view.delayed(self._age(frame.captured))
                 self._frame(frame)
         except Malformed:
             self._opener.counts["malformed"] += 1
             return
+        for source, asked in view.lacking(now):
+            self._ask(source, asked)
         if view.wants(now):
             self._want(camera)
 

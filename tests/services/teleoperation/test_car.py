@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -28,6 +28,7 @@ from scan2sim.services.teleoperation.interface import Answer
 from scan2sim.services.teleoperation.messages import (
     Command,
     Kind,
+    Lacking,
     Message,
     Report,
     Stream,
@@ -84,9 +85,13 @@ class FakeCamera:
     fault: str = ""
     keys: int = 0
     reports: list[Report] = field(default_factory=list)
+    again: list[tuple[int, ...]] = field(default_factory=list)
 
     def want_key(self) -> None:
         self.keys += 1
+
+    def send_again(self, source: int, sequences: Sequence[int]) -> None:
+        self.again.append((source, *sequences))
 
     def adapt(self, report: Report) -> None:
         self.reports.append(report)
@@ -241,19 +246,25 @@ def test_cameras_hear_what_is_theirs_and_their_faults_are_told() -> None:
     desk.car.join(desk.session, desk.bundle, cameras)
     desk.look()
     report = Report(1, 10, 0, 20.0, {})
-    for kind, body in ((Kind.WANTED, Wanted(0).pack()), (Kind.WANTED, Wanted(9).pack()), (Kind.REPORT, report.pack())):
+    for kind, body in (
+        (Kind.WANTED, Wanted(0).pack()),
+        (Kind.WANTED, Wanted(9).pack()),
+        (Kind.REPORT, report.pack()),
+        (Kind.LACKING, Lacking(7 << 8 | 1, (5, 65_535)).pack()),
+    ):
         desk.car.hear(desk.session, Message(kind, 1, 0, body), 0)
     desk.car.hear(object(), Message(Kind.WANTED, 1, 0, Wanted(0).pack()), 0)
     assert (cameras[0].keys, cameras[1].reports) == (1, [report])
+    assert (cameras[0].again, cameras[1].again) == ([], [(7 << 8 | 1, 5, 65_535)])
     assert desk.telemetry().vehicle.faults == ("the camera back: unplugged",)
     assert desk.car.streams() == Streams((cameras[0].stream, cameras[1].stream))
 
 
 def test_what_is_no_message_is_counted() -> None:
     desk = Desk()
-    for kind in (Kind.COMMAND, Kind.WANTED, Kind.REPORT):
+    for kind in (Kind.COMMAND, Kind.WANTED, Kind.REPORT, Kind.LACKING):
         desk.car.hear(desk.session, Message(kind, 1, 0, b"rubbish"), 0)
-    assert desk.telemetry().dropped == {MALFORMED: 3}
+    assert desk.telemetry().dropped == {MALFORMED: 4}
 
 
 def test_a_telemetry_fits_into_a_packet_however_many_faults_there_are() -> None:

@@ -32,6 +32,8 @@ def test_cameras_are_sent_side_by_side() -> None:
         lambda frame: frames.setdefault(frame.camera, []).append(frame),
         lambda camera: None,
         lambda sent: (time.monotonic_ns() - sent) / 1e6,
+        lambda source, sequences: None,
+        lambda: 0.1,
     )
     for key in keys.told(time.monotonic()):
         watcher.learn(key)

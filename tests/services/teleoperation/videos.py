@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import cv2
 import numpy as np
@@ -17,6 +17,8 @@ from scan2sim.services.teleoperation.watching import Frame, Watcher
 
 STEP = 33_333_333
 """Nanoseconds between pictures."""
+TRIP = 0.09
+"""Seconds there and back."""
 Link = Callable[[list[bytes]], Iterable[bytes]]
 """What comes of packets that are sent."""
 
@@ -38,10 +40,11 @@ class Drive:
 
     Attributes:
         frames: that were given out; `pictures`: that were sent, by their time.
-        wanted: times at which key frames were.
+        wanted: times at which key frames were; `asked`: times at which packets were asked for again.
     """
 
-    def __init__(self, every: float = 1e9, plan: Plan | None = None) -> None:
+    def __init__(self, every: float = 1e9, plan: Plan | None = None, mends: bool = False) -> None:
+        """`mends`: packets that are asked for are sent again."""
         self.now = 0.0
         self.keys = Keys(self.now, every)
         self.coder = Coder(3, self.keys, video.find("pyav"))
@@ -50,13 +53,25 @@ class Drive:
         self.wanted: list[float] = []
         self.pictures: dict[int, U8] = {}
         self.watcher = Watcher(
-            self.frames.append, self._want, lambda sent: self.now * 1e3 - sent / 1e6, lambda: self.now
+            self.frames.append,
+            self._want,
+            lambda sent: self.now * 1e3 - sent / 1e6,
+            self._ask,
+            lambda: TRIP,
+            lambda: self.now,
         )
+        self.asked: list[float] = []
+        self._mends, self._again = mends, list[tuple[float, list[bytes]]]()
 
     def _want(self, camera: int) -> None:
         assert camera == 3
         self.wanted.append(self.now)
         self.coder.want_key()
+
+    def _ask(self, source: int, sequences: Sequence[int]) -> None:
+        self.asked.append(self.now)
+        if self._mends:
+            self._again.append((self.now + TRIP, self.coder.again(source, sequences)))
 
     def send(self, pictures: Iterable[Picture], link: Link = lambda packets: packets, name: str = "lte") -> None:
         """All pictures, one after the other."""
@@ -65,7 +80,10 @@ class Drive:
             for key in self.keys.told(self.now):
                 self.watcher.learn(key)
             self.pictures[picture.captured] = picture.image
-            for packet in link(self.coder.code(picture, self.plan, self.now)):
+            packets = self.coder.code(picture, self.plan, self.now)
+            while self._again and self._again[0][0] <= self.now:
+                packets = [*self._again.pop(0)[1], *packets]
+            for packet in link(packets):
                 self.watcher.feed(packet, name)
 
     def decoded(self) -> list[tuple[Frame, U8]]:
