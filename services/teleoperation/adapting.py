@@ -1,10 +1,12 @@
 """How a camera's video follows what the links carry: additive increase, multiplicative decrease, report by report.
 
-Late is as bad as lost: a queue that grows somewhere on the way shows in the delay before anything is dropped.
+Late is as bad as lost: a queue that grows somewhere on the way shows in the delay before anything is dropped. Until
+that happens for the first time, the rate grows by half each report, as TCP's does in its slow start.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from typing import NamedTuple
 
@@ -21,6 +23,10 @@ REST = 1
 """Reports after a decrease that tell of what was before it."""
 INCREASE, SHARE = 10_000, 0.05
 """Bits a second that are added, and the part of what is sent, so that few bits don't fill a narrow link in a second."""
+START = 1.5
+"""Times what is sent, in place of that, until a link was full for the first time."""
+STEP = 1.15
+"""From one bit rate that is planned to the next: another means another encoder, and a key frame."""
 BITS = 0.05
 """A pixel's, with fewer of which a smaller picture, or fewer of them, show more."""
 LADDER = ((1.0, 1.0), (1.0, 2 / 3), (0.75, 2 / 3), (0.5, 2 / 3))
@@ -61,18 +67,28 @@ class Adapting:
         """`start`: at best so many pictures a second."""
         self.plan = start
         self._bounds, self._fps = bounds, start.fps
+        self._bitrate, self._filled = float(start.bitrate), False
         self._delays: deque[float] = deque(maxlen=REPORTS)
         self._rung = self._rests = 0
 
     def follow(self, report: Report, width: int, height: int) -> Plan:
         """What is best after a report, for a camera of so many pixels."""
-        bitrate = self._bitrate(report)
+        carried = self._carried(report)
+        if carried == self._bitrate:
+            return self.plan
+        self._bitrate, bitrate = carried, self._stepped(carried)
         self._climb(bitrate, width * height * self._fps)
         scale, part = LADDER[self._rung]
         self.plan = Plan(bitrate, self._fps * part, scale)
         return self.plan
 
-    def _bitrate(self, report: Report) -> int:
+    def _stepped(self, bitrate: float) -> int:
+        """The next bit rate that is below the highest by whole steps."""
+        steps = math.ceil(math.log(self._bounds.highest / bitrate, STEP) - 1e-9)
+        return max(self._bounds.lowest, round(self._bounds.highest / STEP**steps))
+
+    def _carried(self, report: Report) -> float:
+        """What links carry of this camera's, as a report tells."""
         sent = report.received + report.lost
         loss = report.lost / sent if sent else 0.0
         grown = 0.0
@@ -82,11 +98,12 @@ class Adapting:
         if self._rests:
             self._rests -= 1
         elif loss > LOSSY or grown > GROWN:
-            self._rests = REST
-            return max(self._bounds.lowest, round(DECREASE * self.plan.bitrate))
+            self._rests, self._filled = REST, True
+            return max(self._bounds.lowest, DECREASE * self._bitrate)
         elif report.received and loss < LOSSLESS and grown < GROWN / 2:
-            return min(self._bounds.highest, self.plan.bitrate + INCREASE + round(SHARE * self.plan.bitrate))
-        return self.plan.bitrate
+            more = (1 + SHARE) * self._bitrate + INCREASE if self._filled else START * self._bitrate
+            return min(self._bounds.highest, more)
+        return self._bitrate
 
     def _climb(self, bitrate: int, pixels: float) -> None:
         """Down the ladder as far as the bit rate wants, and up again a rung at a time."""

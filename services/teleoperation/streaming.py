@@ -22,8 +22,6 @@ KEY_PAUSE = 150_000_000
 """Nanoseconds between two key frames that are wanted: what was wanted meanwhile, the last may have brought."""
 PAUSE = 0.5
 """Seconds after an encoder failed, until another is tried."""
-DOWN, UP = 0.9, 1.2
-"""An encoder keeps its bit rate while what is planned is between these parts of it: another one costs a key frame."""
 
 
 class Coder:
@@ -89,8 +87,8 @@ class Coder:
     def _encoder_for(self, planes: U8, plan: Plan) -> tuple[video.Encoder, bool]:
         """An encoder for pictures of that size and the plan; whether it is a new one."""
         width, height = planes.shape[1], planes.shape[0] * 2 // 3
-        asked, now = video.Settings(width, height, plan.fps, plan.bitrate), self._settings
-        if self._encoder and now and asked[:3] == now[:3] and DOWN * now.bitrate < plan.bitrate < UP * now.bitrate:
+        asked = video.Settings(width, height, plan.fps, plan.bitrate)
+        if self._encoder and asked == self._settings:
             return self._encoder, False
         self.close()
         self._encoder, self._settings, self.size = self._backend.encoder(asked), asked, (width, height)

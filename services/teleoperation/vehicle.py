@@ -32,9 +32,7 @@ TOLD = 0.5
 class Sent:
     """A camera's video on its way to a station; see `car.Sender`."""
 
-    def __init__(
-        self, number: int, camera: Camera, keys: Keys, bundle: Bundle, policy: Policy, bounds: Bounds
-    ) -> None:
+    def __init__(self, number: int, camera: Camera, keys: Keys, bundle: Bundle, policy: Policy, bounds: Bounds) -> None:
         """Begins at once."""
         self._coder = Coder(number, keys, video.find())
         self._adapting = Adapting(bounds, Plan(min(Plan().bitrate, bounds.highest)))

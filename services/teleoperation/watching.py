@@ -145,9 +145,7 @@ class Assembly:
     def counts(self) -> Counter[str]:
         """As numbers by name; `lost`: packets between the first and the last that didn't come at all."""
         lost = self._highest - self._lowest + 1 - self.received if self.received else 0
-        return Counter(
-            frames=self.frames, broken=self.broken, received=self.received, lost=lost, mended=self.mended
-        )
+        return Counter(frames=self.frames, broken=self.broken, received=self.received, lost=lost, mended=self.mended)
 
     def _hold(self, sequence: int, packet: rtp.Packet) -> None:
         self._held[sequence] = packet

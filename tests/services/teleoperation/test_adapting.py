@@ -18,9 +18,11 @@ class Link:
         rates: (seconds, cameras) bits a second; `delays`: ms of each second.
     """
 
-    def __init__(self, capacity: float, loss: float = 0.0, cameras: int = 4, start: Plan = Plan()) -> None:  # noqa: B008
+    def __init__(
+        self, capacity: float, loss: float = 0.0, starts: tuple[int, ...] = (1_500_000,) * 4, highest: int = 2_500_000
+    ) -> None:
         self.capacity, self.loss = capacity, loss
-        self.cameras = [Adapting(Bounds(), start) for _ in range(cameras)]
+        self.cameras = [Adapting(Bounds(highest=highest), Plan(start)) for start in starts]
         self.queue = 0.0
         self.rates: list[list[int]] = []
         self.delays: list[float] = []
@@ -56,6 +58,23 @@ def test_the_link_is_used_and_its_queue_stays_short(capacity: float) -> None:
     assert max(link.losses[-60:]) == 0.0
 
 
+def test_a_link_that_carries_much_is_used_within_seconds_and_is_not_filled_far_beyond() -> None:
+    wide, narrow = Link(100e6, highest=5_500_000), Link(16e6, highest=5_500_000)
+    wide.run(5)
+    assert wide.rates[-1] == [5_500_000] * 4
+    narrow.run(30)
+    assert max(narrow.delays) < 45 + 350 and max(narrow.losses) == 0.0 and narrow.used(20) > 0.6
+
+
+def test_what_is_planned_goes_in_steps_as_each_costs_a_key_frame() -> None:
+    link = Link(8e6)
+    link.run(120)
+    for camera in range(4):
+        rates = [each[camera] for each in link.rates]
+        steps = [max(a, b) / min(a, b) for a, b in itertools.pairwise(rates) if a != b]
+        assert min(steps) > 1.1 and len(steps) < 120 / 2
+
+
 def test_a_link_that_worsens_is_followed_within_seconds() -> None:
     link = Link(8e6)
     link.run(60)
@@ -70,9 +89,7 @@ def test_a_link_that_worsens_is_followed_within_seconds() -> None:
 
 
 def test_cameras_share_fairly() -> None:
-    link = Link(4e6)
-    link.cameras[0].plan = Plan(2_500_000)
-    link.cameras[1].plan = Plan(150_000)
+    link = Link(4e6, starts=(2_500_000, 150_000, 1_500_000, 1_500_000))
     link.run(180)
     shares = np.mean(link.rates[-60:], axis=0)
     assert shares.max() < 2.5 * shares.min()
