@@ -1,8 +1,8 @@
 """Teleoperation under what the world does to it: delays, losses, cuts, intruders (docs/teleoperation.md).
 
-`python -m bench.teleop [--parts glass,cuts,stops,hostile,join,qos] [--minutes 10]`, as root: it makes networks. It
-takes 25 minutes; `--minutes` is how long links are cut and restored, and all else in proportion. It ends with a line
-`RESULT {json}`.
+`python -m bench.teleop [--parts glass,cuts,stops,hostile,join,qos,route] [--minutes 10] [--world demo-out]`, as root:
+it makes networks. It takes 25 minutes; `--minutes` is how long links are cut and restored, and all else in proportion.
+It ends with a line `RESULT {json}`.
 
 - glass: four cameras over a mobile link of two wires (40 ms one way, 10 ms jitter, 1 % loss): from a picture's taking
   to its being decoded at the station, by the time that is drawn into it.
@@ -11,6 +11,7 @@ takes 25 minutes; `--minutes` is how long links are cut and restored, and all el
 - hostile: intruders, malformed and replayed datagrams, a flood.
 - join: how long it takes to join a vehicle and a station.
 - qos: table 6 of D3.2 on the robot, the edge and the cloud, as `scan2sim teleop measure` tells.
+- route: a drive along the street of a finished world (`make demo`): how far off its way, by what network.
 """
 
 from __future__ import annotations
@@ -22,10 +23,12 @@ import sys
 import time
 import traceback
 from collections.abc import Callable
+from functools import partial
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Any, NamedTuple
 
-from bench import teleop_drives, teleop_hostile, teleop_stops
+from bench import teleop_drives, teleop_hostile, teleop_route, teleop_stops
 
 FULL = 10.0
 """Minutes."""
@@ -39,6 +42,7 @@ class Part(NamedTuple):
     limit: float
 
 
+WORLD = Path("demo-out")
 PARTS = {
     "glass": Part(teleop_drives.glass, ("glass_to_glass_p95_ms",), 150),
     "cuts": Part(teleop_drives.cuts, ("command_gap_max_ms", "lost_frames_ratio"), 840),
@@ -46,16 +50,17 @@ PARTS = {
     "hostile": Part(teleop_hostile.hostile, ("intruders_in", "memory_growth"), 240),
     "join": Part(teleop_drives.join, ("join_s",), 120),
     "qos": Part(teleop_drives.qos, ("qos",), 330),
+    "route": Part(partial(teleop_route.route, WORLD), ("off_way_m",), 180),
 }
 LEAST = 150.0
 """Seconds that each part may take, however short it is."""
 
 
-def done(name: str, scale: float) -> dict[str, Any]:
+def done(name: str, part: Part, scale: float) -> dict[str, Any]:
     """A part, in a process of its own, which is ended at its limit; what it didn't give is None."""
-    part, spawn = PARTS[name], multiprocessing.get_context("spawn")
+    spawn = multiprocessing.get_context("spawn")
     here, there = spawn.Pipe(duplex=False)
-    process = spawn.Process(target=_run, args=(name, scale, there))
+    process = spawn.Process(target=_run, args=(part, scale, there))
     began = time.monotonic()
     process.start()
     there.close()
@@ -74,9 +79,9 @@ def done(name: str, scale: float) -> dict[str, Any]:
     return {key: found.get(key) for key in part.gives}
 
 
-def _run(name: str, scale: float, pipe: Connection) -> None:
+def _run(part: Part, scale: float, pipe: Connection) -> None:
     try:
-        pipe.send(PARTS[name].do(scale, lambda text: print(f"  {text}", flush=True)))
+        pipe.send(part.do(scale, lambda text: print(f"  {text}", flush=True)))
     except Exception:  # whatever it is, other parts go on
         traceback.print_exc()
     finally:
@@ -88,13 +93,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--parts", default=",".join(PARTS), help="of them, with commas between")
     parser.add_argument("--minutes", type=float, default=FULL, help="that links are cut and restored")
+    parser.add_argument("--world", type=Path, default=WORLD, help="whose street is driven along")
     given = parser.parse_args()
+    parts = PARTS | {"route": PARTS["route"]._replace(do=partial(teleop_route.route, given.world))}
     chosen = given.parts.split(",")
     if unknown := set(chosen) - set(PARTS):
         parser.error(f"no such parts: {', '.join(sorted(unknown))}")
     result: dict[str, Any] = {key: None for part in PARTS.values() for key in part.gives}
     for name in chosen:
-        result |= done(name, given.minutes / FULL)
+        result |= done(name, parts[name], given.minutes / FULL)
     print("RESULT", json.dumps(result))
     sys.exit(any(result[key] is None for name in chosen for key in PARTS[name].gives))
 

@@ -153,6 +153,10 @@ def teleop_measure(params: MeasureParams) -> None:
         f"95 % within {percentile(times, 95):.0f} ms; {measured.lost_frames:.2%} were lost"
     )
     _say(f"the longest time without a command was {measured.command_gap:.0f} ms")
+    if off := measured.aside:
+        mean, most = sum(off) / len(off), percentile(off, 95)
+        runs = measured.vehicle["runs"]
+        _say(f"driven {runs} times along the street, {mean:.2f} m off the way on average, 95 % within {most:.2f} m")
     for name, metrics in (("service", NETWORK), ("machine", MACHINE)):
         _say(f"{name}: {'passed' if passed(found, metrics) else 'FAILED'}")
 

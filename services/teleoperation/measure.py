@@ -32,6 +32,7 @@ from scan2sim.services.qos.shape import Shape
 from scan2sim.services.teleoperation import scripted
 from scan2sim.services.teleoperation.authority import certify
 from scan2sim.services.teleoperation.messages import Kind
+from scan2sim.services.teleoperation.route import aside
 from scan2sim.services.teleoperation.scripted import HEIGHT, WIDTH, Setup
 from scan2sim.services.teleoperation.settings import MeasureParams
 
@@ -111,6 +112,12 @@ class Measured:
         """Share of the frames that weren't shown."""
         shown, broken = self.station["frames"].get("frames", 0), self.station["frames"].get("broken", 0)
         return float(broken / max(shown + broken, 1))
+
+    @property
+    def aside(self) -> list[float]:
+        """How far off its way along a street the vehicle was, m, every 0.1 m of it; nothing: it drove on a plain."""
+        way = np.array(self.vehicle["way"])
+        return np.abs(aside(way, self.vehicle["driven"])).tolist() if len(way) else []
 
     @property
     def command_gap(self) -> float:
@@ -319,7 +326,8 @@ def planned(params: MeasureParams, required: Requirements, rate: float | None) -
     elif asked:
         bitrate = MORE * asked * 1e6 / params.cameras
     share = rate is not None and WIRED * bitrate * params.cameras > FREE * rate
-    return Setup("", "", cameras=params.cameras, bitrate=bitrate, share=share)
+    world = "" if params.world is None else str(params.world)
+    return Setup("", "", cameras=params.cameras, bitrate=bitrate, share=share, world=world)
 
 
 def film(folder: Path) -> Path:

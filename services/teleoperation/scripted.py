@@ -20,7 +20,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from scan2sim.pipeline.errors import StepError
-from scan2sim.services.teleoperation import cameras, marks
+from scan2sim.pipeline.io.scene import read_scene
+from scan2sim.pipeline.types import F64
+from scan2sim.services.teleoperation import cameras, marks, route
 from scan2sim.services.teleoperation.adapting import Bounds
 from scan2sim.services.teleoperation.bundle import Bundle, Policy
 from scan2sim.services.teleoperation.cameras import Camera, View
@@ -35,8 +37,9 @@ from scan2sim.services.teleoperation.identity import Identity, Peer
 from scan2sim.services.teleoperation.listening import Listener
 from scan2sim.services.teleoperation.membership import Membership
 from scan2sim.services.teleoperation.messages import Command, Kind, Message, Telemetry
+from scan2sim.services.teleoperation.route import Driven, Pursuit
 from scan2sim.services.teleoperation.safety import LIMIT_MS
-from scan2sim.services.teleoperation.simulated import LONGEST_STEP, Bicycle
+from scan2sim.services.teleoperation.simulated import LONGEST_STEP, Bicycle, Ground
 from scan2sim.services.teleoperation.station import Joined, Station
 from scan2sim.services.teleoperation.translating import TranslateParams, Translating
 from scan2sim.services.teleoperation.vehicle import Vehicle
@@ -70,6 +73,7 @@ class Setup:
         share: video takes the links in turn.
         pictures: folder of what cameras show; "": the pattern.
         limit: ms, see `safety`.
+        world: folder of a finished world, along whose street is driven (`route`); "": bends, on a plain.
     """
 
     folder: str
@@ -82,6 +86,13 @@ class Setup:
     share: bool = False
     pictures: str = ""
     limit: float = LIMIT_MS
+    world: str = ""
+
+    def street(self) -> tuple[Ground, F64]:
+        """What its car stands on, and the way along it."""
+        scene = read_scene(Path(self.world))
+        ground = Ground(scene)
+        return ground, route.way(scene, ground)
 
 
 def now() -> int:
@@ -212,10 +223,20 @@ class Glass:
                 self.times.append((camera, drawn, now()))
 
 
-class Route:
-    """What a script asks for: bends to both sides at a steady speed; it confirms stops once it has seen them."""
+Steering = Callable[[VehicleState, float], float]
+"""Of a vehicle that tells so, at a moment (seconds): -1 (full right) to 1 (full left)."""
 
-    def __init__(self) -> None:
+
+def bends(vehicle: VehicleState, seconds: float) -> float:
+    """To both sides in turn, wherever it is."""
+    return BEND * math.sin(math.tau * seconds / ROUND)
+
+
+class Route:
+    """What a script asks for: a steady speed, and steering; it confirms stops once it has seen them."""
+
+    def __init__(self, steering: Steering = bends) -> None:
+        self._steering = steering
         self._stop, self._since = -1, 0.0
 
     def command(self, told: Telemetry, seconds: float) -> Command:
@@ -226,7 +247,7 @@ class Route:
             return Command(Controls(gear=Gear.FORWARD), told.stop, seconds > self._since + SEEN)
         lacks = SPEED - told.vehicle.speed
         controls = Controls(
-            steering=BEND * math.sin(math.tau * seconds / ROUND),
+            steering=self._steering(told.vehicle, seconds),
             throttle=min(max(0.5 * lacks, 0.0), 1.0),
             brake=min(max(-0.2 * lacks, 0.0), 0.5),
             gear=Gear.FORWARD,
@@ -237,9 +258,9 @@ class Route:
 class Script(threading.Thread):
     """Drives a station's vehicle along a route."""
 
-    def __init__(self, station: Station) -> None:
+    def __init__(self, station: Station, steering: Steering) -> None:
         super().__init__(name="driver", daemon=True)
-        self._station, self._route, self._ended = station, Route(), threading.Event()
+        self._station, self._route, self._ended = station, Route(steering), threading.Event()
 
     def run(self) -> None:
         """Until `close`."""
@@ -257,11 +278,15 @@ class Script(threading.Thread):
 
 
 class VehicleEnd:
-    """A vehicle on a plain, its translator and its cameras."""
+    """A vehicle on a plain, or in a world, its translator and its cameras."""
 
     def __init__(self, setup: Setup) -> None:
         identity, heard, ended = Identity.read(Path(setup.folder)), Heard(), threading.Event()
-        translating = Translating(Plain(), TranslateParams(port=0, limit=setup.limit))
+        self._driven: Driven | None = None
+        if setup.world:
+            ground, self._way = setup.street()
+            self._driven = Driven(ground, self._way)
+        translating = Translating(self._driven or Plain(), TranslateParams(port=0, limit=setup.limit))
         threading.Thread(target=translating.run, args=(ended,), name="translating", daemon=True).start()
         host, port = translating.address
         self._unit = HearingUnit(CarParams(translator=f"{host}:{port}", limit=setup.limit), heard)
@@ -275,10 +300,12 @@ class VehicleEnd:
     def begin(self) -> bool:
         """Note from now on."""
         self._heard.begin()
+        if self._driven is not None:
+            self._driven.begin()
         return True
 
     def told(self) -> dict[str, Any]:
-        """What came, and what didn't go well."""
+        """What came, and what didn't go well; where it was, and was to be."""
         bundle, safety = self._unit.bundle, self._unit.car.safety
         return {
             "messages": self._heard.times(),
@@ -286,6 +313,9 @@ class VehicleEnd:
             "dropped": dict(safety.dropped),
             "stop": safety.stop,
             "faults": self._unit.car.telemetry(now()).vehicle.faults,
+            "way": [] if self._driven is None else self._way.tolist(),
+            "driven": [] if self._driven is None else list(self._driven.places),
+            "runs": 0 if self._driven is None else self._driven.runs,
         }
 
 
@@ -306,6 +336,7 @@ class StationEnd:
         reached = [Address(host=host, port=port) for host, port in self._listener.addresses]
         self._station = Station(desk, self._listener, reached, self._glass.show)
         self._script: Script | None = None
+        self._steering = _along(setup) if setup.world else bends
         self._before: dict[int, Counter[str]] = {}
         Membership(desk, Address(host=setup.host, port=self.gateway.port), self._station, _say)
 
@@ -339,7 +370,7 @@ class StationEnd:
 
     def drive(self) -> bool:
         """Begin to drive."""
-        self._script = Script(self._station)
+        self._script = Script(self._station, self._steering)
         self._script.start()
         _until(lambda: (told := self._joined().telemetry) is not None and not told.standing, "driving")
         return True
@@ -378,6 +409,12 @@ class StationEnd:
 
     def _joined(self) -> Joined:
         return _until(self._station.joined, "a vehicle")
+
+
+def _along(setup: Setup) -> Steering:
+    ground, way = setup.street()
+    pursuit = Pursuit(way, ground.car)
+    return lambda vehicle, seconds: pursuit.steering(vehicle)
 
 
 def _cameras(setup: Setup) -> dict[str, Camera]:

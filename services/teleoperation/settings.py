@@ -127,3 +127,7 @@ class MeasureParams(Params):
     network: Annotated[
         File | None, Field(description="TOML of a network, in place of what the environment's is assumed to be.")
     ] = None
+    world: Annotated[
+        File | None,
+        Field(description="Folder of a finished world, along whose street is driven; default: bends on a plain."),
+    ] = None
