@@ -1,14 +1,15 @@
 """Teleoperation under what the world does to it: delays, losses, cuts, intruders (docs/teleoperation.md).
 
-`python -m bench.teleop [--parts glass,cuts,stops,hostile,join,qos,route] [--minutes 10] [--world demo-out]`, as root:
-it makes networks. It takes 25 minutes; `--minutes` is how long links are cut and restored, and all else in proportion.
-It ends with a line `RESULT {json}`.
+`python -m bench.teleop [--parts glass,cuts,stops,clocks,hostile,join,qos,route] [--minutes 10] [--world demo-out]`, as
+root: it makes networks. It takes 25 minutes; `--minutes` is how long links are cut and restored, and all else in
+proportion. It ends with a line `RESULT {json}`.
 
 - glass: four cameras over a mobile link of two wires (40 ms one way, 10 ms jitter, 1 % loss): from a picture's taking
   to its being decoded at the station, by the time that is drawn into it.
 - cuts: one of two such links is cut, restored, degraded at random; lost frames against those of a single link.
 - stops: all links of a vehicle are cut, a thousand times: when its translator brakes.
-- hostile: intruders, malformed and replayed datagrams, a flood.
+- clocks: a wall clock is wrong by 10 s: whether both sides notice before anybody drives.
+- hostile: intruders, malformed and replayed datagrams, video sent once more by others, a flood.
 - join: how long it takes to join a vehicle and a station.
 - qos: table 6 of D3.2 on the robot, the edge and the cloud, as `scan2sim teleop measure` tells.
 - route: a drive along the street of a finished world (`make demo`): how far off its way, by what network.
@@ -47,7 +48,8 @@ PARTS = {
     "glass": Part(teleop_drives.glass, ("glass_to_glass_p95_ms",), 150),
     "cuts": Part(teleop_drives.cuts, ("command_gap_max_ms", "lost_frames_ratio"), 840),
     "stops": Part(teleop_stops.stops, ("stops", "stops_in_time"), 420),
-    "hostile": Part(teleop_hostile.hostile, ("intruders_in", "memory_growth"), 240),
+    "clocks": Part(teleop_stops.clocks, ("wrong_clocks", "wrong_clocks_noticed"), 60),
+    "hostile": Part(teleop_hostile.hostile, ("intruders_in", "replayed_shown", "memory_growth"), 240),
     "join": Part(teleop_drives.join, ("join_s",), 120),
     "qos": Part(teleop_drives.qos, ("qos",), 330),
     "route": Part(partial(teleop_route.route, WORLD), ("off_way_m",), 180),

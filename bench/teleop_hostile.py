@@ -1,13 +1,17 @@
 """Who isn't wanted (part of `bench.teleop`): intruders, malformed and replayed datagrams, a flood; a pair drives on.
 
+The pair's video is SRTP as in earnest; what is sent once more by others is to be shown by nobody.
+
 `python -m bench.teleop_hostile HOST PORT RATE SECONDS` is the flood: datagrams that may begin handshakes, and others.
 """
 
 from __future__ import annotations
 
+import itertools
 import os
 import random
 import socket
+import struct
 import subprocess
 import sys
 import tempfile
@@ -30,7 +34,9 @@ from scan2sim.services.teleoperation.listening import Listener
 from scan2sim.services.teleoperation.measure import delays, gap, missing, percentile
 from scan2sim.services.teleoperation.messages import Kind
 from scan2sim.services.teleoperation.scripted import Heard
+from scan2sim.services.teleoperation.srtp import Keys, Sealer
 from scan2sim.services.teleoperation.stream import Client, Stream
+from scan2sim.services.teleoperation.watching import Watcher
 from tests.services.teleoperation.parties import OTHER, OWN, identity
 from tests.services.teleoperation.relay import Relay
 
@@ -45,6 +51,8 @@ WARM = 0.2
 """Of the datagrams, after which memory is looked at first: caches are full by then."""
 GAP = 100.0
 """Milliseconds between two commands that are allowed."""
+PICTURE = struct.pack("<3s3sHH", b"\x10\0\0", b"\x9d\x01\x2a", 640, 480) + bytes(1100)
+"""A key frame of VP8, as far as anybody looks who doesn't decode it; one packet."""
 TIMES = 10
 """Of the pair's own rate that the flood is."""
 
@@ -80,20 +88,37 @@ class Attacked:
         self.relay = Relay((HERE, self.listener.port))
         self.relay.recording = True
         self.commands, self.telemetry = Heard(), Heard()
+        self.sent, self.shown = 0, list[int]()
+        self._keys = Keys(time.monotonic())
+        self._sealer = Sealer(self._keys, 0)
+        self._sealer.renew(time.monotonic())
+        self.watcher = Watcher(
+            lambda frame: self.shown.append(frame.captured), lambda _: None, lambda _: 0.0, lambda *_: None, lambda: 0.1
+        )
+        for key in self._keys.told(time.monotonic()):
+            self.watcher.learn(key)
         nothing = lambda message: None  # noqa: E731
-        self.station = self.listener.expect(self.car.me, self.telemetry.hearing(nothing))
+        self.station = self.listener.expect(self.car.me, self.telemetry.hearing(nothing), self.watcher.feed)
         self.vehicle = dial(
             self.car, self.desk.me, LINKS, [self.relay.address], received=self.commands.hearing(nothing)
         )
         if not _until(lambda: up(self.station) == up(self.vehicle) == len(LINKS)):
             raise TimeoutError("a pair doesn't come together")
         self.own = list(self.relay._out.values())  # what is sent by these comes from the addresses of its links
-        packet = b"\x80" + bytes(1099)
         self._talks = [
             Every(RATE, lambda: self.station.send(Kind.COMMAND, bytes(18))),
             Every(RATE, lambda: self.vehicle.send(Kind.TELEMETRY, bytes(200))),
-            Every(VIDEO, lambda: self.vehicle.send_media(packet)),
+            Every(VIDEO, self._film),
         ]
+
+    def _film(self) -> None:
+        self.sent += 1
+        for packet in self._sealer.seal(PICTURE, self.sent):
+            self.vehicle.send_media(packet)
+
+    def repeated(self) -> int:
+        """Pictures that were shown twice, or after a later one."""
+        return sum(later <= earlier for earlier, later in itertools.pairwise(self.shown))
 
     def begin(self) -> None:
         """Note from now on."""
@@ -109,7 +134,8 @@ class Attacked:
             f"{what}: {len(came)} commands came, {missing(came) + missing(back)} messages didn't, "
             f"{percentile(delays(came, Kind.COMMAND), 95):.0f} ms p95, longest gap {longest:.0f} ms "
             f"({'within' if longest <= GAP else 'BEYOND'} {GAP:g}); links up {up(self.station)}; "
-            f"dropped {dict(self.listener.counts)} {dict(self.station.counts)}"
+            f"dropped {dict(self.listener.counts)} {dict(self.station.counts)}; of {self.sent} pictures "
+            f"{len(self.shown)} shown, {self.repeated()} once more; dropped {dict(self.watcher.counts)}"
         )
 
     def close(self) -> None:
@@ -240,7 +266,7 @@ def _client(who: Identity, port: int) -> Client:
 
 
 def datagrams(pair: Attacked, count: int, say: Say) -> float:
-    """Malformed, forged and replayed ones, of strangers and of the pair's own addresses.
+    """Malformed, forged and replayed ones, messages and video, of strangers and of the pair's own addresses.
 
     Returns:
         Growth of this process's memory meanwhile, as a share of it.
@@ -321,7 +347,7 @@ def hostile(scale: float, say: Say) -> dict[str, Any]:
         pair.told("in the flood", say)
     finally:
         pair.close()
-    return {"intruders_in": found, "memory_growth": round(grown, 4)}
+    return {"intruders_in": found, "replayed_shown": pair.repeated(), "memory_growth": round(grown, 4)}
 
 
 def _until(true: Callable[[], bool], seconds: float = 20.0) -> bool:

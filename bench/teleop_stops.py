@@ -1,4 +1,4 @@
-"""All links of a vehicle cut, again and again: when its translator brakes (part of `bench.teleop`).
+"""All links of a vehicle cut, again and again: when its translator brakes; clocks that are wrong (of `bench.teleop`).
 
 Many pairs at once, some a process; between vehicle and station is a network in this program, as in the tests.
 """
@@ -16,6 +16,7 @@ from typing import Any
 
 from scan2sim.services.teleoperation.bundle import Bundle
 from scan2sim.services.teleoperation.car import CarParams, CarUnit
+from scan2sim.services.teleoperation.clocks import Clocks
 from scan2sim.services.teleoperation.controls import Controls
 from scan2sim.services.teleoperation.dialling import Link, dial
 from scan2sim.services.teleoperation.identity import Role
@@ -33,6 +34,8 @@ ALLOWED = 50.0
 """Milliseconds beyond the limit."""
 PROCESSES, PAIRS = 2, 4
 """And pairs of each."""
+WRONG, WITHIN = 10.0, 3.0
+"""Seconds that a wall clock is set wrong by; that its driver tries to drive nevertheless."""
 PATIENCE = 20.0
 """Seconds within which a pair is to drive again, and to brake."""
 
@@ -53,9 +56,9 @@ class Braking(Plain):
 
 
 class Stopped:
-    """A pair whose links are cut."""
+    """A pair whose links are cut; `apart`: seconds that the vehicle's and the station's wall clocks are wrong by."""
 
-    def __init__(self, seed: int) -> None:
+    def __init__(self, seed: int, apart: tuple[float, float] = (0.0, 0.0)) -> None:
         self._chance, self._ended, self._told = random.Random(seed), threading.Event(), list[Telemetry]()
         car, desk = identity(Role.VEHICLE, "car"), identity(Role.STATION, "desk")
         self._listener = Listener(desk, [(HOSTS[0], 0)])
@@ -68,10 +71,12 @@ class Stopped:
         host, port = translating.address
         self._unit = CarUnit(CarParams(translator=f"{host}:{port}"))
         links = [Link(host, host) for host in HOSTS]
-        self._bundle = self._listener.expect(car.me, self._received)
+        clocks = [Clocks(wall=partial(_wall, wrong)) for wrong in apart]
+        self._bundle = self._listener.expect(car.me, self._received, clocks=clocks[1])
 
         def dialled(received: Callable[[Message], None], began: Callable[[], None]) -> Bundle:
-            return dial(car, desk.me, links, [self._relay.address], received=received, began=began)
+            remote = [self._relay.address]
+            return dial(car, desk.me, links, remote, received=received, began=began, clocks=clocks[0])
 
         self._unit.join(dialled)
         self._threads = [
@@ -100,6 +105,15 @@ class Stopped:
         stays = not vehicle.drives
         self._cut(False)
         return took if braked and stays else None
+
+    def noticed(self) -> str:
+        """What vehicle and station say of their clocks while a driver tries; nothing: one said nothing, or it drove."""
+        wrong = self._bundle.clocks
+        both = self._until(lambda: wrong.wall_wrong and bool(self._told) and "NTP" in self._told[0].reason)
+        end = time.monotonic() + WITHIN
+        while time.monotonic() < end and not self._vehicle.drives:
+            time.sleep(0.01)
+        return self._told[0].reason if both and not self._vehicle.drives else ""
 
     def close(self) -> None:
         """End."""
@@ -130,6 +144,22 @@ class Stopped:
         while not (found := true()) and time.monotonic() < end:
             time.sleep(0.005)
         return found
+
+
+def _wall(wrong: float) -> int:
+    return time.time_ns() + round(wrong * 1e9)
+
+
+def clocks(scale: float, say: Say) -> dict[str, Any]:
+    """A wall clock of either side is wrong, to either side; a driver tries to drive, and both are to notice before."""
+    tries, noticed = [(wrong, side) for wrong in (WRONG, -WRONG) for side in ("vehicle", "station")], 0
+    for wrong, side in tries:
+        pair = Stopped(1, (wrong, 0.0) if side == "vehicle" else (0.0, wrong))
+        told = pair.noticed()
+        pair.close()
+        noticed += bool(told)
+        say(f"the {side}'s clock {wrong:+.0f} s: {told or 'NOT NOTICED'}")
+    return {"wrong_clocks": len(tries), "wrong_clocks_noticed": noticed}
 
 
 def _pairs(each: int, seed: int, pipe: multiprocessing.connection.Connection) -> None:

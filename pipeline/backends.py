@@ -1,8 +1,9 @@
 """Backends and formats: a file each, found by its name in its package; each says what it needs to run here.
 
 To add one: a file in the package. It has what the package's protocol asks for, and, where that takes more than the
-project's own dependencies, `NEEDS`, their import names. Files are formats by `SUFFIXES`, ends of their names. Where one
-of several is chosen unasked, `RANK` says which are better, and `lacking()` what of the machine isn't there.
+project's own dependencies, `NEEDS`, their import names (`EXTRA`: what brings them, where several extras do). Files are
+formats by `SUFFIXES`, ends of their names. Where one of several is chosen unasked, `RANK` says which are better, and
+`lacking()` what of the machine isn't there.
 """
 
 from __future__ import annotations
@@ -52,8 +53,13 @@ def find(package: str, name: str, setting: str) -> Any:
     if name not in known:
         raise SettingError(setting, f"there is no {name!r}", f"Choose one of: {', '.join(known)}")
     backend = module(package, name)
-    extras.need(f"{setting} {name}", *needs(backend))
+    extras.need(f"{setting} {name}", *needs(backend), extra=_extra(backend))
     return backend
+
+
+def _extra(backend: Any) -> str:
+    named: str = getattr(backend, "EXTRA", "")
+    return named
 
 
 class Lacking(NamedTuple):
@@ -90,7 +96,7 @@ def best(package: str, name: str | None, setting: str, what: str) -> Any:
 def _lacking(backend: Any) -> Lacking | None:
     packages = extras.missing(*needs(backend))
     if packages:
-        error = extras.unavailable(backend.__name__, packages)
+        error = extras.unavailable(backend.__name__, packages, extra=_extra(backend))
         return Lacking(error.cause, error.remedy)
     lacking: Lacking | None = backend.lacking()
     return lacking

@@ -56,24 +56,25 @@ def missing(*packages: str) -> str | None:
     return ", ".join(name for name in packages if importlib.util.find_spec(name) is None) or None
 
 
-def need(what: str, *packages: str, instead: str = "") -> None:
+def need(what: str, *packages: str, instead: str = "", extra: str = "") -> None:
     """Go on only if all packages are installed.
 
     Args:
         what: needs them: a setting, option or command.
         instead: what to do without them, a sentence's second half ("or set ...").
+        extra: that brings them all, where another than `EXTRA_OF` tells is meant.
 
     Raises:
         UnavailableError: some aren't; it names them, and the extra that brings them.
     """
     lacking = missing(*packages)
     if lacking:
-        raise unavailable(what, lacking, instead)
+        raise unavailable(what, lacking, instead, extra)
 
 
-def unavailable(what: str, lacking: str, instead: str = "") -> UnavailableError:
+def unavailable(what: str, lacking: str, instead: str = "", extra: str = "") -> UnavailableError:
     """The error of `need`, for packages as `missing` tells them."""
     names = lacking.split(", ")
-    extras = ",".join(sorted({EXTRA_OF[name] for name in names if name in EXTRA_OF}))
+    extras = extra or ",".join(sorted({EXTRA_OF[name] for name in names if name in EXTRA_OF}))
     install = f"pip install 'scan2sim[{extras}]'" if extras else f"pip install {' '.join(names)}"
     return UnavailableError(what, f"needs {lacking}, not installed here", " ".join(filter(None, [install, instead])))

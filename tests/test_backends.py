@@ -76,7 +76,8 @@ def test_it_has_what_its_protocol_asks(package: ModuleType, name: str) -> None:
 
 @each
 def test_it_says_what_it_needs(package: ModuleType, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    needs = backends.needs(backends.module(package.__name__, name))
+    backend = backends.module(package.__name__, name)
+    needs, meant = backends.needs(backend), getattr(backend, "EXTRA", "")
     core = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
     extras = {EXTRA_OF[package] for package in needs if package in EXTRA_OF}
     assert extras or set(needs) <= {re.split(r"[^\w.-]", line)[0] for line in core}
@@ -87,7 +88,7 @@ def test_it_says_what_it_needs(package: ModuleType, name: str, monkeypatch: pyte
         with pytest.raises(UnavailableError) as caught:
             backends.find(package.__name__, name, "a.setting")
         assert caught.value.where == f"a.setting {name}" and all(n in caught.value.cause for n in needs)
-        assert not extras or caught.value.remedy == f"pip install 'scan2sim[{','.join(sorted(extras))}]'"
+        assert not extras or caught.value.remedy == f"pip install 'scan2sim[{meant or ','.join(sorted(extras))}]'"
 
 
 @pytest.mark.parametrize("package", PROTOCOLS, ids=lambda p: p.__name__)

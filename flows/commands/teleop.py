@@ -45,7 +45,7 @@ def teleop_certificates(
     renew: Annotated[bool, typer.Option("--renew", help="Make those named anew, though they still hold.")] = False,
 ) -> None:
     """Make certificates of a gateway, vehicles and stations, and the authority that signs them, or renew them."""
-    extras.need("teleop", *NEEDED)
+    _need()
     from scan2sim.services.teleoperation.authority import certify
 
     if not (gateway or vehicle or station):
@@ -82,7 +82,7 @@ def teleop_translate(
 @options(GatewayParams, certificates="CERTIFICATES")
 def teleop_gateway(params: GatewayParams) -> None:
     """Be the gateway that vehicles and stations meet at, and serve the fleet's page."""
-    extras.need("teleop", *NEEDED, "fastapi", "uvicorn")
+    _need("fastapi", "uvicorn")
     from scan2sim.services.teleoperation.management import serve
 
     serve(params, _say)
@@ -92,7 +92,7 @@ def teleop_gateway(params: GatewayParams) -> None:
 @options(StationParams, certificates="CERTIFICATES", gateway="GATEWAY")
 def teleop_station(params: StationParams) -> None:
     """Be a station: show what its vehicle's cameras see, and send what its driver asks for."""
-    extras.need("teleop", *NEEDED, "fastapi", "uvicorn")
+    _need("fastapi", "uvicorn")
     from scan2sim.services.teleoperation.cockpit import serve
 
     serve(params, _say)
@@ -102,7 +102,7 @@ def teleop_station(params: StationParams) -> None:
 @options(VehicleParams, certificates="CERTIFICATES", gateway="GATEWAY")
 def teleop_vehicle(params: VehicleParams) -> None:
     """Be a vehicle's car unit: send what its cameras see, and have its translator do what the driver asks for."""
-    extras.need("teleop", *NEEDED, "av")
+    _need("av")
     from scan2sim.services.teleoperation.vehicle import serve
 
     ended = threading.Event()
@@ -117,7 +117,7 @@ def teleop_demo(
     browse: Annotated[bool, typer.Option("--browse/--no-browse", help="Open the driver's page.")] = True,
 ) -> None:
     """Drive a simulated car through a finished world: gateway, vehicle and station on this machine."""
-    extras.need("teleop", *NEEDED, "av", "fastapi", "uvicorn")
+    _need("av", "fastapi", "uvicorn")
     from scan2sim.services.teleoperation.demo import demo
 
     ended = threading.Event()
@@ -133,8 +133,7 @@ def teleop_demo(
 @options(MeasureParams)
 def teleop_measure(params: MeasureParams) -> None:
     """Drive by a script over a network like the environment's, and hold what is measured against D3.2's table 6."""
-    extras.need("teleop", *NEEDED, "av")
-    extras.need("measuring", "psutil")
+    _need("av", "psutil")
     from scan2sim.flows.commands import verdicts
     from scan2sim.services.qos import requirements
     from scan2sim.services.qos.requirements import MACHINE, NETWORK
@@ -159,6 +158,10 @@ def teleop_measure(params: MeasureParams) -> None:
         _say(f"driven {runs} times along the street, {mean:.2f} m off the way on average, 95 % within {most:.2f} m")
     for name, metrics in (("service", NETWORK), ("machine", MACHINE)):
         _say(f"{name}: {'passed' if passed(found, metrics) else 'FAILED'}")
+
+
+def _need(*packages: str) -> None:
+    extras.need("teleop", *NEEDED, *packages, extra="teleop")
 
 
 def _say(text: str) -> None:

@@ -21,7 +21,9 @@ from scan2sim.services.teleoperation.messages import Key
 SECRET = 44
 """Bytes of a key and its salt."""
 EVERY = 120.0
-"""Seconds that a key is used; fewer than 2^15 packets of a camera are sent in that time."""
+"""Seconds that a key is used, at most."""
+READABLE = 0.9 * 2**15
+"""Packets of a camera by one key: who learns it later can still tell their numbers, which have 16 bits."""
 AHEAD = 5.0
 """Seconds that a key is told before it is used, as messages may be lost."""
 LASTING = 5.0
@@ -32,6 +34,11 @@ WINDOW = 1024
 """Packets before the newest that are still taken by a station: more than are kept."""
 KEPT = 3
 """Keys that a station holds at most."""
+
+
+def lasting(bitrate: float, fps: float) -> float:
+    """Seconds that a key may be used for, of cameras that send at most so many bits and pictures a second."""
+    return min(EVERY, READABLE / (bitrate / 8 / rtp.LARGEST + fps))
 
 
 def _policy(key: Key, direction: int) -> Policy:

@@ -22,9 +22,11 @@ from scan2sim.services.teleoperation.messages import Kind, Message, Report, Stre
 from scan2sim.services.teleoperation.rates import Rates
 from scan2sim.services.teleoperation.settings import GATEWAY, VehicleParams, address
 from scan2sim.services.teleoperation.simulated import Ground, Place
-from scan2sim.services.teleoperation.srtp import Keys
+from scan2sim.services.teleoperation.srtp import Keys, lasting
 from scan2sim.services.teleoperation.streaming import Coder, Streamer
 
+FASTEST = 60.0
+"""Pictures a second of a camera, at most."""
 TOLD = 0.5
 """Seconds between two tellings of the video's keys, which may be lost."""
 
@@ -148,7 +150,7 @@ class Vehicle:
     def _join(self, order: Join, driving: Driving) -> None:
         station = Peer(Role.STATION, order.other.name, order.other.fingerprint)
         addresses = [(one.host, one.port) for one in order.listening]
-        keys = Keys(time.monotonic())
+        keys = Keys(time.monotonic(), lasting(self._bounds.highest, FASTEST))
 
         def dialled(received: Callable[[Message], None], began: Callable[[], None]) -> Bundle:
             bundle = dial(self._identity, station, self._links, addresses, received=received, began=began)

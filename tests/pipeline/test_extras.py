@@ -20,6 +20,7 @@ from scan2sim.flows.commands.survey import run_source
 from scan2sim.flows.recipes.settings import Settings
 from scan2sim.pipeline.errors import InputError, SettingError, UnavailableError, exit_code
 from scan2sim.pipeline.extras import EXTRA_OF
+from scan2sim.services.teleoperation import video
 from tests.conftest import ROOT
 
 TILE = ROOT / "data_samples" / "tile"
@@ -150,6 +151,15 @@ def test_a_package_that_is_missing_ends_all_commands_alike(
     error = CliRunner().invoke(app, [*words, *([] if words[0] in ("monitor", "teleop") else ["--out", out])]).exception
     assert isinstance(error, UnavailableError) and exit_code(error) == 7
     assert package in error.cause and f"pip install 'scan2sim[{EXTRA_OF[package]}" in error.remedy
+
+
+def test_of_several_extras_that_bring_a_package_the_one_that_is_meant_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    without(monkeypatch, "av", "psutil")
+    for words in (["teleop", "demo", "world"], ["teleop", "measure"], ["teleop", "vehicle", "car", "gate"]):
+        error = CliRunner().invoke(app, words).exception
+        assert isinstance(error, UnavailableError) and error.remedy == "pip install 'scan2sim[teleop]'"
+    with pytest.raises(UnavailableError, match=r"scan2sim\[teleop\]"):
+        video.find("pyav")
 
 
 def test_every_package_that_is_optional_is_missed_by_a_command() -> None:

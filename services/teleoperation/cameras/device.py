@@ -11,7 +11,7 @@ import numpy as np
 from scan2sim.pipeline.errors import InputError
 from scan2sim.services.teleoperation.cameras import Picture, View
 
-NEEDS = ("av",)
+NEEDS, EXTRA = ("av",), "teleop"
 PATIENCE = 5.0, 2.0
 """Seconds for a camera to open, and for a picture to come."""
 PROMPT = {"fflags": "nobuffer", "flags": "low_delay", "rtsp_transport": "tcp", "probesize": "200000"}

@@ -82,7 +82,7 @@ class Decoder:
 
     def __init__(self) -> None:
         """Raises UnavailableError where PyAV isn't there."""
-        need("VP8", "av")
+        need("VP8", "av", extra="teleop")
         import av
 
         self._av = av

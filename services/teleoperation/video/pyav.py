@@ -9,7 +9,7 @@ from scan2sim.pipeline.backends import Lacking
 from scan2sim.pipeline.types import U8
 from scan2sim.services.teleoperation.video import Settings
 
-NEEDS = ("av",)
+NEEDS, EXTRA = ("av",), "teleop"
 RANK = 3
 CLOCK = 90_000
 LARGEST_KEY = 300

@@ -6,7 +6,7 @@ from scan2sim.pipeline.backends import Lacking
 from scan2sim.services.teleoperation.video import Settings
 from scan2sim.services.teleoperation.video.pyav import Encoder
 
-NEEDS = ("av",)
+NEEDS, EXTRA = ("av",), "teleop"
 RANK = 1
 CODEC = "vp8_v4l2m2m"
 

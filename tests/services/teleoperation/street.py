@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+
+import cv2
+import numpy as np
 
 from scan2sim.services.teleoperation import cameras
 from scan2sim.services.teleoperation.adapting import Bounds
 from scan2sim.services.teleoperation.authority import certify
 from scan2sim.services.teleoperation.bundle import Policy
-from scan2sim.services.teleoperation.cameras import Camera, View
+from scan2sim.services.teleoperation.cameras import Camera, Picture, View
 from scan2sim.services.teleoperation.car import CarParams, CarUnit
 from scan2sim.services.teleoperation.control import Address
 from scan2sim.services.teleoperation.controls import Controls, Gear, VehicleState
@@ -21,7 +24,7 @@ from scan2sim.services.teleoperation.gateway import Gateway
 from scan2sim.services.teleoperation.identity import Identity
 from scan2sim.services.teleoperation.listening import Listener
 from scan2sim.services.teleoperation.membership import Membership
-from scan2sim.services.teleoperation.messages import Command
+from scan2sim.services.teleoperation.messages import Command, Stream
 from scan2sim.services.teleoperation.station import Station
 from scan2sim.services.teleoperation.translating import TranslateParams, Translating
 from scan2sim.services.teleoperation.vehicle import Vehicle
@@ -96,6 +99,10 @@ class Desk:
         joined = self.station.joined()
         return None if joined is None else joined.telemetry
 
+    def streams(self) -> tuple[Stream, ...]:
+        joined = self.station.joined()
+        return () if joined is None else joined.streams.cameras
+
     def stop(self) -> int:
         joined = self.station.joined()
         return 0 if joined is None or joined.telemetry is None else joined.telemetry.stop
@@ -135,12 +142,18 @@ class Street:
         self._translator.start()
         where = f"{HERE}:{translating.address[1]}"
         unit = CarUnit(CarParams(translator=where, limit=LIMIT))
-        front = Camera("front", lambda: cameras.pictures("pattern", View(width=160, height=120, fps=10)))
+        self.size = 160, 120
+        front = Camera("front", self._pictures)
         links = [Link("one", HERE), Link("two", HERE)]
         identity = Identity.read(self.parties / "vehicle-car")
         self.vehicle = Vehicle(identity, unit, links, {"front": front}, Policy.COPY, Bounds())
         self._member = Membership(identity, Address(host=HERE, port=self.gateway.port), self.vehicle, lambda _: None)
         self.desks: list[Desk] = []
+
+    def _pictures(self) -> Iterator[Picture]:
+        """A camera's, of the size that is asked for by then."""
+        for one in cameras.pictures("pattern", View(width=160, height=120, fps=10)):
+            yield Picture(np.ascontiguousarray(cv2.resize(one.image, self.size), np.uint8), one.captured)
 
     def desk(self, name: str = "desk", port: int = 0) -> Desk:
         """A station that is there."""

@@ -48,6 +48,22 @@ def test_a_driver_sees_what_the_vehicle_sees_confirms_and_drives(street: Street)
     until(lambda: stands(street.wheels.controls))
 
 
+def test_a_camera_that_changes_its_size_is_seen_on_and_nobody_stops(street: Street) -> None:
+    desk = street.desk()
+    street.fleet.join("car", "desk", "operator")
+    desk.start()
+    until(lambda: desk.frames)
+    stop = desk.stop()
+    for size in ((320, 240), (100, 76)):
+        street.size = size
+        until(lambda: (desk.frames[-1].width, desk.frames[-1].height) == size)  # noqa: B023
+        assert next(frame for frame in desk.frames if (frame.width, frame.height) == size).key
+        until(lambda: [(one.width, one.height) for one in desk.streams()] == [size])  # noqa: B023
+    count = len(desk.frames)
+    until(lambda: len(desk.frames) > count + 5)
+    assert desk.stop() == stop and street.wheels.controls.throttle == AHEAD.throttle
+
+
 def test_a_pair_drives_on_while_its_gateway_starts_anew(street: Street) -> None:
     desk = street.desk()
     street.fleet.join("car", "desk", "operator")

@@ -5,7 +5,7 @@ from pylibsrtp import Policy, Session
 
 from scan2sim.services.teleoperation import rtp, srtp
 from scan2sim.services.teleoperation.messages import Key
-from scan2sim.services.teleoperation.srtp import AHEAD, KEPT, LASTING, Keys, Opener, Sealer
+from scan2sim.services.teleoperation.srtp import AHEAD, EVERY, KEPT, LASTING, Keys, Opener, Sealer, lasting
 
 FRAME = b"\x01" + bytes(3000)
 
@@ -60,6 +60,19 @@ def test_a_station_reads_on_from_anywhere() -> None:
     for _ in range(14_000):  # of 3 packets each
         last = camera.seal(FRAME, 0)
     assert all(opener(keys).open(packet, 0.0) for packet in last)
+
+
+def test_whoever_learns_a_key_late_reads_on_whatever_the_rate() -> None:
+    assert lasting(1e6, 30) == EVERY
+    every = lasting(20e6, 60)
+    camera = sealer(keys := Keys(0.0, every))
+    sent, now = 0, 0.0
+    while now < every:
+        assert not camera.renew(now)
+        last = camera.seal(FRAME * 27, 0)  # 20 Mbit/s at 30 pictures a second
+        sent, now = sent + len(last), now + 1 / 30
+    assert sent > 2**14 and all(opener(keys).open(packet, 0.0) for packet in last)
+    assert camera.renew(every)
 
 
 def test_keys_change_and_are_told_ahead() -> None:
