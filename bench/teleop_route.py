@@ -84,7 +84,7 @@ def draw(found: dict[str, Measured], picture: Path) -> None:
     for (name, measured), colour in zip(found.items(), ("#2a6f97", "#e07a1f", "#b3261e"), strict=True):
         driven = np.array(measured.vehicle["driven"])
         places = (driven[:, 1:] - begin) @ turned
-        left = aside(way, driven)
+        left = aside(way, measured.vehicle["driven"])
         for run in np.unique(driven[:, 0]):
             mine = driven[:, 0] == run
             label = name if run == driven[0, 0] else None
