@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import webbrowser
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated
 
@@ -30,6 +31,7 @@ from scan2sim.services.teleoperation.translating import TranslateParams, Transla
 app = App("Vehicles driven from afar, by several links at once.")
 NEEDED = ("OpenSSL", "pylibsrtp", "websockets")
 """Packages that each of these commands needs."""
+WINDOW = "Show the driver's page in a window of its own, without a browser's bars."
 
 
 @app.command("certificates")
@@ -90,12 +92,15 @@ def teleop_gateway(params: GatewayParams) -> None:
 
 @app.command("station")
 @options(StationParams, certificates="CERTIFICATES", gateway="GATEWAY")
-def teleop_station(params: StationParams) -> None:
+def teleop_station(
+    params: StationParams,
+    window: Annotated[bool, typer.Option("--window", help=WINDOW)] = False,
+) -> None:
     """Be a station: show what its vehicle's cameras see, and send what its driver asks for."""
     _need("fastapi", "uvicorn")
     from scan2sim.services.teleoperation.cockpit import serve
 
-    serve(params, _say)
+    serve(params, _say, window)
 
 
 @app.command("vehicle")
@@ -115,14 +120,20 @@ def teleop_vehicle(params: VehicleParams) -> None:
 def teleop_demo(
     params: DemoParams,
     browse: Annotated[bool, typer.Option("--browse/--no-browse", help="Open the driver's page.")] = True,
+    window: Annotated[bool, typer.Option("--window", help=WINDOW)] = False,
 ) -> None:
     """Drive a simulated car through a finished world: gateway, vehicle and station on this machine."""
     _need("av", "fastapi", "uvicorn")
+    from scan2sim.services.teleoperation import own_window
     from scan2sim.services.teleoperation.demo import demo
 
+    if window:
+        own_window.browser()
     ended = threading.Event()
-    with ends(ended), demo(params, _say) as made:
-        if browse:
+    with ends(ended), demo(params, _say) as made, ExitStack() as stack:
+        if window:
+            stack.enter_context(own_window.window(made.page))
+        elif browse:
             webbrowser.open(made.page)
         while not ended.wait(1.0):
             if (why := made.ended()) is not None:

@@ -16,6 +16,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import ExitStack
 from typing import Annotated, Any, Literal
 
 from fastapi import FastAPI, WebSocket, WebSocketDisconnect
@@ -25,6 +26,7 @@ from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 from scan2sim.pipeline.errors import ScanError, SettingError
 from scan2sim.services import serving
 from scan2sim.services.served import Served
+from scan2sim.services.teleoperation import own_window
 from scan2sim.services.teleoperation.control import Address
 from scan2sim.services.teleoperation.controls import Controls, Gear
 from scan2sim.services.teleoperation.identity import Identity, Role
@@ -236,12 +238,14 @@ def _done(text: str, page: _Page, station: Station, fetch: Callable[[str, str], 
     return None
 
 
-def serve(params: StationParams, say: Callable[[str], None]) -> None:
-    """Be a station, and serve its page, until Ctrl-C; `say` is told what happens.
+def serve(params: StationParams, say: Callable[[str], None], window: bool = False) -> None:
+    """Be a station, and serve its page, until Ctrl-C; `say` is told what happens; `window`: the page has one.
 
     Raises:
-        ScanError: its certificate can't be read, or it can't listen.
+        ScanError: its certificate can't be read, it can't listen, or there can be no window.
     """
+    if window:
+        own_window.browser()
     identity = Identity.read(params.certificates, Role.STATION)
     gateway = address("GATEWAY", params.gateway, GATEWAY)
     listens = [address("--listening", text, STATION) for text in params.listening]
@@ -250,13 +254,17 @@ def serve(params: StationParams, say: Callable[[str], None]) -> None:
     screens = Screens(lambda frame: joined.age(frame.captured) if (joined := station.joined()) else 0.0)
     station = Station(identity, listener, reached, screens.show)
     membership = Membership(identity, gateway, station, say)
-    try:
+    with ExitStack() as stack:
+        for one in (listener, station, membership):
+            stack.callback(one.close)
+
+        def listening(url: str) -> None:
+            say(f"the driver's page is {url}")
+            if window:
+                stack.enter_context(own_window.window(url))
+
         app = application(params, station, screens, lambda what, vehicle: ask(membership, what, vehicle))
-        serving.run(app, params, lambda url: say(f"the driver's page is {url}"))
-    finally:
-        membership.close()
-        station.close()
-        listener.close()
+        serving.run(app, params, listening)
 
 
 def _seen(listens: list[Address], gateway: Address) -> list[Address]:

@@ -1,0 +1,53 @@
+"""A street whose desk has its page, for tests that look at it."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from scan2sim.services import serving
+from scan2sim.services.served import Served
+from scan2sim.services.teleoperation.cockpit import Screens, application
+from tests.services.teleoperation.street import Desk, Street, until
+
+
+@dataclass
+class Cockpit:
+    """A street whose desk has its page."""
+
+    street: Street
+    desk: Desk
+    app: Any
+    screens: Screens
+    url: str = ""
+
+    def watched(self) -> int:
+        """Pages that watch."""
+        return len(self.screens._pages)
+
+
+@contextmanager
+def served(tmp_path: Path, params: Served) -> Iterator[Cockpit]:
+    """A street whose desk's page is served."""
+    street = Street(tmp_path)
+    told: list[str] = []
+    try:
+        made = page_of(street, params)
+        threading.Thread(target=serving.run, args=(made.app, params, told.append), daemon=True).start()
+        until(lambda: told)
+        made.url = told[0]
+        yield made
+    finally:
+        street.close()
+
+
+def page_of(street: Street, params: Served) -> Cockpit:
+    desk = street.desk()
+    screens = Screens(lambda frame: joined.age(frame.captured) if (joined := desk.station.joined()) else 0.0)
+    desk.show = screens.show
+    app = application(params, desk.station, screens, lambda what, vehicle: True)
+    return Cockpit(street, desk, app, screens)
