@@ -60,11 +60,11 @@ def test_the_page_is_shown_in_a_window_and_closing_it_lets_go(cockpit: Cockpit, 
 
 
 def test_without_a_display_or_a_browser_it_is_said_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(own_window.shutil, "which", lambda name: f"/usr/bin/{name}")
+    monkeypatch.setattr(shutil, "which", lambda name: f"/usr/bin/{name}")
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     with pytest.raises(UnavailableError, match="a display"), own_window.window("http://localhost/"):
         pass
-    monkeypatch.setattr(own_window.shutil, "which", lambda name: None)
+    monkeypatch.setattr(shutil, "which", lambda name: None)
     with pytest.raises(UnavailableError, match="chromium"), own_window.window("http://localhost/"):
         pass
