@@ -43,7 +43,8 @@ class Camera {
     this.captured = null;
     this.shown = 0;
     this.begin();
-    byId("cameras").append(this.figure);
+    const later = [...cameras.values()].find((one) => one.number > number); // the first is the largest, whichever comes first
+    byId("cameras").insertBefore(this.figure, later?.figure ?? null);
   }
 
   begin() {
@@ -94,11 +95,19 @@ class Camera {
   }
 }
 
+function camera(number) {
+  const known = cameras.get(number);
+  if (known) return known;
+  const made = new Camera(number),
+    all = [...cameras.values(), made].sort((one, other) => one.number - other.number);
+  cameras.clear();
+  for (const one of all) cameras.set(one.number, one);
+  return made;
+}
+
 function picture(buffer) {
-  const view = new DataView(buffer),
-    number = view.getUint8(0);
-  if (!cameras.has(number)) cameras.set(number, new Camera(number));
-  cameras.get(number).take(view.getUint8(1) === 1, view.getFloat64(6, true), buffer.slice(HEADER));
+  const view = new DataView(buffer);
+  camera(view.getUint8(0)).take(view.getUint8(1) === 1, view.getFloat64(6, true), buffer.slice(HEADER));
 }
 
 // what the driver asks for
@@ -193,10 +202,7 @@ function tell(told) {
     strip("standing", told.left || null);
     return;
   }
-  for (const one of told.cameras) {
-    if (!cameras.has(one.camera)) continue;
-    cameras.get(one.camera).name.textContent = one.fps ? one.name : `${one.name}: gone`;
-  }
+  for (const one of told.cameras) camera(one.camera).name.textContent = one.fps ? one.name : `${one.name}: gone`;
   byId("speed").textContent = telemetry ? (3.6 * telemetry.vehicle.speed).toFixed(1) : "-";
   byId("gear").textContent = { "-1": "back", 0: "neutral", 1: "forwards" }[driving() ? gear : (telemetry?.vehicle.gear ?? 0)];
   byId("command").textContent = telemetry && Number.isFinite(telemetry.age) ? Math.round(telemetry.age) : "-";

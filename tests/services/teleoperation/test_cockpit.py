@@ -69,6 +69,8 @@ def test_a_driver_sees_how_old_the_picture_is_confirms_and_drives_by_keys(cockpi
         page.do("Input.dispatchKeyEvent", type="keyUp", code="ArrowUp", key="ArrowUp")
         until(lambda: cockpit.street.wheels.controls.throttle == 0 and not cockpit.desk.standing())
         assert cockpit.street.wheels.controls.brake == 0, "it rolls: its driver still has the wheel"
+        shown = "[...document.querySelectorAll('#cameras b')].map((one) => one.textContent)"
+        assert page.value(f"camera(2), camera(1), {shown}") == ["front", "camera 1", "camera 2"], "the first is largest"
         assert not page.errors
 
 
