@@ -92,7 +92,7 @@ class Adapting:
         sent = report.received + report.lost
         loss = report.lost / sent if sent else 0.0
         grown = 0.0
-        if report.received:
+        if report.delay is not None:
             self._delays.append(report.delay)
             grown = report.delay - min(self._delays)
         if self._rests:
@@ -100,7 +100,7 @@ class Adapting:
         elif loss > LOSSY or grown > GROWN:
             self._rests, self._filled = REST, True
             return max(self._bounds.lowest, DECREASE * self._bitrate)
-        elif report.received and loss < LOSSLESS and grown < GROWN / 2:
+        elif report.delay is not None and loss < LOSSLESS and grown < GROWN / 2:
             more = (1 + SHARE) * self._bitrate + INCREASE if self._filled else START * self._bitrate
             return min(self._bounds.highest, more)
         return self._bitrate

@@ -250,14 +250,14 @@ class Report(_Told):
 
     Attributes:
         received, lost: packets; such that had to be sent again are among the lost.
-        delay: ms from the camera to here, the median.
+        delay: ms from the camera to here, the median; None: no picture was whole.
         links: bytes a second that came by each link, by its name.
     """
 
     camera: Count
     received: Count
     lost: Count
-    delay: float
+    delay: float | None
     links: dict[Name, float]
 
 

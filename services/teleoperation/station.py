@@ -169,7 +169,7 @@ class Station:
         joined = self.joined()
         if joined is None:
             return Status(told=self._why)
-        delays = [report.delay for report in joined.reports]
+        delays = [report.delay for report in joined.reports if report.delay is not None]
         return Status(
             pair=joined.pair,
             links=joined.rates.links(joined.bundle),

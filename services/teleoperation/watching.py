@@ -275,13 +275,13 @@ class _View:
     def report(self, seconds: float) -> Report:
         """Of so many seconds, those since the last report."""
         total, told = self.counts, self._told
-        delay = statistics.median(self._delays) if self._delays else 0.0
+        delay = round(statistics.median(self._delays), 1) if self._delays else None
         links = {name: amount / seconds for name, amount in self.links.items()}
         self._told = total
         self._delays.clear()
         self.links.clear()
         received, lost, mended = (total[what] - told[what] for what in ("received", "lost", "mended"))
-        return Report(self._camera, max(0, received - mended), max(0, lost + mended), round(delay, 1), links)
+        return Report(self._camera, max(0, received - mended), max(0, lost + mended), delay, links)
 
 
 class Watcher:

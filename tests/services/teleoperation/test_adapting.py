@@ -130,4 +130,12 @@ def test_at_a_rate_between_two_rungs_it_does_not_go_up_and_down() -> None:
 def test_without_video_nothing_is_concluded() -> None:
     camera = Adapting(Bounds(), Plan(800_000))
     for _ in range(20):
-        assert camera.follow(Report(0, 0, 0, 0.0, {}), 640, 480).bitrate == 800_000
+        assert camera.follow(Report(0, 0, 0, None, {}), 640, 480).bitrate == 800_000
+
+
+def test_a_beginning_without_a_whole_picture_is_no_measure_of_delays() -> None:
+    camera = Adapting(Bounds(), Plan(800_000))
+    assert camera.follow(Report(0, 20, 0, None, {}), 640, 480).bitrate == 800_000
+    for _ in range(10):
+        camera.follow(Report(0, 100, 0, 95.0, {}), 640, 480)
+    assert camera.plan.bitrate == Bounds().highest

@@ -82,7 +82,7 @@ def test_one_link_that_loses_packets_breaks_few_pictures(loss: float) -> None:
         drive.send(take(scenery(640, 480), 900), lambda packets: [one for one in packets if rng.random() > loss])  # noqa: B023
         broken[mends] = drive.watcher.frames()[3]["broken"]
         assert drive.in_order()
-    assert broken[True] < broken[False] / 10
+    assert broken[True] < broken[False] / 5
 
 
 def test_of_many_that_lack_none_is_asked_for() -> None:
@@ -196,7 +196,7 @@ def test_a_report_tells_how_it_came() -> None:
     assert set(report.links) == {"lte", "wifi"} and report.links["lte"] > 1000
     assert 4 <= report.lost <= 15 and 25 <= report.received <= 40
     [after] = drive.watcher.reports()
-    assert (after.received, after.lost, after.links) == (0, 0, {})
+    assert (after.received, after.lost, after.delay, after.links) == (0, 0, None, {})
 
 
 def some(sequence: int, key: bool = False, first: bool = True, last: bool = True) -> rtp.Packet:
