@@ -1,12 +1,15 @@
 """Global adjustment: all keyframes and points at once, by pycolmap (Ceres), after odometry; reported apart from it.
 
-Schoenberger and Frahm, "Structure-from-Motion Revisited", CVPR 2016; pycolmap knows equirectangular cameras.
+Schoenberger and Frahm, "Structure-from-Motion Revisited", CVPR 2016; pycolmap knows equirectangular cameras. Features
+that neither odometry nor the adjustment has used (`witness.py`) tell which of both paths is kept.
 """
 
 from __future__ import annotations
 
 import tempfile
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,10 +18,11 @@ from scan2sim.pipeline.extras import need
 from scan2sim.pipeline.io.colmap_writer import SparseMap
 from scan2sim.pipeline.io.colmap_writer import write as write_colmap
 from scan2sim.pipeline.similarity import umeyama
-from scan2sim.pipeline.types import Trajectory
+from scan2sim.pipeline.types import F64, Trajectory
 from scan2sim.slam.geometry import angles
 from scan2sim.slam.mapped import Mapped
-from scan2sim.slam.sparse import kept, move
+from scan2sim.slam.sparse import Kept, kept, move
+from scan2sim.slam.witness import judge
 
 LOSS = 0.3
 """Pixels, of Cauchy's loss: some twice what bearings are off by."""
@@ -28,8 +32,45 @@ EDGE, POLE = 20.0, 0.9
 """Pixels from a 360 frame's seam, and sine of the elevation, beyond which observations are left out."""
 
 
-def adjust(mapped: Mapped) -> dict[str, float]:
+@dataclass(frozen=True)
+class Adjusted:
+    """Where keyframes and points fit best.
+
+    Attributes:
+        known: what odometry knew of the points.
+        poses: (C, 4, 4) of the keyframes, camera to world.
+        xyz: (P, 3) the points.
+        before, after: pixels, mean error of all observations.
+    """
+
+    known: Kept
+    poses: F64
+    xyz: F64
+    before: float
+    after: float
+
+
+def adjust(mapped: Mapped) -> dict[str, Any]:
     """Move the keyframes of an odometry that was told to `keep` to where all observations fit best; figures.
+
+    Where witnesses fit the adjusted path no better, all stays where it was.
+
+    Raises:
+        UnavailableError: pycolmap isn't installed.
+    """
+    new = adjusted(mapped)
+    said = judge(mapped.map, np.stack([k.T_world_cam for k in mapped.map.keyframes]), new.poses)
+    if said.better:
+        move(mapped, new.known, new.poses, new.xyz)
+    return {
+        "adjustment_kept": said.better, "witnesses": said.witnesses, "witnesses_gain": round(said.gain, 4),
+        "adjusted_keyframes": len(new.poses), "adjusted_points": len(new.xyz),
+        "reprojection_before_px": round(new.before, 4), "reprojection_after_px": round(new.after, 4),
+    }  # fmt: skip
+
+
+def adjusted(mapped: Mapped) -> Adjusted:
+    """The keyframes of an odometry that was told to `keep`, where all observations fit best.
 
     The whole keeps its place, orientation and scale: those are the odometry's, or GPS's.
 
@@ -77,9 +118,4 @@ def adjust(mapped: Mapped) -> dict[str, float]:
     xyz = known.xyz.copy()
     for i, point in model.points3D.items():
         xyz[i - 1] = point.xyz
-    move(mapped, known, placed, onto.apply(xyz))
-    return {
-        "adjusted_keyframes": len(poses), "adjusted_points": len(known.xyz),
-        "reprojection_before_px": round(float(before), 4),
-        "reprojection_after_px": round(float(model.compute_mean_reprojection_error()), 4),
-    }  # fmt: skip
+    return Adjusted(known, placed, onto.apply(xyz), float(before), float(model.compute_mean_reprojection_error()))

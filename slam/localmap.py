@@ -19,6 +19,9 @@ from scan2sim.slam.information import Information
 from scan2sim.slam.lens import misfit
 from scan2sim.slam.solvers import lm
 
+WITNESSES = 10
+"""Of so many features one never becomes a point where all is kept: a path is judged by them that they had no say in."""
+
 
 class MapParams(Params):
     """How points come and go, and what is optimised; the mission's numbers where it gives any.
@@ -260,6 +263,8 @@ class LocalMap:
         window = self.window()
         seen = self.observations(window)
         seen = seen.keep(~self.landmarks.find(seen.ids)[1])
+        if self.keep:
+            seen = seen.keep(seen.ids % WITNESSES > 0)
         names, counts = np.unique(seen.ids, return_counts=True)
         needed = min(len(window), self.params.views)
         names = names[(counts >= needed) & np.isin(names, self.keyframes[-1].ids)]

@@ -14,7 +14,8 @@ def adjust_all(inputs: Inputs, params: Params, out: Path, report: Report) -> Don
     """Move keyframes and points of `mapped` to where all observations fit best."""
     mapped = Mapped.read(inputs["mapped"])
     facts = adjust(mapped)
-    return Done({"mapped": mapped.write(out / "mapped.npz")}, dict(facts))
+    stays = f"{facts['witnesses']} features that had no say in it fit the adjusted path no better: odometry's is kept"
+    return Done({"mapped": mapped.write(out / "mapped.npz")}, facts, [] if facts["adjustment_kept"] else [stays])
 
 
 def can_adjust(params: Params) -> None:
@@ -22,4 +23,4 @@ def can_adjust(params: Params) -> None:
     need("--adjust", "pycolmap")
 
 
-ADJUST = Step("adjust", 2, adjust_all, Params, check=can_adjust)
+ADJUST = Step("adjust", 3, adjust_all, Params, check=can_adjust)

@@ -119,13 +119,13 @@ def run(
     *,
     gps: GpsTrack | None = None,
     warn: Callable[[str], None] = lambda _: None,
+    keep: bool = False,
     **params: Any,
 ) -> Odometry:
     """Odometry over a drive."""
 
-    odometry = Odometry(
-        Camera("equirectangular", 2048, 1024), OdometryParams(**params), tracker=follower, gps=gps, warn=warn
-    )
+    camera = Camera("equirectangular", 2048, 1024)
+    odometry = Odometry(camera, OdometryParams(**params), tracker=follower, gps=gps, warn=warn, keep=keep)
     for time in times:
         odometry.add(float(time), np.zeros((4, 8), np.uint8))
     return odometry
