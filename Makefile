@@ -11,7 +11,7 @@ demo: .venv/.installed
 	$(BIN)/scan2sim run $(TILE) --out $(OUT) --hold-out 8 --set segment.overwrite=true
 
 test: .venv/.installed-dev .venv-ros lint
-	$(BIN)/python -m pytest -m "not slow" -n 2 --dist loadfile
+	$(BIN)/python -m pytest -m "not slow" -n 3 --dist loadfile
 
 test-all: .venv/.installed-dev .venv-ros lint
 	$(BIN)/python -m pytest

@@ -158,8 +158,8 @@ def test_hills_lift_everything_and_tilt_the_car(trajectory: Trajectory) -> None:
     ahead = driven.rotations[20:-21, :, 2]
     assert np.abs(ahead[:, 2] - climb).max() < 0.03  # the rest is the suspension's
     steep = 20 + int(np.abs(climb).argmax())
+    camera = Panorama(build(PATH, 3, hills=waves), None, H, seed=3, radius=90.0)
     for k in (steep, steep + 3):
-        camera = Panorama(build(PATH, 3, hills=waves), None, H, seed=3, radius=90.0)
         picture = camera.render(driven.poses[k], k / 15)
         pixels, points = points_of(picture, driven.poses[k])
         above = points[:, 2] - hills.heights(points[:, :2], waves)

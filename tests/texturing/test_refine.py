@@ -99,7 +99,9 @@ def disturbed(
     ]
 
 
-@pytest.mark.parametrize("model", ["pinhole", "opencv", "fisheye", "equirectangular"])
+@pytest.mark.parametrize(
+    "model", ["pinhole", "equirectangular", *(pytest.param(m, marks=pytest.mark.slow) for m in ("opencv", "fisheye"))]
+)
 def test_disturbed_poses_come_back(tmp_path: Path, model: str) -> None:
     camera = CAMERAS[model]
     wrong = disturbed(np.random.default_rng(1))

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from _pytest.mark import ParameterSet
 
 from tests.conftest import ROOT
 from tests.ports import free_port
@@ -264,7 +265,7 @@ def server(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
         yield server
 
 
-def on(*databases: str) -> pytest.MarkDecorator:
+def on(*databases: str | ParameterSet) -> pytest.MarkDecorator:
     """Run a test with these databases."""
     return pytest.mark.parametrize("server", databases, indirect=True, scope="session")
 

@@ -74,7 +74,7 @@ def test_all_deployments_and_automations_are_taken(server: Server) -> None:
     assert len(server.api("POST", "/automations/filter", {})) == 2
 
 
-@on("sqlite", "postgres")
+@on("sqlite", pytest.param("postgres", marks=pytest.mark.slow))
 def test_a_schedule_fires_a_worker_runs_it_and_nothing_disturbs_it(toys: Server, folder: Path) -> None:
     """What comes due meanwhile is cancelled; what is started past the limit finds the folder taken, and is skipped."""
     nightly, other = toys.deployment("toy", "one-at-a-time"), toys.deployment("toy", "any")

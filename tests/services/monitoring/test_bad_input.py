@@ -49,7 +49,7 @@ def flows(path: Path, topic: str, direction: str = "incoming") -> list[dict[str,
     ]
 
 
-@pytest.mark.parametrize("transport", ["cyclone", "rclpy"])
+@pytest.mark.parametrize("transport", ["cyclone", pytest.param("rclpy", marks=pytest.mark.slow)])
 def test_messages_of_ten_megabytes_are_watched_from_inside_and_outside(
     transport: str, tmp_path: Path, start: Start
 ) -> None:
@@ -69,7 +69,11 @@ def test_messages_of_ten_megabytes_are_watched_from_inside_and_outside(
 
 @pytest.mark.parametrize(
     ("transport", "watching"),
-    [("cyclone", (STREAMS, "hear", "11")), ("rclpy", (STREAMS, "hear", "11")), ("cyclone", ("-c", WATCH))],
+    [
+        ("cyclone", (STREAMS, "hear", "11")),
+        pytest.param("rclpy", (STREAMS, "hear", "11"), marks=pytest.mark.slow),
+        pytest.param("cyclone", ("-c", WATCH), marks=pytest.mark.slow),
+    ],
     ids=["inside", "inside rclpy", "outside"],
 )
 def test_a_large_topic_crowds_no_small_one_out(

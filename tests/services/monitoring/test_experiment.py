@@ -17,7 +17,11 @@ CLI = ("cyclone", "-m", "scan2sim.flows.cli", "monitor")
 
 @pytest.mark.parametrize(
     ("forecast", "workers"),  # other days were quiet, so less is expected of this one
-    [((), 3), (("--forecast", "trend", "--lead", "0.5"), 3), (("--history", "days.csv"), 2)],
+    [
+        ((), 3),
+        pytest.param(("--forecast", "trend", "--lead", "0.5"), 3, marks=pytest.mark.slow),
+        (("--history", "days.csv"), 2),
+    ],
 )
 def test_a_rush_is_given_workers_and_loses_nothing(
     forecast: tuple[str, ...], workers: int, tmp_path: Path, start: Start
