@@ -36,6 +36,8 @@ MOBILE = Shape(delay=0.04, jitter=0.01, loss=0.01)
 CUT, WORSE = MOBILE.model_copy(update={"loss": 0.9999}), MOBILE.model_copy(update={"loss": 0.05})
 SINGLE = 0.2
 """Of the time that two links are tried for, a single one is."""
+GROWN = 10.0
+"""Seconds until video has grown to what links carry."""
 CALM = 3.0
 """Seconds without events at the end, so that what was lost is known."""
 
@@ -68,7 +70,7 @@ def glass(scale: float, say: Say) -> dict[str, Any]:
     with mobile() as ends:
         ends.station.ask("join")
         ends.station.ask("drive")
-        time.sleep(max(3.0, 20.0 * scale))
+        time.sleep(GROWN)
         measured = ends.measured(max(5.0, 60.0 * scale))
     told("glass", measured, say)
     return {"glass_to_glass_p95_ms": round(percentile(measured.glass_to_glass, 95), 1)}
@@ -151,9 +153,7 @@ def qos(scale: float, say: Say) -> dict[str, Any]:
     service, verdicts = requirements.read("teleoperation"), dict[str, bool]()
     for environment in Environment:
         required = service.of(environment)
-        params = MeasureParams(
-            environment=environment, seconds=max(5.0, 30.0 * scale), warm=max(3.0, 35.0 * min(1.0, scale * 4))
-        )
+        params = MeasureParams(environment=environment, seconds=max(5.0, 30.0 * scale), warm=GROWN)
         found = rows(required, measure(params, required, quiet))
         verdicts[environment] = passed(found, NETWORK)
         for row in found:

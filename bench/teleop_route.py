@@ -53,7 +53,7 @@ def drives(world: Path, seconds: float) -> dict[str, Measured]:
 def route(world: Path, scale: float, say: Say) -> dict[str, Any]:
     """How far off the way the car was: on average, and of 95 %, by network."""
     found = dict[str, list[float]]()
-    for name, measured in drives(world, max(15.0, 40.0 * scale)).items():
+    for name, measured in drives(world, max(12.0, 25.0 * scale)).items():
         off = measured.aside
         found[name] = [round(sum(off) / len(off), 3), round(percentile(off, 95), 3)]
         say(

@@ -118,7 +118,7 @@ class MeasureParams(Params):
     seconds: Annotated[float, Field(ge=1, le=86_400, description="Seconds that it is measured for.")] = 30.0
     warm: Annotated[
         float, Field(ge=0, le=600, description="Seconds driven before that: video grows to what the links carry.")
-    ] = 30.0
+    ] = 10.0
     cameras: Annotated[int, Field(ge=1, le=16, description="Of the vehicle, 640x480 at 30 pictures a second.")] = 4
     bitrate: Annotated[
         float | None,

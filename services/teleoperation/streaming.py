@@ -64,11 +64,15 @@ class Coder:
         planes = video.planes(scaled(picture.image, plan.scale))
         encoder, made = self._encoder_for(planes, plan)
         key = self._sealer.renew(now) or made or (self._wanted and picture.captured >= self._last_key + KEY_PAUSE)
+        data = encoder.encode(planes, picture.captured, key)
+        if not data:
+            self._wanted = self._wanted or key
+            self.counts["skipped"] += 1
+            return []
         if key:
             self._wanted, self._last_key = False, picture.captured
-        data = encoder.encode(planes, picture.captured, key)
         packets = self._sealer.seal(data, picture.captured)
-        self.counts.update(frames=bool(data), keys=key, packets=len(packets), bytes=sum(map(len, packets)))
+        self.counts.update(frames=1, keys=key, packets=len(packets), bytes=sum(map(len, packets)))
         return packets
 
     def close(self) -> None:

@@ -14,7 +14,17 @@ RANK = 3
 CLOCK = 90_000
 LARGEST_KEY = 300
 """Percent of a frame's share of the rate that a key frame may take: without a bound the first takes a second's."""
-OPTIONS = {"deadline": "realtime", "cpu-used": "8", "lag-in-frames": "0", "max-intra-rate": str(LARGEST_KEY)}
+SPEED = -8
+"""Of libvpx; a positive one changes with the machine's load, and takes more of an idle one."""
+LEAST_BUFFER = 10
+"""Percent of the rate's buffer below which a frame is left out, where even coarse ones are too large."""
+OPTIONS = {
+    "deadline": "realtime",
+    "cpu-used": str(SPEED),
+    "lag-in-frames": "0",
+    "max-intra-rate": str(LARGEST_KEY),
+    "drop-threshold": str(LEAST_BUFFER),
+}
 
 
 def lacking() -> Lacking | None:

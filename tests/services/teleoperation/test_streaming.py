@@ -114,6 +114,16 @@ def test_pictures_are_left_out_for_the_rate() -> None:
         assert gaps.max() <= 30 / fps + 1.01
 
 
+def test_a_frame_that_the_encoder_leaves_out_is_no_loss() -> None:
+    chance = np.random.default_rng(0)
+    drive = Drive(plan=Plan(bitrate=100_000))
+    noise = chance.integers(0, 255, (60, 240, 320, 3), np.uint8)
+    drive.send(Picture(image, i * STEP) for i, image in enumerate(noise))
+    counts = drive.watcher.frames()[3]
+    assert drive.coder.counts["skipped"] > 5 and len(drive.frames) == drive.coder.counts["frames"]
+    assert (counts["broken"], counts["lost"]) == (0, 0) and not drive.wanted and drive.in_order()
+
+
 def test_an_encoder_is_made_anew_where_the_rate_changes() -> None:
     drive, pictures = Drive(plan=Plan(bitrate=1_000_000)), scenery(64, 48)
     for bitrate, made in ((1_000_000, 1), (1_000_000, 1), (800_000, 2), (1_000_000, 3)):
