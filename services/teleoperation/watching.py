@@ -25,7 +25,7 @@ FORGETS = 0.98
 AGAIN = 0.25
 """Seconds after which a key frame is wanted again: about the time there, to encode it, and back."""
 ASKED, TRIPS = 2, 1.5
-"""Times that a packet is asked for again; round trips (and `SHORTEST`) that each asking is given."""
+"""Times that a packet is asked for again; round trips (and `FIRST`, for both machines) that each asking is given."""
 MENDABLE = 32
 """Packets of a camera that may lack at once: of more, a key frame tells sooner."""
 HELD = 1024
@@ -123,7 +123,7 @@ class Assembly:
 
     def _mending(self) -> float:
         """Seconds that a packet which was asked for is given."""
-        return TRIPS * self._trip() + SHORTEST
+        return TRIPS * self._trip() + FIRST
 
     def _came_late(self, lack: _Lack, now: float) -> None:
         if lack.times and now > lack.asked + self._trip() / 2:

@@ -29,6 +29,7 @@ from scan2sim.services.teleoperation.station import Station
 from scan2sim.services.teleoperation.translating import TranslateParams, Translating
 from scan2sim.services.teleoperation.vehicle import Vehicle
 from scan2sim.services.teleoperation.watching import Frame
+from tests.services.teleoperation.relay import Relay
 
 HERE = "127.0.0.1"
 LIMIT = 1500.0
@@ -64,13 +65,15 @@ class Wheels:
 class Desk:
     """A station, as `teleop station` makes it; `frames` are what it was shown."""
 
-    def __init__(self, folder: Path, gateway: int, port: int = 0) -> None:
+    def __init__(self, folder: Path, gateway: int, port: int = 0, loss: float = 0.0) -> None:
         self.frames: list[Frame] = []
         self.show: Callable[[Frame], None] = self.frames.append
         identity = Identity.read(folder)
         self._listener = Listener(identity, [(HERE, port)])
         self.port = self._listener.port
-        reached = [Address(host=HERE, port=self.port)]
+        self._relay = Relay((HERE, self.port))
+        self._relay.shapes[HERE].loss = loss
+        reached = [Address(host=HERE, port=self._relay.address[1] if loss else self.port)]
         self.station = Station(identity, self._listener, reached, lambda frame: self.show(frame))
         self.membership = Membership(identity, Address(host=HERE, port=gateway), self.station, lambda _: None)
         self._asks: Callable[[], Command | None] = lambda: None
@@ -121,6 +124,7 @@ class Desk:
         self.membership.close()
         self.station.close()
         self._listener.close()
+        self._relay.close()
 
     def _drive(self) -> None:
         while not self._ended.wait(0.02):
@@ -155,9 +159,9 @@ class Street:
         for one in cameras.pictures("pattern", View(width=160, height=120, fps=10)):
             yield Picture(np.ascontiguousarray(cv2.resize(one.image, self.size), np.uint8), one.captured)
 
-    def desk(self, name: str = "desk", port: int = 0) -> Desk:
-        """A station that is there."""
-        made = Desk(self.parties / f"station-{name}", self.gateway.port, port)
+    def desk(self, name: str = "desk", port: int = 0, loss: float = 0.0) -> Desk:
+        """A station that is there; `loss`: of what is sent to it and from it."""
+        made = Desk(self.parties / f"station-{name}", self.gateway.port, port, loss)
         self.desks.append(made)
         until(lambda: any(one["name"] == name and one["there"] for one in self.fleet.facts()["stations"]))
         until(lambda: any(one["there"] for one in self.fleet.facts()["vehicles"]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -46,6 +47,19 @@ def test_a_driver_sees_what_the_vehicle_sees_confirms_and_drives(street: Street)
     until(lambda: street.wheels.controls.throttle == AHEAD.throttle)
     street.fleet.release("car", "operator")
     until(lambda: stands(street.wheels.controls))
+
+
+def test_pictures_that_both_links_lose_are_sent_again(street: Street) -> None:
+    desk = street.desk(loss=0.2)
+    street.fleet.join("car", "desk", "operator")
+    until(lambda: desk.frames)
+
+    def frames() -> Counter[str]:
+        joined = desk.station.joined()
+        assert joined is not None
+        return joined.watcher.frames()[0]
+
+    until(lambda: frames()["mended"] >= 4)
 
 
 def test_a_camera_that_changes_its_size_is_seen_on_and_nobody_stops(street: Street) -> None:
