@@ -1,10 +1,10 @@
 """Street furniture and sky against the synthetic streets' truth.
 
 `python -m bench.furniture [--seeds 0 1 2] [--length 100 --points 4e6] [--parts shape sky] [--out bench-out/furniture]`
-- shape: streets are scanned, and the step `furniture` run on their clouds as it stands. `pole_recall`: share of lamps
-  and signs within 20 cm of whose true place one is told of, no trunk; `trunk_recall` of trees; `pole_precision`: share
-  of all things told of that stand within 30 cm of a lamp, sign or tree. `sign_plate_cm`, `pole_cm`: mean distance of
-  true surface samples of plates, and of poles below them, to the meshes.
+- shape: streets are scanned, and the steps `finds` and `furniture` run on their clouds as they stand. `pole_recall`:
+  share of lamps and signs within 20 cm of whose true place one is told of, no trunk; `trunk_recall` of trees;
+  `pole_precision`: share of all things told of that stand within 30 cm of a lamp, sign or tree. `sign_plate_cm`,
+  `pole_cm`: mean distance of true surface samples of plates, and of poles below them, to the meshes.
 - sky: the small street's world with `agreement.sky` off and on: `sky_share`: share of the surface of crowns and
   buildings that is bluer and brighter than the truth by far; `truth_db`: likeness to the true colours there.
 
@@ -30,6 +30,7 @@ from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.render import Renderer, textured
 from scan2sim.pipeline.step import silent
+from scan2sim.pipeline.steps.finds import FINDS, FindsParams
 from scan2sim.pipeline.steps.furniture import FURNITURE, FurnitureParams
 from scan2sim.pipeline.steps.geometry import distances, spread
 from scan2sim.pipeline.types import F32, Mesh
@@ -90,8 +91,9 @@ def _street(street: Path, seed: int, length: float) -> dict[str, list[Any]]:
         folder = Path(name)
         las.read(tile.clouds[0], tile.frame).save(folder / "cloud.npz")
         tile.trajectory.save(folder / "path.npz")
-        inputs = {"cloud": folder / "cloud.npz", "path": folder / "path.npz"}
-        done = FURNITURE.run(inputs, FurnitureParams(), folder, silent)
+        cloud = {"cloud": folder / "cloud.npz"}
+        found = FINDS.run(cloud | {"path": folder / "path.npz"}, FindsParams(), folder, silent)
+        done = FURNITURE.run(cloud | found.files, FurnitureParams(), folder, silent)
         features = json.loads(done.files["geojson"].read_text())["features"]
         mesh = Mesh.load(done.files["building"])
     at = np.array([f["geometry"]["coordinates"][:2] for f in features]).reshape(-1, 2) - tile.frame.origin[:2]

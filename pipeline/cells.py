@@ -7,7 +7,7 @@ computes the same borders. Everything here is in world metres (CRS coordinates t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -57,6 +57,16 @@ def beyond(own: Seed, other: Seed, xy: npt.ArrayLike) -> F64:
     normal = (b - a) / np.linalg.norm(b - a)
     distance = (np.asarray(xy, np.float64) - (a + b) / 2) @ normal
     return distance if tuple(own) == first else -distance
+
+
+def nearest(xy: F64, seeds: Sequence[Seed]) -> npt.NDArray[np.int64]:
+    """(N,) index of the nearest seed to each world place (N, 2), the first of several as near."""
+    index, least = np.zeros(len(xy), np.int64), np.full(len(xy), np.inf)
+    for i, seed in enumerate(seeds):
+        square = ((xy - seed) ** 2).sum(axis=1)
+        nearer = square < least
+        index[nearer], least[nearer] = i, square[nearer]
+    return index
 
 
 def outline(cell: Cell, low: npt.ArrayLike, high: npt.ArrayLike) -> F64:

@@ -6,14 +6,15 @@ Tubes are found by shape (`pipeline.standing`), plates around them (`pipeline.pl
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from scan2sim.pipeline import primitives
-from scan2sim.pipeline.classes import CODE, group_of
+from scan2sim.pipeline.classes import CODE, NOISE, group_of
 from scan2sim.pipeline.lamps import Arm, arm
 from scan2sim.pipeline.plates import Plate, plates
 from scan2sim.pipeline.primitives import Triangles
@@ -78,6 +79,23 @@ class Thing:
         tops = [self.stem.centre[-1, 2], *(plate.centre[2] + plate.height / 2 for plate in self.plates)]
         return float(max(tops) - self.foot[2])
 
+    def moved(self, by: F64) -> Thing:
+        """It by (3,) metres elsewhere: in another frame."""
+        plates = tuple(plate.moved(by) for plate in self.plates)
+        return Thing(self.kind, self.stem.moved(by), plates, None if self.arm is None else self.arm.moved(by))
+
+    def to_json(self) -> dict[str, Any]:
+        """As `from_json` reads it."""
+        plates = [plate.to_json() for plate in self.plates]
+        arm = None if self.arm is None else self.arm.to_json()
+        return {"kind": self.kind, "stem": self.stem.to_json(), "plates": plates, "arm": arm}
+
+    @classmethod
+    def from_json(cls, row: Mapping[str, Any]) -> Thing:
+        """What `to_json` told."""
+        plates = tuple(Plate.from_json(plate) for plate in row["plates"])
+        return cls(row["kind"], Stem.from_json(row["stem"]), plates, Arm.from_json(row["arm"]) if row["arm"] else None)
+
     def held(self, xyz: npt.NDArray[np.floating]) -> Bools:
         """(N,) which points (N, 3) are its own, those of noise around it among them."""
         low, high = self.stem.centre[[0, -1], 2]
@@ -102,6 +120,14 @@ def sheet(plate: Plate) -> Triangles:
     """A plate's mesh."""
     corners = plate.centre + plate.outline[:, :1] * plate.across + plate.outline[:, 1:] * (0, 0, 1)
     return primitives.plate(corners, -SHEET * plate.normal)
+
+
+def eligible(cloud: PointCloud) -> tuple[Bools, I64]:
+    """(N,) which points are the ground's, and the indices of those that may be furniture's, by their classes alone."""
+    assert cloud.classification is not None
+    ground = group_of()[cloud.classification] == 0
+    out_of_it = np.isin(cloud.classification, [*NOISE, CODE["vehicle"], CODE["person"]])
+    return ground, np.flatnonzero(~ground & ~out_of_it)
 
 
 def find(cloud: PointCloud, columns: Columns, height: F32, path: Trajectory) -> list[Thing]:

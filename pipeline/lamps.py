@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -57,6 +59,22 @@ class Arm:
         """(3, 3) rows along, across and up."""
         along = np.array([*self.direction, 0.0])
         return np.array([along, np.cross([0, 0, 1.0], along), [0, 0, 1.0]])
+
+    def moved(self, by: F64) -> Arm:
+        """It by (3,) metres elsewhere."""
+        box = None if self.box is None else (self.box[0] + by, self.box[1])
+        return replace(self, path=self.path + by, box=box)
+
+    def to_json(self) -> dict[str, Any]:
+        """As `from_json` reads it."""
+        box = None if self.box is None else [part.tolist() for part in self.box]
+        return {"path": self.path.tolist(), "radius": self.radius, "box": box}
+
+    @classmethod
+    def from_json(cls, row: Mapping[str, Any]) -> Arm:
+        """What `to_json` told."""
+        box = None if row["box"] is None else (np.array(row["box"][0]), np.array(row["box"][1]))
+        return cls(np.array(row["path"], np.float64), row["radius"], box)
 
     def held(self, xyz: npt.NDArray[np.floating], thin: float) -> Bools:
         """(N,) which points are its own, `thin` metres around it."""

@@ -7,7 +7,7 @@ shapes that its points fill and don't leave.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, Literal
 
@@ -75,6 +75,10 @@ class Plate:
         """Square metres."""
         (x, y), (u, v) = self.outline.T, np.roll(self.outline, -1, axis=0).T
         return float((x * v - u * y).sum() / 2)
+
+    def moved(self, by: F64) -> Plate:
+        """It by (3,) metres elsewhere."""
+        return replace(self, centre=self.centre + by)
 
     def to_json(self) -> dict[str, Any]:
         """As `from_json` reads it."""

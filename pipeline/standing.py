@@ -9,8 +9,10 @@ enough points. Nothing here knows classes or photos.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -105,6 +107,26 @@ class Stem:
         """(N,) metres of points (N, 3) from its surface, sideways; negative inside."""
         xy, radius = self.at(xyz[:, 2])
         return np.hypot(*(xyz[:, :2] - xy).T) - radius
+
+    def covers(self, other: Stem) -> bool:
+        """Whether the middle of another one stands within it, or beside it without a gap."""
+        z = np.array([(other.centre[0, 2] + other.centre[-1, 2]) / 2])
+        apart = float(np.hypot(*(self.at(z)[0] - other.at(z)[0])[0]))
+        return apart < self.thickness + other.thickness + CELL
+
+    def moved(self, by: F64) -> Stem:
+        """It by (3,) metres elsewhere."""
+        return replace(self, centre=self.centre + by)
+
+    def to_json(self) -> dict[str, Any]:
+        """As `from_json` reads it."""
+        fitted = {"spread": float(self.spread), "wobble": float(self.wobble)}
+        return {"centre": self.centre.tolist(), "radius": self.radius.tolist(), **fitted}
+
+    @classmethod
+    def from_json(cls, row: Mapping[str, Any]) -> Stem:
+        """What `to_json` told."""
+        return cls(np.array(row["centre"], np.float64), np.array(row["radius"]), row["spread"], row["wobble"])
 
 
 def stems(columns: Columns, height: F32, least: float) -> list[Stem]:
@@ -401,13 +423,6 @@ def _once(found: list[Stem]) -> list[Stem]:
     """Stems without those that stand within another, the longest first."""
     kept: list[Stem] = []
     for stem in sorted(found, key=lambda s: -s.length):
-        low, high = stem.centre[0, 2], stem.centre[-1, 2]
-
-        def inside(other: Stem, low: float = low, high: float = high, stem: Stem = stem) -> bool:
-            z = np.array([(low + high) / 2])
-            apart = float(np.hypot(*(other.at(z)[0] - stem.at(z)[0])[0]))
-            return apart < other.thickness + stem.thickness + CELL
-
-        if not any(inside(other) for other in kept):
+        if not any(other.covers(stem) for other in kept):
             kept.append(stem)
     return kept

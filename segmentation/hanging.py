@@ -10,6 +10,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from scan2sim.pipeline import primitives
+from scan2sim.pipeline.borders.rims import on_border
+from scan2sim.pipeline.cells import Cell
 from scan2sim.pipeline.classes import CODE
 from scan2sim.pipeline.furniture import SHEET, sheet
 from scan2sim.pipeline.plates import Plate, inside
@@ -67,10 +69,11 @@ def behind(mesh: Mesh, plates: Sequence[Plate]) -> tuple[Mesh, list[F64]]:
     return replace(mesh, vertices=vertices.astype(np.float32)), moved
 
 
-def cleared(mesh: Mesh, plates: Sequence[Plate]) -> Mesh:
+def cleared(mesh: Mesh, plates: Sequence[Plate], cell: Cell | None = None) -> Mesh:
     """The mesh without surfaces that a plate's points made around it; what has a class of its own stays.
 
-    What lies before the plate goes, and so do scraps beside it that hang on nothing else.
+    What lies before the plate goes, and so do scraps beside it that hang on nothing else. Edges on the borders of the
+    tile's `cell` stay, since the neighbour has them, too.
     """
     free = np.ones(len(mesh), bool) if mesh.classification is None else mesh.classification == 0
     gone = np.zeros(len(mesh), bool)
@@ -82,17 +85,17 @@ def cleared(mesh: Mesh, plates: Sequence[Plate]) -> Mesh:
         flat, off = np.stack([places @ plate.across, places[..., 2]], axis=-1), places @ plate.normal
         within = inside(flat.reshape(-1, 2), plate.outline, BESIDE).reshape(off.shape)
         gone[near] |= (within & (off > -BEHIND) & (off < BEFORE)).any(axis=1)
-    kept = mesh.keep(~gone)
-    return kept.keep(~_scraps(kept, plates))
+    kept = mesh.keep(~gone | (on_border(mesh, cell)[mesh.faces].sum(axis=1) > 1))
+    return kept.keep(~_scraps(kept, plates, cell))
 
 
-def _scraps(mesh: Mesh, plates: Sequence[Plate]) -> Bools:
-    """(F,) connected pieces without a class of which all lies within reach of a plate."""
+def _scraps(mesh: Mesh, plates: Sequence[Plate], cell: Cell | None) -> Bools:
+    """(F,) connected pieces without a class of which all lies within reach of a plate, and none on a border."""
     free = np.arange(len(mesh)) if mesh.classification is None else np.flatnonzero(mesh.classification == 0)
-    piece, out = _connected(mesh, free), np.zeros(len(mesh), bool)
+    piece, out, on = _connected(mesh, free), np.zeros(len(mesh), bool), on_border(mesh, cell)
     for plate in plates:
         reach = np.hypot(plate.width, plate.height) / 2 + BEFORE
-        beyond = (np.linalg.norm(mesh.vertices - plate.centre, axis=1) > reach)[mesh.faces[free]].any(axis=1)
+        beyond = (on | (np.linalg.norm(mesh.vertices - plate.centre, axis=1) > reach))[mesh.faces[free]].any(axis=1)
         out[free] |= np.bincount(piece, beyond, minlength=len(mesh.vertices))[piece] == 0
     return out
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -16,7 +16,7 @@ from scan2sim.pipeline.io import image
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.ranges import Place
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.steps.furniture import BORDER, listed, of_plate
+from scan2sim.pipeline.steps.furniture import listed, of_plate
 from scan2sim.pipeline.types import F32, F64, U8, Bools, Frame, Mesh, View
 
 if TYPE_CHECKING:
@@ -39,7 +39,8 @@ class SignsParams(Params):
 
     Attributes:
         when: "auto": where there are photos from the ground; "never": plates stay as points tell.
-        seed, neighbours: as of `furniture`: what hangs within 4 m of a border stays as it is; set by the recipe.
+        seed, neighbours: as of `furniture`: plates on poles of the neighbours' are theirs, and plates without a pole
+            within half a metre of a border are nobody's; set by the recipe.
     """
 
     when: Literal["auto", "never"] = "auto"
@@ -50,8 +51,8 @@ class SignsParams(Params):
 def signs(inputs: Inputs, params: SignsParams, out: Path, report: Report) -> Done:
     """Fit the plates of signs to photos: those that points tell of, and those that photos show.
 
-    Inputs: `mesh.terrain`, `mesh.building`, `mesh.vegetation` (if any); `plates` and `geojson` of `furniture`; `views`;
-    `labels` (a network's classes; without them photos show no signs that points don't).
+    Inputs: `mesh.terrain`, `mesh.building`, `mesh.vegetation` (if any); `plates`, `beside` and `geojson` of
+    `furniture`; `views`; `labels` (a network's classes; without them photos show no signs that points don't).
     Files: `building` and `vegetation`, meshes with the plates, and without what points of plates made before them;
     `geojson` and `csv` as of `furniture`. Facts: `from_points`, plates; `fitted` to photos, of these `new`.
     """
@@ -66,13 +67,17 @@ def signs(inputs: Inputs, params: SignsParams, out: Path, report: Report) -> Don
     rows = [f["properties"] | dict(zip("xyz", f["geometry"]["coordinates"], strict=True)) for f in features]
     views, held = views_io.load(inputs["views"]), views_io.load_held_out(inputs["views"])
     used = [i for i, view in enumerate(views) if not held[i] and view.camera.model != "orthographic"]
-    found = _found(views, used, _probabilities(inputs, used), known, lambda place: _own(place, frame, params), report)
+    cell = None if params.seed is None else Cell(params.seed, params.neighbours)
+    poles = np.array([frame.to_local([row["x"], row["y"], row["z"]]) for row in rows if row["kind"] != "trunk"])
+    others = np.array(json.loads(inputs["beside"].read_text(encoding="utf-8")))
+    own = partial(_own, frame, cell, poles.reshape(-1, 3), others.reshape(-1, 3))
+    found = _found(views, used, _probabilities(inputs, used), known, own, report)
     building = meshes["building"]
     if found:
         replaced = [old for old in known if any(np.linalg.norm(old.centre - p.centre) < SAME for p in found)]
         building, moved = behind(without(building, replaced), found)
-        meshes["building"] = with_plates(cleared(building, found), found)
-        meshes |= {group: cleared(meshes[group], found) for group in groups if group == "vegetation"}
+        meshes["building"] = with_plates(cleared(building, found, cell), found)
+        meshes |= {group: cleared(meshes[group], found, cell) for group in groups if group == "vegetation"}
         rows = _listed(rows, found, moved, meshes["terrain"])
     files = {group: out / f"{group}.npz" for group in groups if group != "terrain"}
     for group, file in files.items():
@@ -88,12 +93,19 @@ def _probabilities(inputs: Inputs, used: Sequence[int]) -> dict[int, U8]:
     return {i: np.load(file) for i, file in files.items() if file.is_file()}
 
 
-def _own(place: F64, frame: Frame, params: SignsParams) -> bool:
-    """Whether what hangs at a place (3,) is this tile's to fit."""
-    if params.seed is None:
+def _own(frame: Frame, cell: Cell | None, poles: F64, others: F64, place: F64) -> bool:
+    """Whether what hangs at a place (3,) is this tile's to fit: on one of its `poles` (P, 3), or clearly in its `cell`.
+
+    Of `others`' poles (Q, 3), their tiles say.
+    """
+    from scan2sim.pipeline.furniture import AROUND
+
+    if cell is None:
         return True
-    world = place[None, :2] + np.asarray(frame.origin[:2])
-    return bool(Cell(params.seed, params.neighbours).outside(world)[0] < -BORDER)
+    apart, away = (np.hypot(*(feet - place)[:, :2].T).min(initial=np.inf) for feet in (poles, others))
+    if min(apart, away) < AROUND:
+        return bool(apart <= away)
+    return bool(cell.outside(place[None, :2] + np.asarray(frame.origin[:2]))[0] < -SAME)
 
 
 def _found(
@@ -115,7 +127,7 @@ def _found(
     found: list[Plate] = []
     for done, (place, normal) in enumerate(wanted):
         report(done / len(wanted), f"{len(found)} plates")
-        if not own(place) or any(np.linalg.norm(place - plate.centre) < SAME for plate in found):
+        if (normal is None and not own(place)) or any(np.linalg.norm(place - plate.centre) < SAME for plate in found):
             continue
         shown = close_ups(place, seen, photo)
         plate = None if shown is None else fitted(shown, REACH, normal)
@@ -159,4 +171,4 @@ def _ground(vertices: F32, place: F64) -> float:
     return float(vertices[np.hypot(*(vertices[:, :2] - place[:2]).T).argmin(), 2]) if len(vertices) else float(place[2])
 
 
-SIGNS = Step("signs", 3, signs, SignsParams)
+SIGNS = Step("signs", 4, signs, SignsParams)

@@ -19,6 +19,7 @@ from scan2sim.pipeline.steps.collision import COLLISION
 from scan2sim.pipeline.steps.decimate import DECIMATE
 from scan2sim.pipeline.steps.export import EXPORT
 from scan2sim.pipeline.steps.facades import FACADES
+from scan2sim.pipeline.steps.finds import FINDS
 from scan2sim.pipeline.steps.furniture import FURNITURE
 from scan2sim.pipeline.steps.geometry import GEOMETRY
 from scan2sim.pipeline.steps.ground import GROUND
@@ -57,8 +58,8 @@ from scan2sim.texturing.texture import TEXTURE
 from scan2sim.texturing.unwrap import UNWRAP
 
 STEPS: tuple[Step, ...] = (
-    INGEST, PATH, CARVE, VIEWS, LABEL, SEGMENT, THINGS, REACH, OVERLAP, FURNITURE, SPLIT, VOXEL, GROUND, WALLS, FACADES,
-    POISSON, TRIM, PLANES, ISLANDS, CLIP, JOIN, DECIMATE, PLANTS, UNWRAP, REFINE, SIGNS, VISIBILITY, EXPOSURE,
+    INGEST, PATH, CARVE, VIEWS, LABEL, SEGMENT, THINGS, REACH, OVERLAP, FINDS, FURNITURE, SPLIT, VOXEL, GROUND, WALLS,
+    FACADES, POISSON, TRIM, PLANES, ISLANDS, CLIP, JOIN, DECIMATE, PLANTS, UNWRAP, REFINE, SIGNS, VISIBILITY, EXPOSURE,
     AGREEMENT, CHOOSE, TEXTURE, LEVEL, ROADS, COLLISION, EXPORT, RASTERS, GEOMETRY, SCORE, PICTURES, PREVIEW, BORDERS,
 )  # fmt: skip
 
@@ -193,9 +194,11 @@ class _Graph:
 
     def parts(self, cloud: Output) -> None:
         """Furniture taken out, the rest split by class and thinned."""
-        if self.scanner and self.settings.params(FURNITURE).when == "auto":
-            self.add(FURNITURE, {"cloud": cloud} | self.scanner, **self.cell)
-            names = (*GROUPS[1:], "taken", "plates", "geojson", "csv")
+        if (self.scanner or self.adjoining) and self.settings.params(FURNITURE).when == "auto":
+            self.add(FINDS, {"cloud": cloud} | self.scanner, **self.cell)
+            found = {"finds": self.at(FINDS, "finds")} | self.of_neighbours(FINDS, "finds")
+            self.add(FURNITURE, {"cloud": cloud} | found, name=self.tile.name, **self.cell)
+            names = (*GROUPS[1:], "taken", "plates", "beside", "geojson", "csv")
             self.standing = {name: self.at(FURNITURE, name) for name in names}
         given = self.settings.params(SPLIT)
         self.kept = given.vehicles == "keep" and bool(self.listed)
@@ -276,7 +279,7 @@ class _Graph:
     def places(self) -> Sources:
         """Lists of what stands where, for the export."""
         lists: Sources = {}
-        if self.standing:
+        if self.standing and self.scanner:
             lists = {"furniture": self.standing["geojson"], "furniture_csv": self.standing["csv"]}
         if self.settings.params(SPLIT).vegetation != "mesh":
             clouds = {name: self.at(VOXEL, "cloud", name) for name in ("vegetation", "terrain")}
@@ -302,7 +305,7 @@ class _Graph:
             add(REFINE, _meshes(surfaces) | {"cloud.rest": clouds["cloud.rest"]} | self._moving() | seen)
             seen = {"views": at(REFINE, "views")}
         if self.photographed and self.standing and self.settings.params(SIGNS).when == "auto":
-            plates = {name: self.standing[name] for name in ("plates", "geojson")}
+            plates = {name: self.standing[name] for name in ("plates", "beside", "geojson")}
             add(SIGNS, _meshes(surfaces) | plates | seen | {"labels": evidence["labels"]}, **self.cell)
             surfaces |= {group: at(SIGNS, group) for group in self.groups if group in ("building", "vegetation")}
             lists |= {"furniture": at(SIGNS, "geojson"), "furniture_csv": at(SIGNS, "csv")}

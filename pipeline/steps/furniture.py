@@ -10,20 +10,18 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from scan2sim.pipeline.cells import Cell
-from scan2sim.pipeline.classes import CODE, NOISE, group_of
 from scan2sim.pipeline.ranges import Place
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.types import F32, I64, Frame, Mesh, PointCloud, Trajectory
+from scan2sim.pipeline.steps.finds import KINDS
+from scan2sim.pipeline.types import I64, Bools, Frame, Mesh, PointCloud
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.furniture import Thing
     from scan2sim.pipeline.plates import Plate
-    from scan2sim.pipeline.standing import Columns
 
-CELL = 0.5  # metres, of the ground's heights
-BORDER = 4.0  # metres to either side of a border of tiles: what stands there stays with the surfaces, alike in both
-LOW, HIGH = 0.2, 14.0  # metres above the ground where things are looked for
+    Bools = Bools
+
+AROUND = 4.0  # metres around its middle within which all of a thing's points lie
 COLUMNS = ("x", "y", "z", "kind", "height_m", "radius_m", "heading_deg", "shape", "plate_width_m", "plate_height_m")
 
 
@@ -33,67 +31,71 @@ class FurnitureParams(Params):
     Attributes:
         when: "auto": where the tile has a scanner's path, or photos from the ground; "never": signs, poles and trunks
             stay with the surfaces around them.
-        seed: the tile's (x, y), world metres, where it meets others: what stands beyond its cell is theirs, and what
-            stands within 4 m of a border stays with the surfaces in both; set by the recipe.
+        name: of the tile; set by the recipe.
+        seed: the tile's (x, y), world metres, where it meets others: what stands beyond its cell is theirs; set by the
+            recipe.
         neighbours: names of tiles whose cells touch to their seeds, world metres; set by the recipe.
     """
 
     when: Literal["auto", "never"] = "auto"
+    name: str = ""
     seed: Place | None = None
     neighbours: dict[str, Place] = Field(default_factory=dict)
 
 
 def furniture(inputs: Inputs, params: FurnitureParams, out: Path, report: Report) -> Done:
-    """Find what stands upright and thin in the classified `cloud`, seen from the scanner's `path`.
+    """Take the `finds` of the tile and of its neighbours, `finds.NAME`, out of the classified `cloud`.
+
+    All of a thing belongs to the tile in whose cell its foot stands; its points are taken out of every tile's surfaces
+    alike. What stands in the cell of a neighbour that isn't given is taken out, and shown by nobody.
 
     Files: `building` and `vegetation`, meshes of signs, poles and lamps, and of trunks, with a class code for every
-    face; `taken`, .npz with `index` (N,) of the cloud's points that are theirs; `geojson` and `csv`: places in the
-    tile's CRS, kind, height above the ground, radius, and of plates the way that they face (of lamps, that they
-    reach), clockwise from the CRS's north; `plates`, JSON list of all plates, local metres.
+    face; `taken`, .npz with `index` (N,) of the cloud's points that are a thing's, and which of them are an `own` one's
+    (N,); `geojson` and `csv`: places in the tile's CRS, kind, height above the ground, radius, and of plates the way
+    that they face (of lamps, that they reach), clockwise from the CRS's north; `plates`, JSON list of all plates, local
+    metres; `beside`, JSON list of the places (x, y, z) where the neighbours' poles stand, local metres.
     """
-    from scan2sim.pipeline.furniture import find
-    from scan2sim.pipeline.standing import Columns
-
-    cloud, path = PointCloud.load(inputs["cloud"]), Trajectory.load(inputs["path"])
-    assert cloud.classification is not None
-    ground = group_of()[cloud.classification] == 0
-    out_of_it = np.isin(cloud.classification, [*NOISE, CODE["vehicle"], CODE["person"]])
-    some = np.flatnonzero(~ground & ~out_of_it)
-    things: list[Thing] = []
-    taken = np.zeros(0, np.int64)
-    if ground.any() and len(some):
-        height = heights(cloud.xyz[ground], cloud.xyz[some])
-        some, height = some[(height > LOW) & (height < HIGH)], height[(height > LOW) & (height < HIGH)]
-        part = cloud.take(some)
-        report(0.3, "stems")
-        if len(part):
-            columns = Columns(part.xyz)
-            things = find(part, columns, height, path)
-    if params.seed is not None and things:
-        feet = np.array([thing.foot[:2] for thing in things]) + np.asarray(cloud.frame.origin[:2])
-        outside = Cell(params.seed, params.neighbours).outside(feet)
-        free = [thing for thing, s in zip(things, outside, strict=True) if abs(s) > BORDER]
-        shown = [thing for thing, s in zip(things, outside, strict=True) if s < -BORDER]
-        things = [thing for thing, s in zip(things, outside, strict=True) if s <= 0]
-    else:
-        free = shown = things
-    if free:
-        taken = some[_held(columns, free)]
-    np.savez(out / "taken.npz", index=taken)
+    cloud = PointCloud.load(inputs["cloud"])
+    own, others = _parted(inputs, params, cloud.frame)
+    report(0.5, "points")
+    index, whose = _held(cloud, own, others)
+    np.savez(out / "taken.npz", index=index, own=whose)
     files = {"taken": out / "taken.npz"}
     faces = 0
     for group, trunks in (("building", False), ("vegetation", True)):
-        mesh = _mesh(cloud.frame, [thing for thing in shown if (thing.kind == "trunk") == trunks])
+        mesh = _mesh(cloud.frame, [thing for thing in own if (thing.kind == "trunk") == trunks])
         mesh.save(out / f"{group}.npz")
         files[group] = out / f"{group}.npz"
         faces += len(mesh)
-    rows = [_row(thing, cloud.frame) for thing in things]
-    files |= listed(out, cloud.frame.crs, rows)
-    files["plates"] = out / "plates.json"
-    plates = [plate.to_json() for thing in shown for plate in thing.plates]
-    files["plates"].write_text(json.dumps(plates), encoding="utf-8")
-    kinds = {kind: sum(thing.kind == kind for thing in things) for kind in ("pole", "sign", "lamp", "trunk")}
-    return Done(files, {**kinds, "points": len(taken), "faces": faces})
+    files |= listed(out, cloud.frame.crs, [_row(thing, cloud.frame) for thing in own])
+    lists = {
+        "plates": [plate.to_json() for thing in own for plate in thing.plates],
+        "beside": [thing.foot.tolist() for thing in others if thing.kind != "trunk"],
+    }
+    for name, rows in lists.items():
+        files[name] = out / f"{name}.json"
+        files[name].write_text(json.dumps(rows), encoding="utf-8")
+    kinds = {kind: sum(thing.kind == kind for thing in own) for kind in KINDS}
+    return Done(files, {**kinds, "points": len(index), "of_neighbours": int((~whose).sum()), "faces": faces})
+
+
+def _parted(inputs: Inputs, params: FurnitureParams, frame: Frame) -> tuple[list[Thing], list[Thing]]:
+    """The tile's own things and its neighbours', local metres."""
+    from scan2sim.pipeline.borders.finds import agreed
+    from scan2sim.pipeline.furniture import Thing
+
+    def read(path: Path) -> list[Thing]:
+        return [Thing.from_json(row) for row in json.loads(path.read_text(encoding="utf-8"))]
+
+    finds = {params.name: read(inputs["finds"])}
+    finds |= {name: read(inputs[f"finds.{name}"]) for name in params.neighbours if f"finds.{name}" in inputs}
+    if params.seed is None:
+        told = [(params.name, thing) for thing in finds[params.name]]
+    else:
+        told = agreed(finds, {params.name: params.seed, **params.neighbours})
+    here = -np.asarray(frame.origin, np.float64)
+    own = [thing.moved(here) for name, thing in told if name == params.name]
+    return own, [thing.moved(here) for name, thing in told if name != params.name]
 
 
 def listed(out: Path, crs: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, Path]:
@@ -108,25 +110,21 @@ def listed(out: Path, crs: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, 
     return files
 
 
-def heights(ground: F32, xyz: F32) -> F32:
-    """(N,) metres of points (N, 3) above the lowest ground (M, 3) near them."""
-    from scipy import ndimage
+def _held(cloud: PointCloud, own: Sequence[Thing], others: Sequence[Thing]) -> tuple[I64, Bools]:
+    """(N,) indices of the points that are a thing's, ascending, and which of them are an own one's."""
+    from scan2sim.pipeline.furniture import eligible
+    from scan2sim.pipeline.standing import Columns
 
-    from scan2sim.pipeline.heightfield import Raster
-
-    raster = Raster.over(CELL, [ground, xyz])
-    low = -raster.highest(np.column_stack([ground[:, :2], -ground[:, 2]]).astype(np.float32))
-    nearest = ndimage.distance_transform_edt(np.isnan(low), return_distances=False, return_indices=True)
-    smooth = ndimage.median_filter(low[tuple(nearest)], 5)
-    return (xyz[:, 2] - smooth[raster.at(xyz)]).astype(np.float32)
-
-
-def _held(columns: Columns, things: list[Thing]) -> I64:
-    """Indices of the points that are one of the things' own."""
-    xyz = columns.xyz
-    near = [columns.near(thing.stem.middle, 4.0) for thing in things]
-    own = [index[thing.held(xyz[index])] for index, thing in zip(near, things, strict=True)]
-    return np.unique(np.concatenate([np.zeros(0, np.int64), *own]))
+    _, some = eligible(cloud)
+    xyz = cloud.xyz[some]
+    taken = np.zeros((2, len(some)), bool)
+    columns = Columns(xyz) if len(some) else None
+    for k, things in enumerate((own, others) if columns else ()):
+        for thing in things:
+            near = columns.near(thing.stem.middle, AROUND)
+            taken[k, near[thing.held(xyz[near])]] = True
+    held = taken.any(axis=0)
+    return some[held], taken[0, held]
 
 
 def _mesh(frame: Frame, things: list[Thing]) -> Mesh:
@@ -160,4 +158,4 @@ def of_plate(plate: Plate) -> dict[str, Any]:
     return {"heading_deg": round(heading, 1), "shape": plate.shape, **size}
 
 
-FURNITURE = Step("furniture", 3, furniture, FurnitureParams)
+FURNITURE = Step("furniture", 4, furniture, FurnitureParams)

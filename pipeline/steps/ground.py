@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from pydantic import Field
 
-from scan2sim.pipeline.cells import Cell
+from scan2sim.pipeline.cells import Cell, nearest
 from scan2sim.pipeline.classes import CODE
 from scan2sim.pipeline.ranges import Place
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.steps.overlap import nearest
 from scan2sim.pipeline.types import UNCOLOURED, Bools, Frame, PointCloud
 
 if TYPE_CHECKING:

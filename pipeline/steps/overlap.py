@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
-from scan2sim.pipeline.cells import Seed
+from scan2sim.pipeline.cells import nearest
 from scan2sim.pipeline.step import Done, Inputs, Report, Step
 from scan2sim.pipeline.steps.clip import CellParams
-from scan2sim.pipeline.types import F64, I64, PointCloud
+from scan2sim.pipeline.types import PointCloud
 
 
 class OverlapParams(CellParams):
@@ -57,16 +57,6 @@ def overlap(inputs: Inputs, params: OverlapParams, out: Path, report: Report) ->
     points = {name: len(part) for name, part in zip(given, parts, strict=True)}
     missing = [name for name in seeds if name not in given]
     return Done({"cloud": out / "cloud.npz"}, {"points_in": len(own), "points": points, "missing": missing})
-
-
-def nearest(xy: F64, seeds: list[Seed]) -> I64:
-    """(N,) index of the nearest seed to each world place (N, 2), the first of several as near."""
-    index, least = np.zeros(len(xy), np.int64), np.full(len(xy), np.inf)
-    for i, seed in enumerate(seeds):
-        square = ((xy - seed) ** 2).sum(axis=1)
-        nearer = square < least
-        index[nearer], least[nearer] = i, square[nearer]
-    return index
 
 
 OVERLAP = Step("overlap", 1, overlap, OverlapParams)

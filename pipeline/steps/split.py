@@ -13,8 +13,8 @@ from scan2sim.pipeline.errors import DataError
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.types import Bools, PointCloud
 
-FURNITURE, VEHICLE = len(GROUPS) + 1, len(GROUPS) + 2
-"""Of a point, beside the groups' numbers: it is street furniture's."""
+REST, FURNITURE, VEHICLE = -1, len(GROUPS) + 1, len(GROUPS) + 2
+"""Of a point, beside the groups' numbers: it is of no surface, street furniture's, a parked vehicle's."""
 NOTABLE = 0.01
 """Share of points without a class from which on a run warns."""
 AROUND = 0.4
@@ -37,10 +37,10 @@ class SplitParams(Params):
 def split(inputs: Inputs, params: SplitParams, out: Path, report: Report) -> Done:
     """Cut the classified `cloud` into `terrain`, `building`, `vegetation` and `rest`.
 
-    Signs and poles go with buildings, but for the points that `taken` (optional, `index` of an .npz) says are street
-    furniture's: they become `furniture`. To keep vehicles, `things` lists their boxes: points of the class in those of
-    parked ones become `vehicle`. Other vehicles, people, wires, noise and what has no class are
-    left out of the surface (`rest`), though they still hide what is behind them; noise is dropped.
+    Signs and poles go with buildings, but for the points that `taken` (optional, `index` and `own` of an .npz) says are
+    street furniture's: they become `furniture`, and those of a neighbouring tile's `rest`. To keep vehicles, `things`
+    lists their boxes: points of the class in those of parked ones become `vehicle`. Other vehicles, people, wires and
+    what has no class are left out of the surface (`rest`), though they still hide what is behind; noise is dropped.
 
     Raises:
         DataError: no point belongs to any surface.
@@ -50,7 +50,7 @@ def split(inputs: Inputs, params: SplitParams, out: Path, report: Report) -> Don
     group = group_of()[cloud.classification]
     if "taken" in inputs:
         with np.load(inputs["taken"]) as taken:
-            group[taken["index"]] = FURNITURE
+            group[taken["index"]] = np.where(taken["own"], FURNITURE, REST)
     files, counts, warnings = {}, {}, []
     parts = [*GROUPS, "rest"] + (["furniture"] if "taken" in inputs else [])
     if params.vehicles == "keep" and "things" in inputs:
@@ -62,7 +62,7 @@ def split(inputs: Inputs, params: SplitParams, out: Path, report: Report) -> Don
     number |= {"furniture": FURNITURE, "vehicle": VEHICLE}
     for i, name in enumerate(parts):
         report(i / len(parts), name)
-        chosen = (group == -1) & ~np.isin(cloud.classification, NOISE) if name == "rest" else group == number[name]
+        chosen = (group == REST) & ~np.isin(cloud.classification, NOISE) if name == "rest" else group == number[name]
         part = cloud.take(np.flatnonzero(chosen))
         part.save(out / f"{name}.npz")
         files[name] = out / f"{name}.npz"
@@ -109,4 +109,4 @@ def parked(cloud: PointCloud, things: Path) -> Bools:
     return inside
 
 
-SPLIT = Step("split", 4, split, SplitParams)
+SPLIT = Step("split", 5, split, SplitParams)

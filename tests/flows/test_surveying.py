@@ -64,6 +64,18 @@ def test_tiles_share_their_borders(made: Path) -> None:
     assert border["colour_step"] < 2
 
 
+def test_furniture_is_listed_by_the_tile_in_whose_cell_it_stands(made: Path, survey: Path) -> None:
+    feet = []
+    for path in sorted(survey.glob("*/tile.toml")):
+        tile = read_tile(path)
+        (listed,) = made.glob(f"tiles/{tile.name}/**/furniture.geojson")
+        places = [f["geometry"]["coordinates"][:2] for f in json.loads(listed.read_text())["features"]]
+        assert tile.cell is not None and (tile.cell.outside(np.array(places).reshape(-1, 2)) <= 0).all()
+        feet += places
+    apart = cKDTree(feet).query(feet, k=2)[0][:, 1]
+    assert len(feet) >= 3 and apart.min() > 0.5
+
+
 def test_the_road_over_both_tiles_is_one(made: Path) -> None:
     (network,) = (made / "world").glob("*.xodr")
     roads = ET.parse(network).getroot().findall("road")

@@ -17,6 +17,7 @@ from scan2sim.pipeline.plates import OUTLINES, Shape, inside, plates
 from scan2sim.pipeline.standing import Columns, stems
 from scan2sim.pipeline.step import Done, silent
 from scan2sim.pipeline.steps.decimate import DECIMATE, DecimateParams
+from scan2sim.pipeline.steps.finds import FINDS, FindsParams
 from scan2sim.pipeline.steps.furniture import FURNITURE, FurnitureParams
 from scan2sim.pipeline.steps.split import SPLIT, SplitParams
 from scan2sim.pipeline.types import Mesh, PointCloud, Trajectory
@@ -36,7 +37,9 @@ def street(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 def _run(street: tuple[Path, Path], out: Path, **params: Any) -> tuple[list[dict[str, Any]], Done]:
     out.mkdir()
-    done = FURNITURE.run({"cloud": street[0], "path": street[1]}, FurnitureParams(**params), out, silent)
+    cloud = {"cloud": street[0]}
+    found = FINDS.run(cloud | {"path": street[1]}, FindsParams(**params), out, silent)
+    done = FURNITURE.run(cloud | found.files, FurnitureParams(**params), out, silent)
     features = json.loads(done.files["geojson"].read_text())["features"]
     return [f["properties"] | {"at": np.array(f["geometry"]["coordinates"]) - FRAME.origin} for f in features], done
 
@@ -80,17 +83,6 @@ def test_signs_look_where_they_look_in_their_size(street: tuple[Path, Path], tmp
         assert sign["shape"] == "rectangle"
         assert sign["plate_width_m"] == pytest.approx(0.72, abs=0.04)
         assert sign["plate_height_m"] == pytest.approx(0.72, abs=0.04)
-
-
-def test_each_thing_belongs_to_one_tile(street: tuple[Path, Path], tmp_path: Path) -> None:
-    whole, _ = _run(street, tmp_path / "whole")
-    origin = np.array(FRAME.origin[:2])
-    west, east = tuple(origin + (-5, 0)), tuple(origin + (5, 0))
-    halves = [
-        _run(street, tmp_path / str(i), seed=seed, neighbours={"other": other})[0]
-        for i, (seed, other) in enumerate([(west, east), (east, west)])
-    ]
-    assert all(halves) and sum(map(len, halves)) == len(whole)
 
 
 def test_things_keep_their_triangles_and_classes_within_the_target(tmp_path: Path) -> None:

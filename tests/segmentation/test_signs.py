@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from scan2sim.pipeline import primitives
+from scan2sim.pipeline.cells import Cell
 from scan2sim.pipeline.classes import CODE
 from scan2sim.pipeline.furniture import sheet
 from scan2sim.pipeline.io import image
@@ -16,6 +18,7 @@ from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.plates import Plate, inside
 from scan2sim.pipeline.step import Done, silent
 from scan2sim.pipeline.types import F32, F64, U8, Camera, Frame, Mesh, View
+from scan2sim.segmentation.hanging import cleared
 from scan2sim.segmentation.labels import CLASSES
 from scan2sim.segmentation.signs import SIGNS, SignsParams
 
@@ -74,8 +77,8 @@ def _photo(view: View, plates: list[Plate]) -> tuple[U8, U8]:
     return photo.round().astype(np.uint8), small.round().astype(np.uint8)
 
 
-def _run(folder: Path, plates: list[Plate], known: list[Plate]) -> Done:
-    """The step, on a street where `plates` hang and `known` were found among points."""
+def _run(folder: Path, plates: list[Plate], known: list[Plate], theirs: bool = False, **params: Any) -> Done:
+    """The step, on a street where `plates` hang and `known` were found among points, on a pole or on `theirs`."""
     views = _views(folder)
     labels = folder / "labels"
     labels.mkdir()
@@ -96,15 +99,19 @@ def _run(folder: Path, plates: list[Plate], known: list[Plate]) -> Done:
     flat = np.array([(-20, -20, 0), (40, -20, 0), (40, 20, 0), (-20, 20, 0)], np.float32)
     Mesh(FRAME, flat, np.array([[0, 1, 2], [0, 2, 3]], np.int32)).save(folder / "terrain.npz")
     (folder / "plates.json").write_text(json.dumps([plate.to_json() for plate in known]))
-    place = FRAME.to_crs([14.05, -3, 0]).tolist()
+    foot = (14.05, -3.0, 0.0)
+    (folder / "beside.json").write_text(json.dumps([foot] if theirs else []))
+    place = FRAME.to_crs(foot).tolist()
     pole = {"geometry": {"coordinates": place}, "properties": {"kind": "pole", "height_m": 3.0, "radius_m": 0.04}}
-    (folder / "furniture.geojson").write_text(json.dumps({"features": [pole]}))
+    (folder / "furniture.geojson").write_text(json.dumps({"features": [] if theirs else [pole]}))
     inputs = {f"mesh.{group}": folder / f"{group}.npz" for group in ("terrain", "building")}
-    inputs |= {"plates": folder / "plates.json", "geojson": folder / "furniture.geojson"}
+    inputs |= {name: folder / f"{name}.json" for name in ("plates", "beside")} | {
+        "geojson": folder / "furniture.geojson"
+    }
     inputs |= {"views": folder / "views.json", "labels": labels}
     out = folder / "out"
     out.mkdir()
-    return SIGNS.run(inputs, SignsParams(), out, silent)
+    return SIGNS.run(inputs, SignsParams(**params), out, silent)
 
 
 def _hung(done: Done) -> list[F32]:
@@ -139,6 +146,28 @@ def test_a_sign_is_whole_where_photos_show_it(tmp_path: Path, known: list[Plate]
     row = feature["properties"]
     assert row["kind"] == "sign" and row["shape"] == "disc" and row["radius_m"] == 0.04
     assert row["height_m"] == pytest.approx(3.5, abs=0.03) and row["plate_width_m"] == pytest.approx(0.6, abs=0.03)
+
+
+@pytest.mark.parametrize("theirs", [False, True])
+def test_plates_at_a_border_are_fitted_by_the_tile_of_their_pole(tmp_path: Path, theirs: bool) -> None:
+    x, y, _ = FRAME.origin
+    middle = x + SIGN.centre[0] + 0.2
+    beside = {"seed": (middle - 5, y), "neighbours": {"other": (middle + 5, y)}}
+    done = _run(tmp_path, [SIGN, BELOW], [], theirs, **beside)
+    assert done.facts["fitted"] == (0 if theirs else 2)
+
+
+def test_edges_on_a_border_stay_where_a_plate_is_put_up() -> None:
+    x, y, z = SIGN.centre
+    corners = np.array(
+        [(x - 0.1, y, z), (x, y, z), (x - 0.1, y, z + 0.1), (x, y, z + 0.1), (x - 0.2, y, z)], np.float32
+    )
+    mesh = Mesh(FRAME, corners, np.array([[0, 1, 2], [1, 3, 2], [4, 0, 2]], np.int32))
+    middle = FRAME.origin[0] + float(corners[1, 0])
+    cell = Cell((middle - 5, FRAME.origin[1]), {"other": (middle + 5, FRAME.origin[1])})
+    assert len(cleared(mesh, [SIGN])) == 0
+    left = cleared(mesh, [SIGN], cell)
+    assert len(left) == 1 and left.vertices[:, 0].max() == corners[1, 0]
 
 
 def test_where_photos_show_nothing_plates_stay_as_points_tell(tmp_path: Path) -> None:

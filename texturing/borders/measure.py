@@ -11,6 +11,7 @@ from scan2sim.pipeline.cells import Cell
 from scan2sim.pipeline.classes import SURFACES
 from scan2sim.pipeline.step import Done, Inputs, Report, Step
 from scan2sim.pipeline.steps.clip import CellParams
+from scan2sim.pipeline.types import Mesh
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.io.textured import Textured
@@ -25,7 +26,7 @@ def borders(inputs: Inputs, params: CellParams, out: Path, report: Report) -> Do
     Facts, by neighbour and class: `length_m` of border; `gap_m`, the farthest that a place of one mesh's border is
     from the other's, where that goes on alongside (`gap_p99_m`: 99 of 100 places are nearer); `one_sided_m`, where it
     doesn't; `shared`, of 1, the border edges that are the very same in both; `overlap_m` beyond the border;
-    `colour_step` and its 95th percentile, grey levels.
+    `colour_step` and its 95th percentile, grey levels. Street furniture has no border.
     """
     from scan2sim.pipeline.io import textured
 
@@ -44,13 +45,18 @@ def borders(inputs: Inputs, params: CellParams, out: Path, report: Report) -> Do
 def _measured(own: Textured, other: Textured, cell: Cell, name: str) -> dict[str, float]:
     from scan2sim.pipeline.borders.gap import gap
 
-    between, (step, p95, _) = gap(own.mesh, other.mesh, cell, name), colour_step(own, other)
+    between, (step, p95, _) = gap(_surface(own.mesh), _surface(other.mesh), cell, name), colour_step(own, other)
     values = {
         "length_m": between.length_m, "gap_m": between.max_m, "gap_p99_m": between.p99_m,
         "one_sided_m": between.one_sided_m,
         "shared": between.shared, "overlap_m": between.overlap_m, "colour_step": step, "colour_step_p95": p95,
     }  # fmt: skip
     return {key: round(float(value), 6 if key.startswith("gap") else 4) for key, value in values.items()}
+
+
+def _surface(mesh: Mesh) -> Mesh:
+    """What of a mesh is no street furniture."""
+    return mesh if mesh.classification is None else mesh.keep(mesh.classification == 0)
 
 
 def colour_step(a: Textured, b: Textured) -> tuple[float, float, float]:
@@ -72,4 +78,4 @@ def colour_step(a: Textured, b: Textured) -> tuple[float, float, float]:
     return float(step.mean()), float(np.percentile(step, 95)), border.length[0]
 
 
-BORDERS = Step("borders", 2, borders, CellParams)
+BORDERS = Step("borders", 3, borders, CellParams)
