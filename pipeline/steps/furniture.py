@@ -118,11 +118,12 @@ def _held(cloud: PointCloud, own: Sequence[Thing], others: Sequence[Thing]) -> t
     _, some = eligible(cloud)
     xyz = cloud.xyz[some]
     taken = np.zeros((2, len(some)), bool)
-    columns = Columns(xyz) if len(some) else None
-    for k, things in enumerate((own, others) if columns else ()):
-        for thing in things:
-            near = columns.near(thing.stem.middle, AROUND)
-            taken[k, near[thing.held(xyz[near])]] = True
+    if len(some) and (own or others):
+        columns = Columns(xyz)
+        for k, things in enumerate((own, others)):
+            for thing in things:
+                near = columns.near(thing.stem.middle, AROUND)
+                taken[k, near[thing.held(xyz[near])]] = True
     held = taken.any(axis=0)
     return some[held], taken[0, held]
 
