@@ -68,8 +68,8 @@ def test_furniture_is_listed_by_the_tile_in_whose_cell_it_stands(made: Path, sur
     feet = []
     for path in sorted(survey.glob("*/tile.toml")):
         tile = read_tile(path)
-        (listed,) = made.glob(f"tiles/{tile.name}/**/furniture.geojson")
-        places = [f["geometry"]["coordinates"][:2] for f in json.loads(listed.read_text())["features"]]
+        listed = json.loads((made / "tiles" / tile.name / "world" / "furniture.geojson").read_text())
+        places = [f["geometry"]["coordinates"][:2] for f in listed["features"]]
         assert tile.cell is not None and (tile.cell.outside(np.array(places).reshape(-1, 2)) <= 0).all()
         feet += places
     apart = cKDTree(feet).query(feet, k=2)[0][:, 1]
