@@ -230,8 +230,8 @@ def test_surfaces_meet_vertex_for_vertex(tiles: dict[str, Tile], clouds: dict[st
 def test_what_one_tile_alone_finds_goes_from_both(
     silent_one: str, tiles: dict[str, Tile], clouds: dict[str, Path], tmp_path: Path
 ) -> None:
-    (tmp_path / "nothing.json").write_text("[]")
-    found = {name: tile.found for name, tile in tiles.items()} | {silent_one: tmp_path / "nothing.json"}
+    nothing = go(FINDS, tmp_path / "nothing", {"cloud": clouds[silent_one]}, **known(silent_one))  # it has no path
+    found = {name: tile.found for name, tile in tiles.items()} | {silent_one: nothing.files["finds"]}
     made = {name: furnish(clouds, found, name, tmp_path / name) for name in FRAMES}
     east, west = ({tuple(p) for p in tile.taken.tolist() if abs(p[0] - X) <= BUFFER} for tile in made.values())
     assert east == west
