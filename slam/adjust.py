@@ -7,7 +7,7 @@ that neither odometry nor the adjustment has used (`witness.py`) tell which of b
 from __future__ import annotations
 
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +20,14 @@ from scan2sim.pipeline.io.colmap_writer import write as write_colmap
 from scan2sim.pipeline.similarity import umeyama
 from scan2sim.pipeline.types import F64, Trajectory
 from scan2sim.slam.geometry import angles
+from scan2sim.slam.graph import Graph
 from scan2sim.slam.mapped import Mapped
 from scan2sim.slam.sparse import Kept, kept, move
-from scan2sim.slam.witness import judge
+from scan2sim.slam.witness import judge, laid
 
-LOSS = 0.3
-"""Pixels, of Cauchy's loss: some twice what bearings are off by."""
+LOSS = 3.0
+"""Times the median error, beyond which Cauchy's loss counts observations ever less: that loses little of what Gaussian
+errors tell."""
 WRONG = 2.0
 """Observations off by more than so many times the odometry's gate are left out."""
 EDGE, POLE = 20.0, 0.9
@@ -84,6 +86,10 @@ def adjusted(mapped: Mapped) -> Adjusted:
     poses = np.stack([k.T_world_cam for k in keyframes])
     known = kept(mapped)
     camera = mapped.map.camera
+    still = np.ones(len(poses), bool)
+    graph = Graph(poses, known.xyz, known.point, known.keyframe, known.bearing, still, mapped.map.sigma)
+    xyz = laid(graph)  # cameras have moved since some points left the window
+    known = replace(known, xyz=np.where(np.isfinite(xyz), xyz, known.xyz))
     uv, inside = project(camera, known.bearing)
     error = angles(poses[known.keyframe], known.xyz[known.point], known.bearing)
     inside &= error < WRONG * mapped.map.gate
@@ -93,6 +99,8 @@ def adjusted(mapped: Mapped) -> Adjusted:
         inside &= (np.abs(uv[:, 0] - camera.width / 2) < camera.width / 2 - EDGE) & (np.abs(known.bearing[:, 1]) < POLE)
     seen = np.bincount(known.point[inside], minlength=len(known.xyz))
     inside &= seen[known.point] > 1
+    if not inside.any():
+        return Adjusted(known, poses, known.xyz, 0.0, 0.0)
     path = Trajectory(np.arange(len(poses), dtype=np.float64), poses[:, :3, 3], poses[:, :3, :3])
     sparse = SparseMap(known.xyz, known.point[inside], known.keyframe[inside], uv[inside].astype(np.float64))
     with tempfile.TemporaryDirectory(prefix="scan2sim-adjust-") as folder:
@@ -103,7 +111,7 @@ def adjusted(mapped: Mapped) -> Adjusted:
     options.refine_focal_length = options.refine_principal_point = options.refine_extra_params = False
     options.print_summary = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.loss_function_scale = LOSS
+    options.ceres.loss_function_scale = LOSS * float(np.median(error[inside])) / mapped.map.pixel
     options.ceres.solver_options.max_num_iterations = 50
     pycolmap.bundle_adjustment(model, options)
     model.update_point_3d_errors()

@@ -130,7 +130,7 @@ class LocalMap:
     ) -> None:
         """`pixel`: radians; `backend`: name of one of `slam.solvers`; `keep`: remember what has left the window."""
         self.camera, self.params, self.gps, self.backend, self.keep = camera, params, gps, backend, keep
-        self.sigma = params.sigma * pixel
+        self.pixel, self.sigma = pixel, params.sigma * pixel
         self.gate = 4 * self.sigma
         self.keyframes: list[Keyframe] = []
         self.landmarks = Landmarks()

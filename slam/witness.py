@@ -44,7 +44,6 @@ def judge(found: LocalMap, first: F64, second: F64) -> Verdict:
     if not len(names):
         return Verdict(0, 0.0)
     still = found.graph(which, seen, names, np.zeros((len(names), 3)), np.ones(len(which), bool))
-    still = replace(still, shared_sigma=np.full(len(still.shared), 1e-9))
     before, after = (_errors(replace(still, poses=poses)) for poses in (first, second))
     sure = np.isfinite(before) & np.isfinite(after)
     sure = np.bincount(still.point_of, ~sure, minlength=len(names))[still.point_of] == 0
@@ -58,9 +57,14 @@ def judge(found: LocalMap, first: F64, second: F64) -> Verdict:
 
 def _errors(graph: Graph) -> F64:
     """(O,) radians of observations of points that lie where a graph's cameras see them best; NaN: nowhere."""
+    return errors(graph, graph.poses, laid(graph), graph.shared)
+
+
+def laid(graph: Graph) -> F64:
+    """(P, 3) points where a graph's cameras, which stay, see them best; NaN: nowhere."""
+    graph = replace(graph, fixed=np.ones(len(graph.poses), bool), shared_sigma=np.full(len(graph.shared), 1e-9))
     starts = np.searchsorted(graph.point_of, np.arange(len(graph.points) + 1))
     xyz, _ = triangulate(graph.poses, starts, graph.camera_of, graph.bearing)
-    known = np.isfinite(xyz[:, 0])
-    graph = replace(graph, points=np.where(known[:, None], xyz, 1e3))
-    solved = solvers.named("lm").solve(graph)
-    return np.where(known[graph.point_of], errors(graph, graph.poses, solved.points, graph.shared), np.nan)
+    known = np.isfinite(xyz[:, :1])
+    solved = solvers.named("lm").solve(replace(graph, points=np.where(known, xyz, 1e3)))
+    return np.where(known, solved.points, np.nan)

@@ -23,4 +23,4 @@ def can_adjust(params: Params) -> None:
     need("--adjust", "pycolmap")
 
 
-ADJUST = Step("adjust", 3, adjust_all, Params, check=can_adjust)
+ADJUST = Step("adjust", 4, adjust_all, Params, check=can_adjust)
