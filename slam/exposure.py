@@ -17,6 +17,8 @@ ENOUGH = 30
 """Features from which both numbers can be told."""
 AROUND = 17
 """Pixels, of the square about a feature whose mean is taken: Lucas-Kanade's larger one."""
+SURROUNDINGS = 31
+"""Pixels, of the square about a pixel whose mean is taken from it: well over Lucas-Kanade's smaller one."""
 STEADY = 0.05
 """Gains nearer to 1 than this, and changes of the mean below it, aren't told from none: where the exposure is held,
 what comes nearer looks otherwise by some 2 % (one standard deviation; two real streets and a rendered one), which
@@ -39,6 +41,17 @@ class Exposure(NamedTuple):
         if self.gain < 1:
             return first, _lit(second, 1 / self.gain, -self.offset / self.gain)
         return _lit(first, self.gain, self.offset), second
+
+
+def level(picture: U8) -> U8:
+    """By how much each value is above the mean about it, plus 128: how bright the picture is doesn't count any more.
+
+    Lucas-Kanade shifts a feature by what its square is brighter or darker by, and by as much back: unnoticed.
+    """
+    import cv2
+
+    mean = cv2.blur(picture, (SURROUNDINGS, SURROUNDINGS))
+    return np.asarray(cv2.addWeighted(picture, 1.0, mean, -1.0, 128.0), np.uint8)
 
 
 def _lit(picture: U8, gain: float, offset: float) -> U8:

@@ -1,8 +1,8 @@
 """Corners, followed from frame to frame by pyramidal Lucas-Kanade, each in its facet of the sphere.
 
 Needs no weights. A corner is followed there and back; one that doesn't return to where it was is lost. Pictures are
-brought to one exposure before (`exposure.py`). What is found is laid onto what the corner looked like at first
-(`patches.py`): a corner that looks otherwise is lost, too.
+brought to one exposure before, and what is left of its change is taken out (`exposure.py`). What is found is laid onto
+what the corner looked like at first (`patches.py`): a corner that looks otherwise is lost, too.
 """
 
 from __future__ import annotations
@@ -87,6 +87,7 @@ class CornerTracker:
         alike = exposure.between(old, new, start, guess).alike(old, new)
         there, ok, _ = flow(*alike, start, guess.copy(), WINDOW, LEVELS)
         old, new = exposure.between(old, new, start, np.where(ok > 0, there, np.nan)).alike(old, new)
+        old, new = exposure.level(old), exposure.level(new)
         there, ok2, _ = flow(old, new, start, there, FINE, 1)
         back, ok3, _ = flow(new, old, there, start.copy(), FINE, 1)
         good = ((ok > 0) & (ok2 > 0) & (ok3 > 0)).ravel() & (np.linalg.norm(back - start, axis=1) < RETURN)

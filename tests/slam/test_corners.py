@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+import cv2
 import numpy as np
 import pytest
 
@@ -10,7 +11,7 @@ from scan2sim.pipeline.types import F32, F64, U8, Camera
 from scan2sim.slam import exposure
 from scan2sim.slam.facets import Facets
 from scan2sim.slam.geometry import exp_so3, relative_pose, rigid
-from scan2sim.slam.trackers.corners import CornerTracker
+from scan2sim.slam.trackers.corners import FINE, CornerTracker, flow
 
 CAMERA = Camera("equirectangular", 768, 384)
 
@@ -96,6 +97,20 @@ def test_a_change_of_exposure_is_told_and_loses_no_corner(gain: float, offset: f
     told = exposure.between(first, tracker.pictures[0], there, now)
     assert told.gain == pytest.approx(gain, rel=0.03) and told.offset == pytest.approx(offset, abs=4)
     assert followed[1] > 0.95 * followed[0]
+
+
+@pytest.mark.parametrize(("gain", "offset"), [(1.0, 12), (0.9, 0), (1.1, 0)])
+def test_a_change_of_light_that_is_told_wrongly_moves_no_corner(gain: float, offset: float) -> None:
+    first = frame(sphere(), np.eye(3))
+    second = np.clip(gain * (first.astype(np.float64) // 2 + 60) + offset, 0, 255).astype(np.uint8)
+    first = first // 2 + 60
+    start = cv2.goodFeaturesToTrack(first, 200, 0.01, 12).reshape(-1, 2)
+
+    def off(old: np.ndarray, new: np.ndarray) -> float:
+        there, found, _ = flow(old, new, start, start.copy(), FINE, 1)
+        return float(np.median(np.linalg.norm(there - start, axis=1)[found.ravel() > 0]))
+
+    assert off(exposure.level(first), exposure.level(second)) < 0.3 * off(first, second)
 
 
 def test_nothing_is_found_or_followed_on_the_car() -> None:
