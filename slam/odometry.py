@@ -26,6 +26,9 @@ from scan2sim.slam.relocalise import Remembered, describe, relocalise
 from scan2sim.slam.trackers import Tracker, Tracks
 from scan2sim.slam.trackers import named as tracker_named
 
+AROUND, AHEAD = 3.0, 1.0
+"""Degrees of parallax to a keyframe, for 360 cameras and for others; the latter's maps begin with no more, whatever is
+asked: straight ahead features leave the view before they have moved much."""
 LOST = 0.4
 """Seconds after which a new map is begun."""
 QUARREL = 0.4, 2.5
@@ -117,7 +120,8 @@ class Odometry:
         self._pose, self._time = np.eye(4), 0.0
         self._velocity = np.zeros(6)
         self._started = self._blind = False
-        self._parallax = math.radians(params.parallax or (1.0 if self.facets.whole else 3.0))
+        self._parallax = math.radians(params.parallax or (AHEAD if self.facets.whole else AROUND))
+        self._begins = min(self._parallax, math.radians(AHEAD)) if self.facets.whole else self._parallax
         self._waiting: list[Tracks] = []  # of frames since the first keyframe of a map, or since the car moved
         self._settled = 0
         self._adrift = False  # nothing ties this map to those before
@@ -276,7 +280,7 @@ class Odometry:
             return
         if moved > math.radians(0.5):
             found = relative_pose(there, now, threshold=self.map.gate, rng=self._rng)
-        if found is None or _median_angle(now @ found[0][:3, :3].T, there) < self._parallax:
+        if found is None or _median_angle(now @ found[0][:3, :3].T, there) < self._begins:
             self._waiting.append(self.tracker.tracks)
             self._place(time, guess if self.map.part else first.T_world_cam, unsure=self.map.part > 0)
             return

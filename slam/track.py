@@ -22,7 +22,7 @@ from scan2sim.slam.trackers import Tracks
 from scan2sim.slam.trackers.descriptors import SeenInFacet
 from scan2sim.slam.video import Video
 
-VERSION = 10
+VERSION = 11
 """Raised whenever the same video comes to another trajectory with the same options: what older code left, a state of an
 interrupted run or a trajectory that is kept, is begun anew then."""
 KEEP_EVERY = 60.0

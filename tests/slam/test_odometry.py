@@ -11,7 +11,7 @@ from scan2sim.slam.mapped import Mapped
 from scan2sim.slam.odometry import Odometry, OdometryParams
 from tests.present import present
 from tests.slam.conftest import Drive
-from tests.slam.made_up import Follower, Narrow, drive, gps_of, run, scatter
+from tests.slam.made_up import LENS, Follower, Narrow, drive, gps_of, run, scatter
 
 
 def positions(odometry: Odometry) -> F64:
@@ -156,3 +156,13 @@ def test_what_left_the_window_is_forgotten_unless_it_is_to_be_kept() -> None:
     odometry = run(times, Follower(poses, scatter(poses)), window=5, anchors=2)
     held = [len(k.ids) > 0 for k in odometry.map.keyframes]
     assert len(held) > 12 and sum(held) <= 8 and not odometry.map.retired
+
+
+def test_a_perspective_map_begins_straight_ahead_however_far_keyframes_are_to_be_apart() -> None:
+    times, poses = drive(5, turn=0.0)
+    tracker = Narrow(poses, scatter(poses, 8000), noise=np.radians(0.01))
+    odometry = Odometry(LENS, OdometryParams(parallax=20.0), tracker=tracker)
+    for time in times:
+        odometry.add(float(time), np.zeros((4, 8), np.uint8))
+    assert odometry.map.part == 0 and len(odometry.map.keyframes) > 1
+    assert odometry.map.keyframes[1].time < 2.5
