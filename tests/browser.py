@@ -67,8 +67,8 @@ class Page:
         end = time.monotonic() + seconds
         while not self.value(script):
             if time.monotonic() > end:
-                shown = self.value("document.body.innerText")
-                raise AssertionError(f"never true: {script}; errors: {self.errors}; the page: {shown}")
+                shown = self.value("`${document.hidden ? 'hidden' : 'shown'}: ${document.body.innerText}`")
+                raise AssertionError(f"never true: {script}; errors: {self.errors}; the page, {shown}")
             time.sleep(0.05)
 
     def click(self, selector: str) -> None:
@@ -131,7 +131,10 @@ def chromium(folder: Path, *flags: str) -> Iterator[Page]:
             port, path = (profile / "DevToolsActivePort").read_text().split()
             with connect(f"ws://127.0.0.1:{port}{path}", max_size=None) as whole:
                 browser = Page(whole)
-                target = browser.do("Target.getTargets")["targetInfos"][0]["targetId"]
+                while not (targets := browser.do("Target.getTargets", filter=[{"type": "page"}])["targetInfos"]):
+                    assert time.monotonic() < end, "Chromium opens no page"
+                    time.sleep(0.05)
+                target = targets[0]["targetId"]  # others, of its own extensions, are never shown
             with connect(f"ws://127.0.0.1:{port}/devtools/page/{target}", max_size=None) as socket:
                 page = Page(socket)
                 page.do("Page.enable")
