@@ -10,9 +10,9 @@ OUT ?= demo-out
 demo: .venv/.installed
 	$(BIN)/scan2sim run $(TILE) --out $(OUT) --hold-out 8 --set segment.overwrite=true
 
-# three at a time, as many tests wait; in their order: else the longest files, which hold few tests, come last
+# in their order: else the longest files, which hold few tests, come last
 test: .venv/.installed-dev .venv-ros lint
-	$(BIN)/python -m pytest -m "not slow" -n 3 --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest -m "not slow" -n 2 --dist loadfile --no-loadscope-reorder
 
 test-all: .venv/.installed-dev .venv-ros lint
 	$(BIN)/python -m pytest

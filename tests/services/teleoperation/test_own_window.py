@@ -46,6 +46,7 @@ def cockpit(tmp_path: Path) -> Iterator[Cockpit]:
         yield made
 
 
+@pytest.mark.slow
 def test_the_page_is_shown_in_a_window_and_closing_it_lets_go(cockpit: Cockpit, display: str) -> None:
     def windows() -> str:
         return subprocess.run(["xwininfo", "-root", "-tree"], capture_output=True, text=True, check=True).stdout
