@@ -11,14 +11,14 @@ import numpy as np
 
 from scan2sim.pipeline.classes import CODE
 from scan2sim.pipeline.io import geojson
-from scan2sim.pipeline.io.scene import Scene, describe, keep, read_scene
+from scan2sim.pipeline.io.scene import PATH, Scene, describe, keep, read_scene
 from scan2sim.pipeline.primitives import tube
 from scan2sim.pipeline.render import look_at, pinhole
 from scan2sim.pipeline.step import Done, silent
 from scan2sim.pipeline.steps.collision import COLLISION, CollisionParams
 from scan2sim.pipeline.steps.decimate import with_things
 from scan2sim.pipeline.steps.export import EXPORT, ExportParams
-from scan2sim.pipeline.types import Frame, Mesh, View
+from scan2sim.pipeline.types import Frame, Mesh, Trajectory, View
 
 UTM = Frame("EPSG:32632", (690_000.0, 5_335_000.0, 500.0))
 HOUSE = (4.0, 2.0)  # its corner of least x and y; it measures 3 x 2 x 5 m
@@ -142,3 +142,12 @@ def scene(folder: Path, frame: Frame = UTM, tiles: int = 2, apart: float = 25.0)
         names.append(f"tile{i}")
     describe(world, "town", frame, names)
     return read_scene(world)
+
+
+def driven(out: Path) -> Scene:
+    """One tile of it, and a way past the house's south on which it was driven through."""
+    made = scene(out, tiles=1)
+    x = np.linspace(-6.0, 8.0, 33)
+    places = np.column_stack([x, np.full(33, -2.0), height(x, np.full(33, -2.0)) + 2])
+    Trajectory(np.arange(33.0), places).save(made.tiles[0].folder / PATH)
+    return made

@@ -10,8 +10,8 @@ import pytest
 pytest.importorskip("OpenSSL", reason="the extra teleop isn't installed")
 pytest.importorskip("av", reason="the extra teleop isn't installed")
 
-from scan2sim.pipeline.io.scene import PATH, Scene
-from scan2sim.pipeline.types import F64, Trajectory
+from scan2sim.pipeline.io.scene import Scene
+from scan2sim.pipeline.types import F64
 from scan2sim.services.teleoperation import route
 from scan2sim.services.teleoperation.controls import VehicleState
 from scan2sim.services.teleoperation.messages import Telemetry
@@ -55,11 +55,7 @@ def test_a_vehicle_that_does_not_tell_where_it_is_is_driven_straight_on() -> Non
 @pytest.fixture(scope="module")
 def street(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     """A tile that was driven through."""
-    scene = made_up.scene(tmp_path_factory.mktemp("street"), tiles=1)
-    x = np.linspace(-6.0, 8.0, 33)
-    places = np.column_stack([x, np.full(33, -2.0), made_up.height(x, np.full(33, -2.0)) + 2])
-    Trajectory(np.arange(33.0), places).save(scene.tiles[0].folder / PATH)
-    return scene
+    return made_up.driven(tmp_path_factory.mktemp("street"))
 
 
 def test_a_car_is_driven_along_a_world_s_way_again_and_again(street: Scene, monkeypatch: pytest.MonkeyPatch) -> None:

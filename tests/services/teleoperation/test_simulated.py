@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.io.scene import PATH, Scene
-from scan2sim.pipeline.types import Trajectory
+from scan2sim.pipeline.io.scene import Scene
 from scan2sim.services.teleoperation.controls import STOP, Controls, Gear, VehicleState
 from scan2sim.services.teleoperation.simulated import LONGEST_STEP, Bicycle, Car, Ground, Place, SimulatedCar
 from tests.pipeline import made_up
@@ -66,11 +65,7 @@ def test_reverse_does_not_go_in_at_speed() -> None:
 @pytest.fixture(scope="module")
 def street(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     """A tile with a house at (4..7, 2..4), and a way past its south."""
-    scene = made_up.scene(tmp_path_factory.mktemp("street"), tiles=1)
-    x = np.linspace(-6.0, 8.0, 33)
-    places = np.column_stack([x, np.full(33, -2.0), made_up.height(x, np.full(33, -2.0)) + 2])
-    Trajectory(np.arange(33.0), places).save(scene.tiles[0].folder / PATH)
-    return scene
+    return made_up.driven(tmp_path_factory.mktemp("street"))
 
 
 @pytest.fixture
