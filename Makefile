@@ -2,6 +2,8 @@
 PYTHON ?= $(shell command -v python3.11 || command -v python3.12 || command -v python3.13 || command -v python3)
 NO_PYTHON = There is no Python here. Install 3.11, 3.12 or 3.13, or say where it is: make PYTHON=/path/to/python3.11
 BIN := .venv/bin
+# more options for `make test`, e.g. PYTEST="-k texture"
+PYTEST ?=
 TILE ?= data_samples/tile
 OUT ?= demo-out
 
@@ -11,10 +13,10 @@ demo: .venv/.installed
 	$(BIN)/scan2sim run $(TILE) --out $(OUT) --hold-out 8 --set segment.overwrite=true
 
 # in their order: else the longest files, which hold few tests, come last
-test: .venv/.installed-dev .venv-ros lint
-	$(BIN)/python -m pytest -m "not slow" -n 2 --dist loadfile --no-loadscope-reorder
+test: .venv/.installed-dev .venv-ros
+	$(BIN)/python -m pytest -m "not slow" -n 2 --dist loadfile --no-loadscope-reorder $(PYTEST)
 
-test-all: .venv/.installed-dev .venv-ros lint
+test-all: .venv/.installed-dev .venv-ros
 	$(BIN)/python -m pytest
 
 lint: .venv/.installed-dev

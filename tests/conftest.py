@@ -2,27 +2,52 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 import signal
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from bench.bus_broker import Broker
+from tests.skips import pytest_sessionfinish, pytest_terminal_summary  # noqa: F401  # hooks
 
 ROOT = Path(__file__).resolve().parent.parent
-DATA = ROOT.parent / "shared" / "data"
+DATA_VARIABLE = "SCAN2SIM_REAL_DATA"
+"""Environment variable: the folder of real recordings. Where it is unset, `../shared/data` is used if it exists."""
 
 # a shell that runs the tests in the background has them, and all that they start, ignore Ctrl-C
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Give the run an empty home of its own: no test reads or writes the user's, which may not be writable."""
+    if not hasattr(config, "workerinput"):
+        os.environ["HOME"] = tempfile.mkdtemp(prefix="scan2sim-home-")
+        config.add_cleanup(lambda: shutil.rmtree(os.environ["HOME"], ignore_errors=True))
+        for name in ("XDG_CACHE_HOME", "XDG_CONFIG_HOME", "XDG_DATA_HOME", "XDG_STATE_HOME"):
+            os.environ.pop(name, None)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark tests that need real recordings, so that `-m real_data` runs them alone."""
+    for item in items:
+        if "real_data" in getattr(item, "fixturenames", ()):
+            item.add_marker("real_data")
+
+
 @pytest.fixture(scope="session")
 def real_data() -> Path:
-    """The folder of real data; the test is skipped where it is absent."""
-    if not DATA.is_dir():
-        pytest.skip(f"real data is not at {DATA}")
-    return DATA
+    """The folder of real recordings; the test is skipped where there is none."""
+    if given := os.environ.get(DATA_VARIABLE):
+        assert Path(given).is_dir(), f"{DATA_VARIABLE}: no such folder: {given}"
+        return Path(given)
+    beside = ROOT.parent / "shared" / "data"
+    if not beside.is_dir():
+        pytest.skip(f"no real recordings: set {DATA_VARIABLE} to their folder")
+    return beside
 
 
 @pytest.fixture(scope="session")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pwd
 import re
 import shutil
 import subprocess
@@ -19,6 +20,8 @@ from tests.conftest import ROOT
 from tests.test_architecture import ROOMS
 
 PYTHONS = ("3.11", "3.12", "3.13")
+HOME = Path(pwd.getpwuid(os.getuid()).pw_dir)
+"""The user's home: where pyenv keeps Pythons, and pip its settings."""
 LIGHT = ["--set", "unwrap.texel=0.1", "--set", "decimate.target=10000", "--set", "voxel.size=0.15"]
 
 
@@ -120,10 +123,10 @@ def test_a_users_folders_and_files_are_not_taken_for_ours(installed: Installed) 
 
 def interpreter(version: str) -> Path | None:
     """A Python of that version on this machine, on the path or among pyenv's."""
-    found = [shutil.which(f"python{version}"), *Path.home().glob(f".pyenv/versions/{version}.*/bin/python")]
+    found = [shutil.which(f"python{version}"), *HOME.glob(f".pyenv/versions/{version}.*/bin/python")]
     for python in map(str, filter(None, found)):
         try:
-            printed = done(python, "-c", "import sys; print('%d.%d' % sys.version_info[:2])", cwd=Path.home())
+            printed = done(python, "-c", "import sys; print('%d.%d' % sys.version_info[:2])", cwd=ROOT)
         except (AssertionError, OSError):
             continue  # a shim of pyenv's, of a version that isn't there
         if printed.strip() == version:
@@ -139,7 +142,7 @@ def test_a_world_is_made_from_the_wheel_alone(version: str, wheel: Path, tmp_pat
         pytest.skip(f"there is no Python {version} on this machine")
     done(python, "-m", "venv", tmp_path / "venv", cwd=tmp_path)
     pip = tmp_path / "venv" / "bin" / "pip"
-    done(pip, "install", "-c", ROOT / "constraints.txt", f"{wheel}[flows]", cwd=tmp_path)
+    done(pip, "install", "-c", ROOT / "constraints.txt", f"{wheel}[flows]", cwd=tmp_path, HOME=str(HOME))
     here = place(tmp_path / "venv", tmp_path / "user")
     here.scan2sim("sample", "--small", "tile")
     printed = here.scan2sim("run", "tile", "--out", "out", "--set", "segment.overwrite=true", *LIGHT)

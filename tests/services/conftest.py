@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.ports import free_dds_domain
+
 ROOT = Path(__file__).resolve().parents[2]
 ROS_PYTHON = ROOT / ".venv-ros" / "bin" / "python"
 
@@ -18,9 +20,8 @@ Start = Callable[..., "subprocess.Popen[str]"]
 
 @pytest.fixture(scope="session")
 def domain() -> str:
-    """A DDS domain that no other test's process is in."""
-    worker = os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw")
-    return str(20 + (7 * os.getpid() + int(worker)) % 80)
+    """A DDS domain that no other process of any test run is in."""
+    return str(free_dds_domain())
 
 
 @pytest.fixture(scope="session")

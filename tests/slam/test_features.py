@@ -18,6 +18,8 @@ from scan2sim.slam import features, matchers, weights
 from scan2sim.slam.features import Found
 
 SIZE = (240, 320)
+PUBLISHED_WEIGHTS = {"aliked": "aliked/aliked-t16.pth", "superpoint": "superpoint/superpoint_v1.pth"}
+"""Files of networks' weights, in the folder `weights` of the real data."""
 
 
 @pytest.fixture(autouse=True)
@@ -62,68 +64,96 @@ def saved(path: Path, model: weights.Model) -> Path:
     return path
 
 
-def loaded(name: str, folder: Path, real_data: Path | None) -> features.Features:
-    """A backend that can run here: with real weights where there are any, else random ones."""
-    lacking = backends.missing(features.__name__, name)
-    if lacking:
-        pytest.skip(f"{name} needs {lacking}")
-    if name == "superpoint":
-        from scan2sim.slam.features.superpoint import MODEL
+def with_random_weights(name: str, folder: Path) -> features.Features:
+    """A backend that can run here; networks get random weights, of which no behaviour can be expected."""
+    if missing_packages := backends.missing(features.__name__, name):
+        pytest.skip(f"{name} needs {missing_packages}")
+    if name not in PUBLISHED_WEIGHTS:
+        return features.named(name, count=500)
+    from scan2sim.slam.features import aliked, superpoint
 
-        return features.named(name, saved(folder / "superpoint_v1.pth", MODEL), count=500, device="cpu")
-    if name == "aliked":
-        file = real_data / "weights" / "aliked" / "aliked-t16.pth" if real_data else None
-        if file is None or not file.is_file():
-            from scan2sim.slam.features.aliked import MODELS
-
-            file = saved(folder / "aliked.pth", MODELS[1])
-        return features.named(name, file, count=500, device="cpu")
-    return features.named(name, count=500)
+    model = {"aliked": aliked.MODELS[1], "superpoint": superpoint.MODEL}[name]
+    return features.named(name, saved(folder / f"{name}.pth", model), count=500, device="cpu")
 
 
-@pytest.fixture
-def data() -> Path | None:
-    from tests.conftest import DATA
+def with_published_weights(name: str, real_data: Path) -> features.Features:
+    """A network with its published weights; the test is skipped where they are absent."""
+    if missing_packages := backends.missing(features.__name__, name):
+        pytest.skip(f"{name} needs {missing_packages}")
+    file = real_data / "weights" / PUBLISHED_WEIGHTS[name]
+    if not file.is_file():
+        pytest.skip(f"no published weights of {name}: {PUBLISHED_WEIGHTS[name]}")
+    return features.named(name, file, count=500, device="cpu")
 
-    return DATA if DATA.is_dir() else None
 
-
-@pytest.mark.parametrize("name", backends.names(features.__name__))
-def test_features_move_with_the_picture(name: str, tmp_path: Path, data: Path | None) -> None:
-    backend = loaded(name, tmp_path, data)
+def check_keypoints_follow_translation(backend: features.Features) -> None:
+    """An image translated by (8, 16) px gives the same keypoints, translated."""
     large = picture()
     a = np.ascontiguousarray(large[16 : 16 + SIZE[0], 16 : 16 + SIZE[1]])
     b = np.ascontiguousarray(large[: SIZE[0], 8 : 8 + SIZE[1]])  # right by 8, down by 16
     found, other = backend.detect(a), backend.detect(b)
-    assert found.uv.dtype == np.float32 and found.uv.shape == (len(found.uv), 2) and 100 < len(found.uv) <= 500
-    assert found.descriptors.shape == (len(found.uv), backend.dimension) and found.scores.shape == (len(found.uv),)
-    assert found.descriptors.dtype == (np.uint8 if backend.binary else np.float32)
-    assert (found.uv >= 0).all() and (found.uv <= (SIZE[1] - 1, SIZE[0] - 1)).all()
-    if not backend.binary:
-        assert np.allclose(np.linalg.norm(found.descriptors, axis=1), 1, atol=1e-4)
+    assert 100 < len(found.uv) <= 500
     matcher = matchers.named("nearest")
     matchers.check(backend, matcher)
     pairs = matcher.match(found, other, (SIZE[::-1], SIZE[::-1]))
     assert len(pairs) > 50 and len(np.unique(pairs[:, 0])) == len(np.unique(pairs[:, 1])) == len(pairs)
     moved = other.uv[pairs[:, 1]] - found.uv[pairs[:, 0]]
-    assert (np.linalg.norm(moved - (8, 16), axis=1) < 3).mean() > 0.9  # ORB finds some in small copies of the picture
+    assert (np.linalg.norm(moved - (8, 16), axis=1) < 3).mean() > 0.9  # ORB finds some in small copies of the image
     assert np.abs(np.median(moved, axis=0) - (8, 16)).max() < 0.1
-    assert name in backend.describe().lower()
+
+
+def check_mask_and_flat_image(backend: features.Features) -> None:
+    """No keypoints where the mask is 0, none on an image of one colour."""
+    mask = np.full(SIZE, 255, np.uint8)
+    mask[:, 160:] = 0
+    found = backend.detect(picture()[: SIZE[0], : SIZE[1]], mask)
+    assert len(found.uv) > 20 and found.uv[:, 0].max() < 161
+    flat = backend.detect(np.full((40, 50), 90, np.uint8))
+    assert flat.descriptors.shape == (0, backend.dimension)
+    assert matchers.named("nearest").match(found, Found(*(x[:0] for x in found)), (SIZE, SIZE)).shape == (0, 2)
 
 
 @pytest.mark.parametrize("name", backends.names(features.__name__))
-def test_masks_and_flat_pictures(name: str, tmp_path: Path, data: Path | None) -> None:
-    backend = loaded(name, tmp_path, data)
-    a = picture()[: SIZE[0], : SIZE[1]]
+def test_every_backend_keeps_the_contract(name: str, tmp_path: Path) -> None:
+    """Shapes, types, bounds, order and determinism hold for any weights."""
+    backend = with_random_weights(name, tmp_path)
+    image = np.ascontiguousarray(picture()[: SIZE[0], : SIZE[1]])
+    found = backend.detect(image)
+    n = len(found.uv)
+    assert 0 < n <= 500
+    assert found.uv.dtype == np.float32 and found.uv.shape == (n, 2)
+    assert (found.uv >= 0).all() and (found.uv <= (SIZE[1] - 1, SIZE[0] - 1)).all()
+    assert found.descriptors.dtype == (np.uint8 if backend.binary else np.float32)
+    assert found.descriptors.shape == (n, backend.dimension) and found.scores.shape == (n,)
+    if not backend.binary:
+        assert np.allclose(np.linalg.norm(found.descriptors, axis=1), 1, atol=1e-4)
+    assert all(np.array_equal(x, y) for x, y in zip(found, backend.detect(image), strict=True))
     mask = np.full(SIZE, 255, np.uint8)
     mask[:, 160:] = 0
-    found = backend.detect(a, mask)
-    assert len(found.uv) > 20 and found.uv[:, 0].max() < 161
+    assert (backend.detect(image, mask).uv[:, 0] < 161).all()
     flat = backend.detect(np.full((40, 50), 90, np.uint8))
     assert flat.descriptors.shape == (len(flat.uv), backend.dimension)
-    if name != "superpoint":  # random weights see something everywhere
-        assert len(flat.uv) == 0
-    assert matchers.named("nearest").match(found, Found(*(x[:0] for x in found)), (SIZE, SIZE)).shape == (0, 2)
+    assert name in backend.describe().lower()
+
+
+@pytest.mark.parametrize("name", [n for n in backends.names(features.__name__) if n not in PUBLISHED_WEIGHTS])
+def test_keypoints_follow_the_image(name: str) -> None:
+    check_keypoints_follow_translation(features.named(name, count=500))
+
+
+@pytest.mark.parametrize("name", PUBLISHED_WEIGHTS)
+def test_keypoints_of_networks_follow_the_image(name: str, real_data: Path) -> None:
+    check_keypoints_follow_translation(with_published_weights(name, real_data))
+
+
+@pytest.mark.parametrize("name", [n for n in backends.names(features.__name__) if n not in PUBLISHED_WEIGHTS])
+def test_masks_and_flat_images(name: str) -> None:
+    check_mask_and_flat_image(features.named(name, count=500))
+
+
+@pytest.mark.parametrize("name", PUBLISHED_WEIGHTS)
+def test_masks_and_flat_images_with_networks(name: str, real_data: Path) -> None:
+    check_mask_and_flat_image(with_published_weights(name, real_data))
 
 
 def test_enlarging_does_not_move_features() -> None:

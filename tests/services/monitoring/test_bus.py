@@ -6,6 +6,7 @@ import json
 import subprocess
 
 from bench.bus_broker import Broker
+from tests.ports import free_dds_domain
 from tests.services.conftest import Start
 
 PROGRAM = """
@@ -37,10 +38,10 @@ print(taken)
 """
 
 
-def test_events_are_taken_once_by_kafka_and_ros(start: Start, broker: Broker, domain: str) -> None:
+def test_events_are_taken_once_by_kafka_and_ros(start: Start, broker: Broker) -> None:
     counts = start("cyclone", "-c", PROGRAM, "counts", broker.servers)
     near = start("cyclone", "-c", PROGRAM, "near", broker.servers)
-    far = start("cyclone", "-c", PROGRAM, "far", broker.servers, ROS_DOMAIN_ID=str(int(domain) + 100))
+    far = start("cyclone", "-c", PROGRAM, "far", broker.servers, ROS_DOMAIN_ID=str(free_dds_domain()))
 
     def taken(process: subprocess.Popen[str]) -> list[int]:
         output, errors = process.communicate(timeout=90)

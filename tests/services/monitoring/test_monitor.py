@@ -15,6 +15,7 @@ from bench.bus_broker import Broker
 from scan2sim.services import kafka
 from scan2sim.services.monitoring.record import Record
 from scan2sim.services.records import Spool
+from tests.ports import free_port
 from tests.services.conftest import Start
 
 NODE = """
@@ -152,13 +153,14 @@ def test_a_broker_that_is_not_there_does_not_delay_a_node(tmp_path: Path, start:
 
 def test_a_topic_is_watched_from_outside_and_shown_to_prometheus(tmp_path: Path, start: Start) -> None:
     start("cyclone", "-c", NODE, "talker", tmp_path / "talker.log", "60")
+    port = free_port()
     watch = start("cyclone", "-m", "scan2sim.flows.cli", "monitor", "topic", "chatter", "--period", "0.5",
-                  "--log", tmp_path / "topic.log", "--metrics", "29464")  # fmt: skip
+                  "--log", tmp_path / "topic.log", "--metrics", str(port))  # fmt: skip
     until, shown = time.monotonic() + 40, ""
     while 'topic="/chatter"' not in shown and time.monotonic() < until:
         time.sleep(0.5)
         try:
-            shown = urllib.request.urlopen("http://127.0.0.1:29464/metrics", timeout=1).read().decode()
+            shown = urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=1).read().decode()
         except OSError:
             continue
     watch.terminate()

@@ -14,8 +14,6 @@ from scan2sim.services.toolboxes import coco, models
 from scan2sim.services.toolboxes.boxes import detect
 from scan2sim.services.toolboxes.boxes.detect import Params
 
-KITTI = Path(__file__).resolve().parents[4] / "shared/data/kitti_raw0009_f00-24"
-
 
 def test_the_package_of_coco_is_named_where_it_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
@@ -24,11 +22,10 @@ def test_the_package_of_coco_is_named_where_it_is_missing(monkeypatch: pytest.Mo
 
 
 @pytest.mark.skipif(extras.missing(coco.PACKAGE) is not None, reason=f"{coco.PACKAGE} isn't installed")
-@pytest.mark.skipif(not KITTI.exists(), reason="no real photos here (../shared/data)")
-def test_cars_of_a_real_photo_are_found_by_coco() -> None:
+def test_cars_of_a_real_photo_are_found_by_coco(real_data: Path) -> None:
     import cv2
 
-    photo = cv2.imread(str(min(KITTI.rglob("image_02/data/*.png"))))[..., ::-1]
+    photo = cv2.imread(str(min((real_data / "kitti_raw0009_f00-24").rglob("image_02/data/*.png"))))[..., ::-1]
     (body,) = detect.load(Params(network="coco", labels="car", threshold=0.5))([np.ascontiguousarray(photo)])
     found = body.detections or ()
     assert {one.label for one in found} == {"car"} and any(one.box[0] > 700 and one.score > 0.8 for one in found)
