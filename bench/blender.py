@@ -87,7 +87,7 @@ def _imported(command: Sequence[str], files: Sequence[Path], suffix: str) -> dic
     with tempfile.TemporaryDirectory() as place:
         script = Path(place) / "look.py"
         names = json.dumps([str(file.resolve()) for file in files])
-        script.write_text(SCRIPT.format(files=names, suffix=suffix, said=SAID))
+        script.write_text(SCRIPT.format(files=names, suffix=suffix, said=SAID), encoding="utf-8")
         done = subprocess.run([*command, str(script)], capture_output=True, text=True, timeout=LIMIT)
     said = [line for line in done.stdout.splitlines() if line.startswith(SAID)]
     if done.returncode or not said:

@@ -165,7 +165,7 @@ class _Run:
 
     def _states(self) -> list[dict[str, Any]]:
         try:
-            return [json.loads(line) for line in (self._folder / "scale.log").read_text().splitlines()]
+            return [json.loads(line) for line in (self._folder / "scale.log").read_text(encoding="utf-8").splitlines()]
         except FileNotFoundError:
             return []
 
@@ -173,7 +173,7 @@ class _Run:
         states, speed = self._states(), self._told.speed
         first = next(number for number, one in enumerate(states) if one["arrived"])
         began = states[first]["time"] - states[first]["seconds"]
-        records = [json.loads(line) for line in (self._folder / "work.log").read_text().splitlines()]
+        records = [json.loads(line) for line in (self._folder / "work.log").read_text(encoding="utf-8").splitlines()]
         flows = [flow for one in records for flow in one["flows"] if flow["topic"] == TOPIC]
         return Outcome(
             series=[

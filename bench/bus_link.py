@@ -93,7 +93,7 @@ class Watch:
 
     def read(self) -> None:
         """Take what it told so far: flows, with the `time` and `period` of their records."""
-        lines = self._log.read_text().splitlines(keepends=True) if self._log.exists() else []
+        lines = self._log.read_text(encoding="utf-8").splitlines(keepends=True) if self._log.exists() else []
         records = [json.loads(line) for line in lines if line.endswith("\n")]
         self.flows = [flow | {key: one[key] for key in ("time", "period")} for one in records for flow in one["flows"]]
 

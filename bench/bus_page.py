@@ -93,7 +93,7 @@ def watch(replay: Replay, folder: Path, every: float) -> dict[str, Any]:
     """
     outcomes: list[Outcome] = []
     rules = folder / "rules.toml"
-    rules.write_text(RULES.format(above=ALARMING / replay.speed, hold=0.1))
+    rules.write_text(RULES.format(above=ALARMING / replay.speed, hold=0.1), encoding="utf-8")
     running = threading.Thread(target=lambda: outcomes.extend(bus_experiment.replay([replay], folder)))
     kafka = ("--kafka", replay.kafka)
     seen: list[dict[str, Any]] = []

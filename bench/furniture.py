@@ -94,7 +94,7 @@ def _street(street: Path, seed: int, length: float) -> dict[str, list[Any]]:
         cloud = {"cloud": folder / "cloud.npz"}
         found = FINDS.run(cloud | {"path": folder / "path.npz"}, FindsParams(), folder, silent)
         done = FURNITURE.run(cloud | found.files, FurnitureParams(), folder, silent)
-        features = json.loads(done.files["geojson"].read_text())["features"]
+        features = json.loads(done.files["geojson"].read_text(encoding="utf-8"))["features"]
         mesh = Mesh.load(done.files["building"])
     at = np.array([f["geometry"]["coordinates"][:2] for f in features]).reshape(-1, 2) - tile.frame.origin[:2]
     trunk = np.array([f["properties"]["kind"] == "trunk" for f in features], bool)
@@ -127,7 +127,7 @@ def sky(out: Path, on: bool) -> dict[str, float]:
     scan2sim = str(Path(sys.executable).parent / "scan2sim")
     command = [scan2sim, "run", str(SMALL), "--out", str(out), "--set", f"agreement.sky={str(on).lower()}"]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-    report = json.loads((out / "report.json").read_text())
+    report = json.loads((out / "report.json").read_text(encoding="utf-8"))
     folders = {g: out / "steps" / f"texture.{g}" for g in ("building", "vegetation")}
     made = {g: max(f.glob("*/textured"), key=lambda p: p.stat().st_mtime) for g, f in folders.items()}
     figures = {f"{group}_{k}": v for group, folder in made.items() for k, v in on_surface(folder).items()}

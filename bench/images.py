@@ -236,7 +236,7 @@ def _alone(task: Callable[[Path], Pixels], path: Path) -> dict[str, float]:
 
 
 def _peak() -> float:
-    return int(re.findall(r"VmHWM:\s+(\d+)", Path("/proc/self/status").read_text())[0]) / 1e3
+    return int(re.findall(r"VmHWM:\s+(\d+)", Path("/proc/self/status").read_text(encoding="utf-8"))[0]) / 1e3
 
 
 def region_opencv(path: Path) -> Pixels:

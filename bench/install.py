@@ -58,7 +58,7 @@ def _unpacked(path: Path) -> int:
 
 def packages(project: Path) -> dict[str, float]:
     """Number of Debian's packages that would be installed, and their megabytes."""
-    wanted = (project / "packages.txt").read_text().split()
+    wanted = (project / "packages.txt").read_text(encoding="utf-8").split()
     command = ["apt-get", "install", "--print-uris", "-qq", "--no-install-recommends", *wanted]
     lines = subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()
     names = [line.split()[1].split("_")[0] for line in lines if line.startswith("'")]

@@ -76,7 +76,7 @@ def main(tile_path: Path, out: Path) -> None:
             mapping, indices, uvs = xatlas.parametrize(vertices, faces.astype(np.uint32))
         with timed("texture"):
             texture(out / name, vertices[mapping], indices, uvs, tile.views)
-    (out / "naive.json").write_text(json.dumps(seconds))
+    (out / "naive.json").write_text(json.dumps(seconds), encoding="utf-8")
 
 
 def texture(path: Path, vertices: np.ndarray, faces: np.ndarray, uvs: np.ndarray, views: tuple[View, ...]) -> None:

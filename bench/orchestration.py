@@ -52,7 +52,7 @@ def services(folder: Path, replicas: int = 1, count: int = 0) -> Path:
         text += f'[[service]]\nname = "{name}"\nservice = "{service}"\nreplicas = {replicas}\n'
         text += 'cluster = "edge-cluster"\n'
     path = folder / "services.toml"
-    path.write_text(text)
+    path.write_text(text, encoding="utf-8")
     return path
 
 

@@ -75,7 +75,7 @@ def main() -> None:
 
 def compared(world: Path, layout: Layout) -> dict[str, F64]:
     """Errors of all places on lines, metres, by the names of the module's docstring."""
-    features = json.loads(next(world.glob("*roads.geojson")).read_text())["features"]
+    features = json.loads(next(world.glob("*roads.geojson")).read_text(encoding="utf-8"))["features"]
     kinds = [f["properties"]["kind"] for f in features]
     lines = [layout_place(layout, f["geometry"]["coordinates"]) for f in features]
     painted = np.array([layout.lane - FROM_EDGE, 0.0, FROM_EDGE - layout.lane])
@@ -163,7 +163,7 @@ def draw(run: Path) -> None:
     body = textured(folder)
     low, high = body.mesh.vertices.min(axis=0).astype(float), body.mesh.vertices.max(axis=0).astype(float)
     picture = Renderer([body]).above(low, high, width=int((high[0] - low[0]) / PIXEL)).rgb.copy()
-    for feature in json.loads((run / "world" / "roads.geojson").read_text())["features"]:
+    for feature in json.loads((run / "world" / "roads.geojson").read_text(encoding="utf-8"))["features"]:
         about = feature["properties"]
         places = body.mesh.frame.to_local(feature["geometry"]["coordinates"])[:, :2] - low[:2]
         pixels = np.column_stack([places[:, 0], high[1] - low[1] - places[:, 1]]) / PIXEL

@@ -143,7 +143,7 @@ def pano() -> None:
     import cv2
 
     folder = DATA / "pano360"
-    numbers = (folder / "dense_transformation.dat").read_text().splitlines()[1].split()[1:]
+    numbers = (folder / "dense_transformation.dat").read_text(encoding="utf-8").splitlines()[1].split()[1:]
     axes = np.array([[0.0, 0, -1], [1, 0, 0], [0, -1, 0]])  # ours to the reference's
     R = np.array(numbers[3:], float).reshape(3, 3)
     turn, way = axes.T @ R.T @ axes, axes.T @ (-R.T @ np.array(numbers[:3], float))

@@ -41,7 +41,7 @@ def slam(drive: Path, out: Path, *options: object) -> tuple[Evaluation, dict[str
         sys.exit(f"scan2sim slam failed with exit status {measured.status}")
     found = evaluate(trajectory_io.read(out / "trajectory.csv"), trajectory_io.read(drive / "truth.csv"))
     plot(found, out / "plot.png")
-    return found, json.loads((out / "slam.json").read_text()) | {"peak_gb": measured.peak_gb}
+    return found, json.loads((out / "slam.json").read_text(encoding="utf-8")) | {"peak_gb": measured.peak_gb}
 
 
 def drive(out: Path, path: str, length: float, stretch: float) -> dict[str, float | None]:

@@ -38,7 +38,7 @@ class Sequence:
     @classmethod
     def of(cls, folder: Path, name: str, camera: int = 0) -> Sequence:
         """A folder with `poses.txt`, `calib.txt`, and pictures of one of its cameras."""
-        lines = (folder / "calib.txt").read_text().splitlines()
+        lines = (folder / "calib.txt").read_text(encoding="utf-8").splitlines()
         P = [float(v) for v in next((x.split(":")[1] for x in lines if x.startswith(f"P{camera}:")), lines[0]).split()]
         frames = folder / ("image_2" if camera == 2 else "image_l")
         video = open_video(frames)
@@ -100,6 +100,6 @@ places = {{best.images[i].name: best.images[i].projection_center().tolist() for 
     seconds = time.perf_counter() - began
     if done.returncode:
         sys.exit(f"pycolmap failed: {done.stderr[-500:]}")
-    found, busy = json.loads((out / "places.json").read_text())
+    found, busy = json.loads((out / "places.json").read_text(encoding="utf-8"))
     rows = sorted((int(Path(name).stem), place) for name, place in found.items())
     return sequence.ate(np.array([p for _, p in rows]), [i for i, _ in rows]), seconds, busy, len(rows)

@@ -123,7 +123,7 @@ def kitti(out: Path) -> Recorded:
     assert beside is not None
     np.savetxt(out / "extrinsics.txt", beside[:3], "%.9f")
     np.savetxt(out / "times.txt", times, "%.6f")
-    line = next(line for line in calib.read_text().splitlines() if line.startswith("P2:"))
+    line = next(line for line in calib.read_text(encoding="utf-8").splitlines() if line.startswith("P2:"))
     P = [float(value) for value in line.split()[1:]]
     return Recorded(
         KITTI / "velodyne", photos, truth, times, P[0], (P[2], P[6]), out / "extrinsics.txt", out / "times.txt",
@@ -153,7 +153,7 @@ def turned(out: Path, frames: Path | None) -> Recorded:
     np.savetxt(out / "extrinsics.txt", T_CAMERA_SCANNER[:3], "%.9f")
     times = driven.times - driven.times[0]
     np.savetxt(out / "times.txt", times, "%.6f")
-    P = [float(value) for value in (frames / "calib.txt").read_text().split()]
+    P = [float(value) for value in (frames / "calib.txt").read_text(encoding="utf-8").split()]
     return Recorded(
         out / "sweeps", frames / "image_l", truth, times, P[0], (P[2], P[6]), out / "extrinsics.txt",
         out / "times.txt", received(truth, times, out / "gps.csv"),

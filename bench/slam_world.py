@@ -30,7 +30,13 @@ DRIVE = ROOT.parent / "shared" / "data" / "kitti_raw0009_f00-24"
 def seconds(file: Path, start: float) -> np.ndarray:
     """(T,) seconds after `start` (UNIX) of a file of KITTI's time stamps."""
     return (
-        np.array([datetime.fromisoformat(line[:26]).timestamp() for line in file.read_text().split("\n") if line])
+        np.array(
+            [
+                datetime.fromisoformat(line[:26]).timestamp()
+                for line in file.read_text(encoding="utf-8").split("\n")
+                if line
+            ]
+        )
         - start
     )
 
@@ -39,7 +45,12 @@ def prepare(out: Path, drive: Path) -> dict[str, Path]:
     """What `slam` and `import sweeps` need of a KITTI drive: GPS, times, where the camera is."""
     sync = next(drive.glob("*_sync"))
     start = seconds(sync / "image_02" / "timestamps.txt", 0.0)[0]
-    oxts = np.array([[float(v) for v in f.read_text().split()[:3]] for f in sorted((sync / "oxts/data").glob("*.txt"))])
+    oxts = np.array(
+        [
+            [float(v) for v in f.read_text(encoding="utf-8").split()[:3]]
+            for f in sorted((sync / "oxts/data").glob("*.txt"))
+        ]
+    )
     oxts[:, :2] += np.random.default_rng(0).normal(0, 0.1 / 111_000, (len(oxts), 2))
     times = seconds(sync / "oxts" / "timestamps.txt", start)[: len(oxts)]
     made = {name: out / f"{name}.txt" for name in ("photo_times", "sweep_times", "extrinsics")}
@@ -52,7 +63,7 @@ def prepare(out: Path, drive: Path) -> dict[str, Path]:
     np.savetxt(made["sweep_times"], seconds(sync / "velodyne_points" / "timestamps.txt", start)[: len(sweeps)], "%.6f")
     numbers = {}
     for name in ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt"):
-        for line in (drive / name).read_text().splitlines():
+        for line in (drive / name).read_text(encoding="utf-8").splitlines():
             key, _, values = line.partition(":")
             numbers[key] = values
     T = np.eye(4)
@@ -90,7 +101,7 @@ def main() -> None:
     paths = {}
     for kind in ("slam", "matched"):
         scan2sim("run", out / f"tile_{kind}", "--out", out / f"world_{kind}", "--hold-out", 5)
-        report = json.loads((out / f"world_{kind}" / "report.json").read_text())
+        report = json.loads((out / f"world_{kind}" / "report.json").read_text(encoding="utf-8"))
         for group, value in report["geometry"]["cloud_to_mesh_mean_m"].items():
             result[f"{kind}_{group}_m"] = value
         result[f"{kind}_psnr_db"] = report["texture"]["psnr_db"]

@@ -56,7 +56,7 @@ def main() -> None:
     out: Path = arguments.out
     survey = street(out)
     notes = out / "notes.json"
-    known: dict[str, dict[str, Any]] = json.loads(notes.read_text()) if notes.is_file() else {}
+    known: dict[str, dict[str, Any]] = json.loads(notes.read_text(encoding="utf-8")) if notes.is_file() else {}
     for part in (name for name in PARTS if name in arguments.parts):
         if part in RUNS:
             known[part] = whole(survey, out / part, (*RUNS[part], *settings))
@@ -67,7 +67,7 @@ def main() -> None:
         else:
             known[part] = one_tile(survey / MIDDLE, out / "tile")
         print(part, json.dumps(known[part]), flush=True)
-        notes.write_text(json.dumps(known, indent=1))
+        notes.write_text(json.dumps(known, indent=1), encoding="utf-8")
     report(known, out)
 
 
@@ -98,7 +98,7 @@ def whole(survey: Path, out: Path, options: tuple[str, ...]) -> dict[str, Any]:
     ran = measure(command(survey, out, options))
     if ran.status != 0:
         sys.exit(f"{' '.join(options)}: exit status {ran.status}")
-    body = json.loads((out / "survey.json").read_text())
+    body = json.loads((out / "survey.json").read_text(encoding="utf-8"))
     figures = [tile["figures"] for tile in body["tiles"].values()]
     return {
         "seconds": round(ran.seconds, 1),
@@ -127,8 +127,11 @@ def one_tile(tile: Path, out: Path) -> dict[str, Any]:
     for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
         os.environ[name] = "1"
     measure([str(Path(sys.executable).parent / "scan2sim"), "run", str(tile), "--out", str(out), "--jobs", "1"])
-    body = json.loads((out / "report.json").read_text())
-    made = {path.parent.name: json.loads(path.read_text()) for path in (out / "steps").glob("*/*/manifest.json")}
+    body = json.loads((out / "report.json").read_text(encoding="utf-8"))
+    made = {
+        path.parent.name: json.loads(path.read_text(encoding="utf-8"))
+        for path in (out / "steps").glob("*/*/manifest.json")
+    }
     sources = read_tile(tile)
     read = sum(path.stat().st_size for path in (*sources.clouds, *(view.photo for view in sources.views)))
     between = sum(size(made, source) for manifest in made.values() for source in manifest["inputs"].values())
@@ -156,7 +159,7 @@ def photo(survey: Path, out: Path, options: tuple[str, ...]) -> dict[str, Any]:
     """Change one photo in the middle of the street, and see what is made anew."""
     place = out / "street" / "photos"
     changed = sorted(place.glob("*.jpg"))[len(list(place.glob("*.jpg"))) // 2]
-    seen = [path.parent.name for path in survey.glob("*/tile.toml") if changed.name in path.read_text()]
+    seen = [path.parent.name for path in survey.glob("*/tile.toml") if changed.name in path.read_text(encoding="utf-8")]
     before, original, stat = contents(out / "two"), changed.read_bytes(), changed.stat()
     try:
         import cv2
@@ -170,7 +173,7 @@ def photo(survey: Path, out: Path, options: tuple[str, ...]) -> dict[str, Any]:
         changed.write_bytes(original)
         os.utime(changed, ns=(stat.st_atime_ns, stat.st_mtime_ns))
     anew = sorted({node for node, content in after.items() if before.get(node) != content})
-    made = json.loads((out / "two" / "survey.json").read_text())["tiles"]
+    made = json.loads((out / "two" / "survey.json").read_text(encoding="utf-8"))["tiles"]
     return {
         "seconds": round(ran.seconds, 1),
         "tiles_that_see_it": sorted(seen),
@@ -182,13 +185,13 @@ def photo(survey: Path, out: Path, options: tuple[str, ...]) -> dict[str, Any]:
 
 def contents(out: Path) -> dict[str, str]:
     """Digests of all results of a run, by tile and step."""
-    manifests = [json.loads(path.read_text()) for path in (out / "steps").glob("*/*/*/manifest.json")]
+    manifests = [json.loads(path.read_text(encoding="utf-8")) for path in (out / "steps").glob("*/*/*/manifest.json")]
     return {manifest["label"]: manifest["content"] for manifest in manifests}
 
 
 def borders(out: Path) -> dict[str, float]:
     """The widest gap, the mean colour step, and lengths, over all borders."""
-    body = json.loads((out / "survey.json").read_text())["borders"]
+    body = json.loads((out / "survey.json").read_text(encoding="utf-8"))["borders"]
     length = np.array([b["length_m"] for b in body])
     return {
         "border_gap_m": max(b["gap_m"] for b in body),

@@ -146,8 +146,8 @@ class Bench:
         """Atlas or depth maps: drawn once a run, and once and for all where ours does not run."""
         note = scene.folder / f"{step}.json"
         if "ours" in self.methods or not note.is_file():
-            note.write_text(json.dumps(asdict(self._child(step, scene, fresh(folder)))))
-        return Measured(**json.loads(note.read_text()))
+            note.write_text(json.dumps(asdict(self._child(step, scene, fresh(folder)))), encoding="utf-8")
+        return Measured(**json.loads(note.read_text(encoding="utf-8")))
 
     def _run(self, scene: Scene, method: str, *, again: bool) -> Measured:
         folder = self.folder(scene, method)
@@ -155,8 +155,8 @@ class Bench:
         if again or not (self.keep and note.is_file()):
             note.unlink(missing_ok=True)
             measured = self._child(method, scene, fresh(folder))
-            note.write_text(json.dumps(asdict(measured)))
-        return Measured(**json.loads(note.read_text()))
+            note.write_text(json.dumps(asdict(measured)), encoding="utf-8")
+        return Measured(**json.loads(note.read_text(encoding="utf-8")))
 
     def parametrize(self, scene: Scene) -> Measured:
         """The plain unwrapping of xatlas, of the whole mesh."""

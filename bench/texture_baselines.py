@@ -89,7 +89,7 @@ def _paint(scene: Scene, out: Path, *, only_nearest: bool) -> None:
     mesh = Mesh.load(scene.atlas / "mesh.npz")
     assert mesh.uv is not None and mesh.page is not None
     corners, normals = mesh.corners, mesh.face_normal
-    for k, size in enumerate(json.loads((scene.atlas / "pages.json").read_text())):
+    for k, size in enumerate(json.loads((scene.atlas / "pages.json").read_text(encoding="utf-8"))):
         width, height = size["width"], size["height"]
         faces = np.flatnonzero(mesh.page == k)
         flat = texels.corners(mesh.uv[faces], width, height)

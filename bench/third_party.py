@@ -130,7 +130,7 @@ NOT_HERE = ("dev", "meshlab")
 
 def project() -> dict[str, list[str]]:
     """What pyproject.toml asks for: "core", then each extra but those that `make test` makes no environment with."""
-    about = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    about = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = {name: requested for name, requested in about["optional-dependencies"].items() if name not in NOT_HERE}
     return {"core": about["dependencies"], **extras}
 
@@ -176,7 +176,7 @@ def licence(package: Distribution) -> str:
 def titled(package: Distribution) -> str:
     """The first line of a package's file LICENSE, for one whose metadata tells nothing."""
     file = next((path for path in package.files or () if path.name.startswith("LICENSE")), None)
-    lines = file.read_text().splitlines() if file else []
+    lines = file.read_text(encoding="utf-8").splitlines() if file else []
     return next((line.strip() for line in lines if line.strip()), "not told")
 
 

@@ -62,8 +62,8 @@ def main() -> None:
     rerun = _checked(measure(command), "rerun")
     naive = _checked(measure([sys.executable, "-m", "bench.naive", str(street), str(naive_out)]), "naive")
 
-    steps = json.loads((ours_out / "report.json").read_text())["steps"]
-    baseline = json.loads((naive_out / "naive.json").read_text())
+    steps = json.loads((ours_out / "report.json").read_text(encoding="utf-8"))["steps"]
+    baseline = json.loads((naive_out / "naive.json").read_text(encoding="utf-8"))
     print(f"\n{'step':<12}{'naive s':>9}{'ours s':>9}{'ratio':>8}   (ours: sum over steps, two of which run at a time)")
     for name, parts in STEPS.items():
         own = sum(s["seconds"] for node, s in steps.items() if node.split(".")[0] in parts)

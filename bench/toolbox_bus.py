@@ -64,7 +64,7 @@ def render(folder: Path) -> None:
 
 def watch(kafka: str, images: Path, out: Path, seconds: float) -> dict[str, Any]:
     """Run it all, and take pictures."""
-    (out / "rules.toml").write_text(RULES)
+    (out / "rules.toml").write_text(RULES, encoding="utf-8")
     tell = ("--kafka", kafka)
     with ExitStack() as stack, tempfile.TemporaryDirectory() as browser:
 

@@ -50,7 +50,7 @@ def classes() -> dict[str, float] | None:
 def _cut_out() -> list[U8]:
     photos = sorted(KITTI.rglob("image_02/data/*.png"))
     found = []
-    for line in TRUTH.read_text().splitlines():
+    for line in TRUTH.read_text(encoding="utf-8").splitlines():
         words = line.split()
         left, top, right, bottom = (round(float(word)) for word in words[6:10])
         if words[2] in ("Car", "Van") and words[3] == words[4] == "0" and bottom - top >= HIGH:

@@ -107,7 +107,9 @@ def kitti(detector: Detector, size: int, threshold: float) -> tuple[dict[str, An
 
 def kitti_pictures(folder: Path) -> Iterator[tuple[U8, Truth]]:
     """Pictures, and their vehicles; what is hidden, cut off or nobody's care is spared."""
-    rows = [line.split() for line in (folder / "tracking_gt_0001_frames_0-24.txt").read_text().splitlines()]
+    rows = [
+        line.split() for line in (folder / "tracking_gt_0001_frames_0-24.txt").read_text(encoding="utf-8").splitlines()
+    ]
     for number, image in enumerate(sorted(folder.rglob("image_02/data/*.*"))):
         own = [r for r in rows if int(r[0]) == number and r[2] in ("Car", "Van", "Truck", "Tram", "Misc", "DontCare")]
         spared = [r[2] in ("DontCare", "Tram", "Misc") or float(r[3]) > 1 or int(r[4]) > 1 for r in own]

@@ -37,7 +37,7 @@ Truth = Mapping[int, Mapping[int, Sequence[float]]]
 def truth() -> Truth:
     """KITTI's boxes of vehicles."""
     found: dict[int, dict[int, list[float]]] = {frame: {} for frame in range(FRAMES)}
-    for line in TRUTH.read_text().splitlines():
+    for line in TRUTH.read_text(encoding="utf-8").splitlines():
         words = line.split()
         if words[2] in FOLLOWED:
             found[int(words[0])][int(words[1])] = [float(word) for word in words[6:10]]

@@ -89,7 +89,7 @@ def qos(out: Path) -> Found:
             file = out / f"qos-{name}-{environment}.json"
             command = [sys.executable, "-m", "scan2sim.flows.cli", "qos", "measure", name, "--environment", environment]
             subprocess.run([*command, "--rate", QOS_RATE, "--seconds", QOS_SECONDS, "--out", str(file)], check=True)
-            told = json.loads(file.read_text())
+            told = json.loads(file.read_text(encoding="utf-8"))
             service.setdefault(name, {})[environment] = told["passed"]
             machine.setdefault(name, {})[environment] = told["machine_passed"]
     return {"qos": service, "qos_machine": machine}

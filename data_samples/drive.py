@@ -115,7 +115,7 @@ def generate_drive(
     out.mkdir(parents=True, exist_ok=True)
     cv2.imwrite(str(out / "mask.png"), camera.mask)
     write_truth(out / "truth.csv", trajectory)
-    (out / "camera.json").write_text(json.dumps(asdict(hard), indent=1) + "\n")
+    (out / "camera.json").write_text(json.dumps(asdict(hard), indent=1) + "\n", encoding="utf-8")
     times, fixes = gps.receiver(trajectory, gps_rate, seed, gaps=tuple(gps_gaps), jumps=tuple(gps_jumps))
     table = np.column_stack([times, gps.geographic(fixes)])
     np.savetxt(

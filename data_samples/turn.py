@@ -63,7 +63,7 @@ def generate_turn(out: Path, *, height: int = 2048, seed: int = 0, report: Repor
     from_first = np.linalg.inv(driven.poses[0]) @ driven.poses
     np.savetxt(out / "poses.txt", from_first[:, :3].reshape(-1, 12))
     P = [camera.fx, 0, camera.cx, 0, 0, camera.fy, camera.cy, 0, 0, 0, 1, 0]
-    (out / "calib.txt").write_text(" ".join(map(str, P)) + "\n")
+    (out / "calib.txt").write_text(" ".join(map(str, P)) + "\n", encoding="utf-8")
     return out
 
 

@@ -67,13 +67,15 @@ class Found:
     def write(self, path: Path) -> None:
         """As JSON."""
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps({"camera": asdict(self.camera), "sigma": self.sigma.tolist(), "how": self.how}))
+        path.write_text(
+            json.dumps({"camera": asdict(self.camera), "sigma": self.sigma.tolist(), "how": self.how}), encoding="utf-8"
+        )
 
     @classmethod
     def read(cls, path: Path) -> Self | None:
         """What `write` wrote; None where it isn't whole."""
         try:
-            tree = json.loads(path.read_text())
+            tree = json.loads(path.read_text(encoding="utf-8"))
             camera = Camera(**tree["camera"] | {"distortion": tuple(tree["camera"]["distortion"])})
             return cls(camera, np.array(tree["sigma"], np.float64), str(tree["how"]))
         except (OSError, ValueError, KeyError, TypeError):

@@ -128,7 +128,7 @@ def chromium(folder: Path, *flags: str) -> Iterator[Page]:
                 assert process.poll() is None and time.monotonic() < end, "Chromium doesn't start"
                 time.sleep(0.05)
             time.sleep(0.1)
-            port, path = (profile / "DevToolsActivePort").read_text().split()
+            port, path = (profile / "DevToolsActivePort").read_text(encoding="utf-8").split()
             with connect(f"ws://127.0.0.1:{port}{path}", max_size=None) as whole:
                 browser = Page(whole)
                 while not (targets := browser.do("Target.getTargets", filter=[{"type": "page"}])["targetInfos"]):

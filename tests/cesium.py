@@ -92,7 +92,7 @@ def viewer(world: Path, work: Path, size: tuple[int, int]) -> Iterator[Viewer]:
     work.mkdir(exist_ok=True)
     (work / "cesium").symlink_to(package)
     (work / "world").symlink_to(world.resolve())
-    (work / "page.html").write_text(PAGE)
+    (work / "page.html").write_text(PAGE, encoding="utf-8")
     handler = functools.partial(_Quiet, directory=str(work))
     with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server, browser.chromium(work) as page:
         threading.Thread(target=server.serve_forever, daemon=True).start()

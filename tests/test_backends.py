@@ -78,7 +78,7 @@ def test_it_has_what_its_protocol_asks(package: ModuleType, name: str) -> None:
 def test_it_says_what_it_needs(package: ModuleType, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     backend = backends.module(package.__name__, name)
     needs, meant = backends.needs(backend), getattr(backend, "EXTRA", "")
-    core = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
+    core = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["dependencies"]
     extras = {EXTRA_OF[package] for package in needs if package in EXTRA_OF}
     assert extras or set(needs) <= {re.split(r"[^\w.-]", line)[0] for line in core}
     real = importlib.util.find_spec
@@ -112,7 +112,7 @@ def add(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     def one(package: ModuleType, name: str, code: str) -> None:
         folder = tmp_path / package.__name__
         folder.mkdir()
-        (folder / f"{name}.py").write_text(code)
+        (folder / f"{name}.py").write_text(code, encoding="utf-8")
         monkeypatch.setattr(package, "__path__", [*package.__path__, str(folder)])
         importlib.invalidate_caches()
         added.append((package, name))

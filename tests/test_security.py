@@ -32,7 +32,9 @@ def test_xml_is_read_in_one_place() -> None:
     for room in ROOMS:
         for path in (ROOT / room).rglob("*.py"):
             if path.name != "xml.py":
-                assert not re.search(r"fromstring\(|ElementTree\.parse|ET\.parse|minidom", path.read_text()), path
+                assert not re.search(
+                    r"fromstring\(|ElementTree\.parse|ET\.parse|minidom", path.read_text(encoding="utf-8")
+                ), path
 
 
 LAUGHS = "".join(f'<!ENTITY l{i + 1} "{f"&l{i};" * 10}">' for i in range(12))

@@ -11,10 +11,10 @@ from tests.conftest import ROOT
 
 
 def test_the_page_names_every_pinned_package_of_the_core() -> None:
-    pins = dict(re.findall(r"^([\w.-]+)==(\S+)$", (ROOT / "constraints.txt").read_text(), re.MULTILINE))
+    pins = dict(re.findall(r"^([\w.-]+)==(\S+)$", (ROOT / "constraints.txt").read_text(encoding="utf-8"), re.MULTILINE))
     pins = {canonicalize_name(name): version for name, version in pins.items()}
     core = [name for name in closure(project()["core"]) if name in pins]
-    page = (ROOT / "docs" / "third-party.md").read_text().split("## Core")[1].split("\n## ")[0]
+    page = (ROOT / "docs" / "third-party.md").read_text(encoding="utf-8").split("## Core")[1].split("\n## ")[0]
     assert len(core) > 20
     for name in core:
         assert f"| {name} | {pins[name]} |" in page, f"{name}: python -m bench.third_party > docs/third-party.md"

@@ -70,9 +70,11 @@ def place(environment: Path, user: Path) -> Installed:
     """A user's folders and files beside an environment."""
     for room in ROOMS:
         (user / "src" / room).mkdir(parents=True)
-        (user / "src" / room / "__init__.py").write_text("raise SystemExit('this folder is the user's own')")
+        (user / "src" / room / "__init__.py").write_text(
+            "raise SystemExit('this folder is the user's own')", encoding="utf-8"
+        )
     for module in ("random", "inspect", "numpy"):
-        (user / f"{module}.py").write_text("raise SystemExit('this file is the user's own')")
+        (user / f"{module}.py").write_text("raise SystemExit('this file is the user's own')", encoding="utf-8")
     return Installed(environment, user)
 
 
@@ -84,7 +86,7 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Installe
     python = folder / "venv" / "bin" / "python"
     done(sys.executable, "-m", "pip", "--python", python, "install", "--no-deps", "--no-index", wheel, cwd=folder)
     packages = next((folder / "venv" / "lib").iterdir()) / "site-packages"
-    (packages / "rest.pth").write_text(sysconfig.get_path("purelib"))
+    (packages / "rest.pth").write_text(sysconfig.get_path("purelib"), encoding="utf-8")
     return place(folder / "venv", folder / "user")
 
 
@@ -115,7 +117,7 @@ def test_a_users_folders_and_files_are_not_taken_for_ours(installed: Installed) 
     assert installed.run(installed.environment / "bin" / "python", "-P", "-c", call) == "3\n"
     printed = installed.scan2sim("plan", "tile", "--set", "voxel.size=-1", code=2)
     (page,) = re.findall(r"/\S+/docs/settings.md", printed)  # hints name pages where they are
-    assert "voxel.size" in Path(page).read_text()
+    assert "voxel.size" in Path(page).read_text(encoding="utf-8")
     (installed.user / "tile" / "cloud.laz").write_bytes(b"LASF")  # found out by the first step, in its own process
     printed = installed.scan2sim("run", "tile", "--out", "out", code=3)
     assert "cloud.laz" in printed and "the user's own" not in printed and "Traceback" not in printed

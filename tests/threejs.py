@@ -118,7 +118,7 @@ def viewer(
     shutil.copyfile(PAGES / "three.js", work / "three.js")
     if package is not None:
         (work / "npm").symlink_to(package)
-    (work / "page.html").write_text(PAGE.replace("HEAD", NPMS if package is not None else OURS))
+    (work / "page.html").write_text(PAGE.replace("HEAD", NPMS if package is not None else OURS), encoding="utf-8")
     handler = functools.partial(_Quiet, directory=str(work))
     with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server, browser.chromium(work) as page:
         threading.Thread(target=server.serve_forever, daemon=True).start()

@@ -54,7 +54,7 @@ class _Engine:
         pybullet.setGravity(0, 0, -9.8)
         (world,) = (path for path in export.glob("*.urdf") if path.stem != ROBOT.name)
         pybullet.loadURDF(str(world), useFixedBase=True)
-        start = json.loads((export / "metadata.json").read_text())["robot"]
+        start = json.loads((export / "metadata.json").read_text(encoding="utf-8"))["robot"]
         angles = pybullet.getQuaternionFromEuler(start["angles_rad"])
         self._robot = pybullet.loadURDF(str(export / f"{ROBOT.name}.urdf"), start["position_m"], angles)
         joints = range(pybullet.getNumJoints(self._robot))

@@ -25,7 +25,7 @@ def check(export: Path, places: Places) -> dict[str, Any]:
     """Validate: neither an error nor a warning."""
     package = node_module(NAME)
     assert package is not None
-    program = package / next(iter(json.loads((package / "package.json").read_text())["bin"].values()))
+    program = package / next(iter(json.loads((package / "package.json").read_text(encoding="utf-8"))["bin"].values()))
     with tempfile.TemporaryDirectory() as place:
         told = Path(place) / "report.json"
         done = subprocess.run(

@@ -80,7 +80,7 @@ def qos_measure(
             "answers": asdict(answers),
             "encoding": asdict(measured.encoding),
         }
-        out.write_text(json.dumps(told, indent=1))
+        out.write_text(json.dumps(told, indent=1), encoding="utf-8")
 
 
 @app.command("choose")

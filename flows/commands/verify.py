@@ -86,7 +86,7 @@ def _published(out: Path, folder: Path, manifest: Manifest) -> Iterator[Path]:
     shown = (out / TILES / tile[0] if tile else out) / place
     if output not in manifest.files or not (shown / STAMP).is_file():
         return
-    if (shown / STAMP).read_text(errors="replace") != folder.name:
+    if (shown / STAMP).read_text(errors="replace", encoding="utf-8") != folder.name:
         return  # of another result
     for name, known in manifest.digests.items():
         below = Path(name).is_relative_to(manifest.files[output])

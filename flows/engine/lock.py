@@ -20,7 +20,7 @@ def locked(folder: Path) -> Iterator[None]:
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        file = open(folder / ".lock", "w")
+        file = open(folder / ".lock", "w", encoding="utf-8")
     except OSError as error:
         raise from_os_error(error, folder) from None
     with file:

@@ -95,7 +95,7 @@ class Remote:
             raise InputError(self.url, "there is nothing", "Check the address; `scan2sim tile --copy` makes a survey")
         for name in found:
             self._path(name)
-        known: dict[str, str] = json.loads(index.read_text()) if index.is_file() else {}
+        known: dict[str, str] = json.loads(index.read_text(encoding="utf-8")) if index.is_file() else {}
         new = [name for name, key in found.items() if known.get(name) != key or not (self.local / name).is_file()]
         for i, name in enumerate(new):
             report(i / len(new), name)
@@ -103,7 +103,7 @@ class Remote:
         for name in known.keys() - found.keys():
             self._path(name).unlink(missing_ok=True)
         self.local.mkdir(parents=True, exist_ok=True)
-        index.write_text(json.dumps(found))
+        index.write_text(json.dumps(found), encoding="utf-8")
         return self.local
 
     def push(self, names: Iterable[str]) -> None:
@@ -140,13 +140,13 @@ class Remote:
             UnavailableError: as `push`.
         """
         index = self.local / PUSHED
-        known: dict[str, list[int]] = json.loads(index.read_text()) if index.is_file() else {}
+        known: dict[str, list[int]] = json.loads(index.read_text(encoding="utf-8")) if index.is_file() else {}
         marks = {}
         for name in names:
             stat = (self.local / name).stat()
             marks[name] = [stat.st_size, stat.st_mtime_ns]
         self.push(name for name, mark in marks.items() if known.get(name) != mark)
-        index.write_text(json.dumps(marks))
+        index.write_text(json.dumps(marks), encoding="utf-8")
 
     def _path(self, name: str) -> Path:
         """Where a key's file is on this machine."""

@@ -127,7 +127,7 @@ class Clock:
 def this_host() -> str:
     """What this machine, in this life of it, differs from others by."""
     boot = Path("/proc/sys/kernel/random/boot_id")
-    return boot.read_text().strip() if boot.exists() else f"{uuid.getnode():x}"
+    return boot.read_text(encoding="utf-8").strip() if boot.exists() else f"{uuid.getnode():x}"
 
 
 class _NtpTime(ctypes.Structure):

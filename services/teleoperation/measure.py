@@ -215,7 +215,7 @@ class End:
         assert self.process.stdout is not None
         line = self.process.stdout.readline()
         if not line:
-            said = self._log.read_text(errors="replace").strip()[-600:]
+            said = self._log.read_text(errors="replace", encoding="utf-8").strip()[-600:]
             raise StepError(f"the scripted {self._role}", f"has failed: {said}", "Report it")
         return json.loads(line)
 

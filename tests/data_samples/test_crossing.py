@@ -90,7 +90,7 @@ def test_no_car_stands_where_a_train_passes() -> None:
 
 def test_films_come_with_a_line_a_frame(tmp_path: Path) -> None:
     crossing.film(tmp_path, views=2, frames=6, seed=3)
-    lines = [json.loads(line) for line in (tmp_path / "truth.jsonl").read_text().splitlines()]
+    lines = [json.loads(line) for line in (tmp_path / "truth.jsonl").read_text(encoding="utf-8").splitlines()]
     assert [(line["view"], line["frame"]) for line in lines] == [(v, f) for v in (0, 1) for f in range(6)]
     assert {line["light"] for line in lines} == {"day", "dusk"}
     bright = []

@@ -297,7 +297,7 @@ def test_a_drive_is_written(tmp_path: Path) -> None:
     assert len(kept) == 15
     assert np.abs(cv2.imread(str(kept[7]))[..., ::-1].astype(int) - frames[7][1]).mean() < 8
     truth = np.loadtxt(out / "truth.csv", delimiter=",", skiprows=1)
-    assert (out / "truth.csv").read_text().startswith("time,x,y,z,qx,qy,qz,qw\n")
+    assert (out / "truth.csv").read_text(encoding="utf-8").startswith("time,x,y,z,qx,qy,qz,qw\n")
     assert truth.shape == (15, 8)
     assert np.allclose(truth[:, 0], [t for t, _ in frames], atol=1e-6)
     assert np.allclose(np.linalg.norm(truth[:, 4:], axis=1), 1)

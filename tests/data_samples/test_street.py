@@ -106,7 +106,7 @@ def test_photos_show_the_true_colours_where_they_should(street: Street) -> None:
     everything = o3d.t.geometry.RaycastingScene()
     street_faces = scene.surface.faces[: scene._moving_at].astype(np.uint32)
     everything.add_triangles(o3d.core.Tensor(scene.surface.vertices), o3d.core.Tensor(street_faces))
-    lines = (folder / "truth/exposures.csv").read_text().splitlines()[1:]
+    lines = (folder / "truth/exposures.csv").read_text(encoding="utf-8").splitlines()[1:]
     ev = dict(line.split(",") for line in lines)
     offset = street.tile.frame.to_local(FRAME.to_crs(street.truth.xyz))
     assert street.truth.rgb is not None

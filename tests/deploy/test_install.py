@@ -31,7 +31,7 @@ def install() -> ModuleType:
 def commands(folder: Path, monkeypatch: pytest.MonkeyPatch, **scripts: str) -> None:
     """A PATH that has these commands alone, each a shell script."""
     for name, body in scripts.items():
-        (folder / name).write_text(f"#!/bin/sh\n{body}\n")
+        (folder / name).write_text(f"#!/bin/sh\n{body}\n", encoding="utf-8")
         (folder / name).chmod(0o755)
     monkeypatch.setenv("PATH", str(folder))
 
@@ -88,7 +88,7 @@ def test_what_may_be_installed_is_said_and_installed(
     scripts = {"apt-get": f'echo "$@" >> {requests}', "env": 'shift; exec "$@"', "sudo": 'shift; "$@"'}
     commands(tmp_path, monkeypatch, **scripts)
     install.install_system_packages(USB)
-    assert "install --no-install-recommends libusb-1.0-0" in requests.read_text()
+    assert "install --no-install-recommends libusb-1.0-0" in requests.read_text(encoding="utf-8")
     assert "Installing these packages now, by apt-get as root" in capfd.readouterr().out
 
 
@@ -119,7 +119,7 @@ def test_no_python_at_all_is_told() -> None:
 
 
 def test_packages_txt_holds_the_packages_of_all_libraries() -> None:
-    assert set((ROOT / "packages.txt").read_text().split()) == set(libraries.PACKAGE_OF.values())
+    assert set((ROOT / "packages.txt").read_text(encoding="utf-8").split()) == set(libraries.PACKAGE_OF.values())
 
 
 def test_every_shared_object_of_every_wheel_finds_its_libraries() -> None:

@@ -174,9 +174,9 @@ def damaged(street: Path, tmp_path: Path) -> Path:
 
 
 def edit(tile: Path, old: str, new: str, count: int = 1) -> None:
-    text = (tile / "tile.toml").read_text()
+    text = (tile / "tile.toml").read_text(encoding="utf-8")
     assert old in text
-    (tile / "tile.toml").write_text(text.replace(old, new, count))
+    (tile / "tile.toml").write_text(text.replace(old, new, count), encoding="utf-8")
 
 
 def test_version_and_help() -> None:
@@ -187,7 +187,7 @@ def test_version_and_help() -> None:
 
 def test_a_street_becomes_a_world_with_its_report(world: Path) -> None:
     assert len(list((world / "world").glob("*.sdf"))) == 1
-    report = json.loads((world / "report.json").read_text())
+    report = json.loads((world / "report.json").read_text(encoding="utf-8"))
     for group in ("terrain", "building", "vegetation"):
         assert report["geometry"]["cloud_to_mesh_mean_m"][group] < 0.1
         assert report["geometry"]["truth_mean_m"][group] < 0.2
@@ -195,7 +195,7 @@ def test_a_street_becomes_a_world_with_its_report(world: Path) -> None:
     assert report["texture"]["psnr_db"] > 12 and report["texture"]["psnr_gain_db"] >= report["texture"]["psnr_db"] - 0.5
     assert 0 < report["texture"]["ssim"] < 1 and report["texture"]["truth_psnr_db"] > 12
     assert report["steps"]["poisson.terrain"]["seconds"] > 0 and report["steps"]["poisson.terrain"]["peak_mb"] > 50
-    page = (world / "report.html").read_text()
+    page = (world / "report.html").read_text(encoding="utf-8")
     assert page.count("data:image/") >= 8 and "http" not in page.split("<main>")[1]
 
 
@@ -248,7 +248,7 @@ def test_plants_as_places(street: Path, world: Path, tmp_path: Path) -> None:
     good(scan2sim("run", street, "--out", out, "--hold-out", 4, *SMALL, "--set", "split.vegetation=locations"))
     pages = list((out / "world").rglob("vegetation*.png"))
     assert len(pages) == 1  # of the low-poly plants that stand there
-    features = json.loads(next((out / "world").rglob("plants.geojson")).read_text())["features"]
+    features = json.loads(next((out / "world").rglob("plants.geojson")).read_text(encoding="utf-8"))["features"]
     assert features and all(f["properties"]["height_m"] > 0 for f in features)
 
 
@@ -258,7 +258,7 @@ def test_a_cloud_alone_without_colours_or_classes(street: Path, tmp_path: Path) 
     las.write(tmp_path / "plain.laz", PointCloud(frame, cloud.xyz))
     good(scan2sim("import", "las", tmp_path / "plain.laz", "--out", tmp_path / "tile"))
     good(scan2sim("run", tmp_path / "tile", "--out", tmp_path / "out", *SMALL))
-    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    report = json.loads((tmp_path / "out" / "report.json").read_text(encoding="utf-8"))
     assert report["texture"]["coverage"] == 0 and report["steps"]["segment"]["facts"]["source"] == "shape"
 
 
@@ -271,8 +271,10 @@ def test_truncated_cloud(damaged: Path, tmp_path: Path) -> None:
 def test_no_crs(damaged: Path, tmp_path: Path) -> None:
     cloud = las.read(damaged / "cloud.laz", read_tile(damaged).frame)
     las.write(damaged / "cloud.laz", PointCloud(Frame(), cloud.xyz))
-    text = (damaged / "tile.toml").read_text()
-    (damaged / "tile.toml").write_text("\n".join(line for line in text.splitlines() if not line.startswith("crs")))
+    text = (damaged / "tile.toml").read_text(encoding="utf-8")
+    (damaged / "tile.toml").write_text(
+        "\n".join(line for line in text.splitlines() if not line.startswith("crs")), encoding="utf-8"
+    )
     bad(scan2sim("run", damaged, "--out", tmp_path / "out"), 3, "cloud.laz", "no CRS", 'crs = "local"')
 
 
@@ -284,7 +286,7 @@ def test_two_crs(damaged: Path, tmp_path: Path) -> None:
 
 
 def test_cloud_and_cameras_that_never_meet(damaged: Path, tmp_path: Path) -> None:
-    lines = (damaged / "tile.toml").read_text().splitlines()
+    lines = (damaged / "tile.toml").read_text(encoding="utf-8").splitlines()
     inside = False
     for i, line in enumerate(lines):
         if line.startswith("position"):
@@ -295,7 +297,7 @@ def test_cloud_and_cameras_that_never_meet(damaged: Path, tmp_path: Path) -> Non
             inside = False
         if line.startswith("position") and line.endswith("]"):
             lines[i], inside = "position = [12345.0, 12345.0, 12345.0]", False
-    (damaged / "tile.toml").write_text("\n".join(lines))
+    (damaged / "tile.toml").write_text("\n".join(lines), encoding="utf-8")
     bad(scan2sim("run", damaged, "--out", tmp_path / "out", *SMALL), 4, "never meet", "CRS, units and axes")
 
 
@@ -314,7 +316,7 @@ def test_missing_and_unreadable_photos_are_skipped(damaged: Path, world: Path, t
 @pytest.mark.slow
 def test_masks_named_as_their_photos_keep_pixels_out(damaged: Path, world: Path, tmp_path: Path) -> None:
     (damaged / "masks").mkdir()
-    text, out = (damaged / "tile.toml").read_text(), []
+    text, out = (damaged / "tile.toml").read_text(encoding="utf-8"), []
     for line in text.splitlines():
         out.append(line)
         if line.startswith("file ="):
@@ -322,17 +324,17 @@ def test_masks_named_as_their_photos_keep_pixels_out(damaged: Path, world: Path,
             width, height = Image.open(damaged / "photos" / name).size
             Image.new("L", (width, height), 0).save(damaged / "masks" / name, quality=100)
             out.append(f'mask = "masks/{name}"')
-    (damaged / "tile.toml").write_text("\n".join(out))
+    (damaged / "tile.toml").write_text("\n".join(out), encoding="utf-8")
     shutil.copytree(world, tmp_path / "out")
     good(scan2sim("run", damaged, "--out", tmp_path / "out", *SMALL))
-    assert json.loads((tmp_path / "out" / "report.json").read_text())["texture"]["coverage"] == 0
+    assert json.loads((tmp_path / "out" / "report.json").read_text(encoding="utf-8"))["texture"]["coverage"] == 0
 
 
 def test_a_folder_that_is_no_tile_is_not_overwritten(street: Path, tmp_path: Path) -> None:
-    (tmp_path / "notes.txt").write_text("mine")
+    (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
     result = scan2sim("import", "las", street / "cloud.laz", "--out", tmp_path, "--overwrite")
     bad(result, 2, "is no tile")
-    assert (tmp_path / "notes.txt").read_text() == "mine"
+    assert (tmp_path / "notes.txt").read_text(encoding="utf-8") == "mine"
 
 
 @pytest.mark.parametrize("options", [["--jobs", "-1"], ["--set", "ingest.unit=2.0"], ["--set", "split.roof.x=1"]])
@@ -342,9 +344,9 @@ def test_options_that_make_no_sense(street: Path, tmp_path: Path, options: list[
 
 def test_a_users_edit_of_the_world_stays(street: Path, world: Path) -> None:
     sdf = next((world / "world").glob("*.sdf"))
-    sdf.write_text(sdf.read_text() + "<!-- my robot -->")
+    sdf.write_text(sdf.read_text(encoding="utf-8") + "<!-- my robot -->", encoding="utf-8")
     good(scan2sim("run", street, "--out", world, "--hold-out", 4, *SMALL))
-    assert "my robot" in sdf.read_text()
+    assert "my robot" in sdf.read_text(encoding="utf-8")
 
 
 def test_all_photos_gone(damaged: Path, tmp_path: Path) -> None:
@@ -353,12 +355,14 @@ def test_all_photos_gone(damaged: Path, tmp_path: Path) -> None:
 
 
 def test_nan_pose_and_no_rotation(damaged: Path, tmp_path: Path) -> None:
-    text = (damaged / "tile.toml").read_text()
+    text = (damaged / "tile.toml").read_text(encoding="utf-8")
     head, tail = text.split("rotation", 1)
-    (damaged / "tile.toml").write_text(head + "rotation = [[1,0,0],[0,2,0],[0,0,1]]\n#" + _one_line(tail))
+    (damaged / "tile.toml").write_text(
+        head + "rotation = [[1,0,0],[0,2,0],[0,0,1]]\n#" + _one_line(tail), encoding="utf-8"
+    )
     bad(scan2sim("run", damaged, "--out", tmp_path / "out"), 3, "tile.toml", "is no rotation")
     head, tail = text.split("position", 1)
-    (damaged / "tile.toml").write_text(head + "position = [nan, 0.0, 0.0]\n#" + _one_line(tail))
+    (damaged / "tile.toml").write_text(head + "position = [nan, 0.0, 0.0]\n#" + _one_line(tail), encoding="utf-8")
     bad(scan2sim("run", damaged, "--out", tmp_path / "out"), 3, "tile.toml", "NaN")
 
 

@@ -40,7 +40,7 @@ def test_what_is_there_is_never_destroyed(tmp_path: Path) -> None:
     world = made_up.world(tmp_path).files["world"]
     out = tmp_path / "out"
     out.mkdir()
-    (out / "mine.txt").write_text("mine")
+    (out / "mine.txt").write_text("mine", encoding="utf-8")
     for more in ((), ("--overwrite",)):
         with pytest.raises(SettingError, match="not empty|is no world"):
             run(world, "--to", "glb", "--out", out, *more)
@@ -75,7 +75,7 @@ def test_budgets_that_are_none_are_told(tmp_path: Path, text: str) -> None:
 def test_a_world_is_written_within_a_budget(tmp_path: Path) -> None:
     world = made_up.world(tmp_path).files["world"]
     run(world, "--to", "glb", "--out", tmp_path / "out", "--budget", "triangles=1k,texture=0.1MP")
-    groups = json.loads((tmp_path / "out" / "metadata.json").read_text())["groups"].values()
+    groups = json.loads((tmp_path / "out" / "metadata.json").read_text(encoding="utf-8"))["groups"].values()
     assert 500 < sum(group["triangles"] for group in groups) <= 1050
     assert parse("triangles=200k, texture=64MP") == (200_000, 64e6) and parse(None) == (None, None)
 
@@ -92,16 +92,16 @@ def test_a_world_whose_borders_need_more_than_its_budget_is_told_of(
 def test_a_robot_is_put_into_a_world_within_a_budget(tmp_path: Path) -> None:
     driven(made_up.scene(tmp_path, tiles=1))
     run(tmp_path, "--to", "urdf", "--out", tmp_path / "out", "--robot", "--budget", "triangles=1k")
-    assert json.loads((tmp_path / "out" / "metadata.json").read_text())["robot"]["on"] == "path"
+    assert json.loads((tmp_path / "out" / "metadata.json").read_text(encoding="utf-8"))["robot"]["on"] == "path"
     assert (tmp_path / "out" / "robot.urdf").is_file()
 
 
 def test_3d_tiles_come_in_levels_of_detail(tmp_path: Path) -> None:
     world = made_up.world(tmp_path).files["world"]
     run(world, "--to", "tiles3d", "--out", tmp_path / "out", "--levels", 2)
-    tileset = json.loads((tmp_path / "out" / "tileset.json").read_text())
+    tileset = json.loads((tmp_path / "out" / "tileset.json").read_text(encoding="utf-8"))
     coarse, (fine,) = tileset["root"], tileset["root"]["children"]
     assert (coarse["refine"], coarse["content"]["uri"]) == ("REPLACE", "tiles3d/level1/street.glb")
     assert tileset["geometricError"] > coarse["geometricError"] > fine["geometricError"] == 0
-    files = json.loads((tmp_path / "out" / "metadata.json").read_text())["triangles_by_file"]
+    files = json.loads((tmp_path / "out" / "metadata.json").read_text(encoding="utf-8"))["triangles_by_file"]
     assert files[coarse["content"]["uri"]] < files[fine["content"]["uri"]] / 2

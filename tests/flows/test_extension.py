@@ -43,7 +43,7 @@ LIFT = Step("lift", 1, lift, LiftParams)
 def test_a_step_of_ones_own_is_one_file_and_one_line(
     small_street: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "lifting.py").write_text(FILE)
+    (tmp_path / "lifting.py").write_text(FILE, encoding="utf-8")
     monkeypatch.syspath_prepend(tmp_path)
     step = importlib.import_module("lifting").LIFT
     tile, store = read_tile(small_street), Store(tmp_path / "steps")

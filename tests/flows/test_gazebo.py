@@ -18,10 +18,10 @@ def test_a_shell_hands_gazebo_the_world_and_its_models_whatever_the_folder_is_ca
 ) -> None:
     world = tmp_path / "it's a $HOME & more" / "world"
     (world / "models").mkdir(parents=True)
-    (world / "street.sdf").write_text("<sdf/>")
+    (world / "street.sdf").write_text("<sdf/>", encoding="utf-8")
     fake = tmp_path / "bin" / program
     fake.parent.mkdir()
-    fake.write_text('#!/bin/sh\necho "$2"\necho "$GZ_SIM_RESOURCE_PATH$IGN_GAZEBO_RESOURCE_PATH"\n')
+    fake.write_text('#!/bin/sh\necho "$2"\necho "$GZ_SIM_RESOURCE_PATH$IGN_GAZEBO_RESOURCE_PATH"\n', encoding="utf-8")
     fake.chmod(0o755)
     variables = {"GZ_SIM_RESOURCE_PATH": "/robots"} if program == "gz" else {"IGN_GAZEBO_RESOURCE_PATH": "/robots"}
     said = subprocess.run(

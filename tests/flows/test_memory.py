@@ -84,11 +84,11 @@ def test_a_killed_process_gives_its_share_back(tmp_path: Path) -> None:
 def test_nothing_that_others_plant_is_followed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, planted: str) -> None:
     victim, folder = tmp_path / "victim", tmp_path / f"scan2sim-memory-{os.getuid()}"
     (victim / "below").mkdir(parents=True)
-    (victim / "kept.txt").write_text("precious")
+    (victim / "kept.txt").write_text("precious", encoding="utf-8")
     if planted == "folder":
         folder.symlink_to(victim / "below")
     elif planted == "file":
-        folder.write_text("precious")
+        folder.write_text("precious", encoding="utf-8")
     else:
         folder.mkdir()
         if planted == "another user's":
@@ -99,7 +99,7 @@ def test_nothing_that_others_plant_is_followed(tmp_path: Path, monkeypatch: pyte
             (folder / planted).symlink_to(victim / "kept.txt")
     with pytest.raises(ScanError, match="scan2sim-memory|queue|00000"), share(1.0, 0.25):
         pass
-    assert (victim / "kept.txt").read_text() == "precious" and not list((victim / "below").iterdir())
+    assert (victim / "kept.txt").read_text(encoding="utf-8") == "precious" and not list((victim / "below").iterdir())
 
 
 def test_the_queue_is_its_users_alone(tmp_path: Path) -> None:
@@ -112,7 +112,7 @@ def test_steps_that_do_not_fit_together_run_one_after_the_other(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("scan2sim.flows.engine.execution.need", lambda *_: 3.0)
-    (tmp_path / "source.txt").write_text("1")
+    (tmp_path / "source.txt").write_text("1", encoding="utf-8")
     running: set[int] = set()
     most: list[int] = []
 

@@ -37,7 +37,7 @@ def corridor(small_street: Path, tmp_path: Path) -> Path:
 
 def drive(folder: Path, text: str) -> Path:
     path = folder / "drive.toml"
-    path.write_text(text)
+    path.write_text(text, encoding="utf-8")
     return path
 
 
@@ -54,8 +54,8 @@ def test_a_corridor_is_cut_once_and_again_when_it_changes(corridor: Path, tmp_pa
     assert cut(length=6.0, buffer=2.0) == first
     finer = cut(length=4.0, buffer=1.0)
     assert len(read_survey(finer[0]).tiles) > 2 and not first[0].exists()
-    text = (corridor / "tile.toml").read_text()
-    (corridor / "tile.toml").write_text(text.replace('name = "street"', 'name = "road"'))
+    text = (corridor / "tile.toml").read_text(encoding="utf-8")
+    (corridor / "tile.toml").write_text(text.replace('name = "street"', 'name = "road"'), encoding="utf-8")
     other = cut(length=4.0, buffer=1.0)
     assert other != finer and read_survey(other[0]).name == "road"
 
@@ -71,7 +71,7 @@ def test_steps_of_a_drive_are_done_again_by_newer_code_and_of_other_files(
 ) -> None:
     for name in ("video.mp4", "camera.toml", "velodyne/0.bin", "image/0.png"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).write_text(name)
+        (tmp_path / name).write_text(name, encoding="utf-8")
     text = '[slam]\nvideo = "video.mp4"\n[sweeps]\nfolder = "velodyne"\nphotos = "image"\ncamera = "camera.toml"\n'
     place, known = drive(tmp_path, text), dict[str, str]()
 
@@ -87,11 +87,11 @@ def test_steps_of_a_drive_are_done_again_by_newer_code_and_of_other_files(
         monkeypatch.setattr(f"scan2sim.flows.recipes.{recipe}.{step.name.upper()}", replace(step, version=1000))
         assert changed() == ({"cut"} if step is CUT else {"import_sweeps", "cut"})
     for name in ("camera.toml", "velodyne/0.bin", "image/0.png"):
-        (tmp_path / name).write_text("another")
+        (tmp_path / name).write_text("another", encoding="utf-8")
         assert changed() == {"import_sweeps", "cut"}, name
-    (tmp_path / "velodyne/1.bin").write_text("one more")
+    (tmp_path / "velodyne/1.bin").write_text("one more", encoding="utf-8")
     assert changed() == {"import_sweeps", "cut"}
-    (tmp_path / "video.mp4").write_text("another")
+    (tmp_path / "video.mp4").write_text("another", encoding="utf-8")
     assert changed() == {"track", "place", "import_sweeps", "cut"}
 
 

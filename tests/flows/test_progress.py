@@ -71,7 +71,7 @@ Run = Callable[..., None]
 def run(tmp_path: Path) -> Iterator[Run]:
     """Runs the toy chain as commands do; keyword arguments by node."""
     source = tmp_path / "source.txt"
-    source.write_text("1")
+    source.write_text("1", encoding="utf-8")
 
     def go(where: str, **changes: dict[str, Any]) -> None:
         store = Store(tmp_path / "store")
@@ -156,7 +156,7 @@ def test_an_interrupted_run_is_told_as_stopped(heard: Heard) -> None:
 
 def test_workers_elsewhere_tell_of_the_same_run(tmp_path: Path, heard: Heard) -> None:
     source, store = tmp_path / "source.txt", Store(tmp_path / "store")
-    source.write_text("1")
+    source.write_text("1", encoding="utf-8")
     planned = plan(chain(source, tmp_path / "log", c={"does": "fail"}), store)
 
     class Later:

@@ -17,8 +17,8 @@ pytestmark = pytest.mark.slow
 def run(tile: Path, out: Path, *options: object) -> dict[str, Any]:
     """Run the command with its defaults, have Gazebo load the world; the report's figures."""
     good(scan2sim("run", tile, "--out", out, *options, timeout=1800))
-    report = json.loads((out / "report.json").read_text())
-    ground = json.loads((out / "world" / "metadata.json").read_text())["groups"]["terrain"]
+    report = json.loads((out / "report.json").read_text(encoding="utf-8"))
+    ground = json.loads((out / "world" / "metadata.json").read_text(encoding="utf-8"))["groups"]["terrain"]
     x, y, _ = ((a + b) / 2 for a, b in zip(ground["low_m"], ground["high_m"], strict=True))
     above = (x, y, ground["high_m"][2] + 2)
     seen = check_world(next((out / "world").glob("*.sdf")), ("box", above))

@@ -58,8 +58,8 @@ def report(tmp_path: Path) -> Any:
             done[node] = store.commit(node, "key", folder, Done(files, facts), about)
             planned.append(Planned(Node(Step(node, 1, no_step), Params(), {}), "key", {}, None))
         tile = Tile(tmp_path / "tile.toml", "made_up", Frame(), ())
-        page = write_report(tile, planned, done, store, tmp_path, seconds=1.0).read_text()
-        return json.loads((tmp_path / "report.json").read_text()), page
+        page = write_report(tile, planned, done, store, tmp_path, seconds=1.0).read_text(encoding="utf-8")
+        return json.loads((tmp_path / "report.json").read_text(encoding="utf-8")), page
 
     return write
 
@@ -73,7 +73,7 @@ def album(folder: Path, titles: list[str]) -> Path:
     entries = [{"file": f"{t}.jpg", "role": "error", "title": t, "caption": "23 dB."} for t in titles]
     for entry in entries:
         image.write(folder / "error" / entry["file"], np.zeros((8, 24, 3), np.uint8))
-    (folder / "error" / "index.json").write_text(json.dumps(entries))
+    (folder / "error" / "index.json").write_text(json.dumps(entries), encoding="utf-8")
     return folder / "error"
 
 

@@ -51,7 +51,9 @@ def test_defaults_are_the_missions_numbers() -> None:
 
 
 def test_a_class_wins_over_all_classes_and_the_command_line_over_the_file(tmp_path: Path) -> None:
-    (tmp_path / "s.toml").write_text("[decimate]\ntarget = 20000\n[decimate.building]\ntarget = 30000\n")
+    (tmp_path / "s.toml").write_text(
+        "[decimate]\ntarget = 20000\n[decimate.building]\ntarget = 30000\n", encoding="utf-8"
+    )
     settings = Settings.read(tmp_path / "s.toml", ["decimate.vegetation.target=40000", "split.vegetation=both"])
     assert [settings.params(DECIMATE, g).target for g in ("terrain", "building", "vegetation")] == [
         20_000,
@@ -89,7 +91,7 @@ def test_values_out_of_range_are_refused(text: str) -> None:
 
 
 def test_a_broken_file_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "s.toml").write_text("[decimate\n")
+    (tmp_path / "s.toml").write_text("[decimate\n", encoding="utf-8")
     with pytest.raises(SettingError, match="TOML"):
         Settings.read(tmp_path / "s.toml")
 
@@ -138,7 +140,7 @@ def test_every_number_has_two_ends(where: str, name: str) -> None:
 
 
 def test_the_page_of_settings_tells_their_ranges() -> None:
-    text = (ROOT / "docs" / "settings.md").read_text()
+    text = (ROOT / "docs" / "settings.md").read_text(encoding="utf-8")
     for step in STEPS:
         for name, field in step.params.model_fields.items():
             line = next(line for line in text.splitlines() if line.startswith(f"| `{step.name}.{name}` "))

@@ -49,7 +49,7 @@ def tiles(count: int = 6, length: float = 50.0) -> list[TileState]:
 def written(out: Path, made: list[TileState], **more: Any) -> tuple[dict[str, Any], str]:
     """survey.json and survey.html."""
     page = write_survey_report(out, "town", made, **more)
-    return json.loads((out / "survey.json").read_text()), page.read_text()
+    return json.loads((out / "survey.json").read_text(encoding="utf-8")), page.read_text(encoding="utf-8")
 
 
 def drawn(page: str) -> ET.Element:

@@ -52,7 +52,7 @@ def made(survey: Path, failed: Path) -> Path:
 
 
 def report_of(out: Path) -> dict[str, Any]:
-    return json.loads((out / "survey.json").read_text())
+    return json.loads((out / "survey.json").read_text(encoding="utf-8"))
 
 
 def test_tiles_share_their_borders(made: Path) -> None:
@@ -68,7 +68,7 @@ def test_furniture_is_listed_by_the_tile_in_whose_cell_it_stands(made: Path, sur
     feet = []
     for path in sorted(survey.glob("*/tile.toml")):
         tile = read_tile(path)
-        listed = json.loads((made / "tiles" / tile.name / "world" / "furniture.geojson").read_text())
+        listed = json.loads((made / "tiles" / tile.name / "world" / "furniture.geojson").read_text(encoding="utf-8"))
         places = [f["geometry"]["coordinates"][:2] for f in listed["features"]]
         assert tile.cell is not None and (tile.cell.outside(np.array(places).reshape(-1, 2)) <= 0).all()
         feet += places
@@ -111,7 +111,7 @@ def test_where_classes_meet_there_is_no_hole(made: Path, survey: Path) -> None:
 
 def test_gazebo_loads_all_tiles_as_one_world(made: Path) -> None:
     (world,) = (made / "world").glob("*.sdf")
-    tiles = json.loads((made / "world" / "metadata.json").read_text())["tiles"]
+    tiles = json.loads((made / "world" / "metadata.json").read_text(encoding="utf-8"))["tiles"]
     assert len(tiles) == 2
     seen = check_world(world, ("box", (0, 0, 2)))
     (box,) = seen["bodies"]
@@ -127,7 +127,7 @@ def test_an_unchanged_survey_is_left_as_it_is(survey: Path, made: Path) -> None:
 
 
 def test_a_tile_that_fails_is_told_and_the_others_are_made(survey: Path, failed: Path) -> None:
-    tiles = json.loads((failed.parent / "failed.json").read_text())["tiles"]
+    tiles = json.loads((failed.parent / "failed.json").read_text(encoding="utf-8"))["tiles"]
     assert tiles.keys() == {tile.parent.name for tile in survey.glob("*/tile.toml")}
     first, second = tiles.values()
     assert first["state"] == "done" and second["state"] == "failed"
@@ -140,7 +140,9 @@ def test_a_survey_that_failed_first_is_as_one_made_at_once_and_names_of_folders_
 ) -> None:  # fmt: skip
     other = renamed(survey, tmp_path / "tiles")
     for tile in other.glob("*/tile.toml"):
-        tile.write_text(tile.read_text().replace('"../../corridor', f'"{survey.parent}/corridor'))
+        tile.write_text(
+            tile.read_text(encoding="utf-8").replace('"../../corridor', f'"{survey.parent}/corridor'), encoding="utf-8"
+        )
     good(scan2sim("survey", other, "--out", tmp_path / "out", *SMALL))
     assert contents(tmp_path / "out") == contents(made)
 
@@ -150,14 +152,16 @@ def renamed(survey: Path, to: Path) -> Path:
     shutil.copytree(survey, to)
     for i, tile in enumerate(sorted(to.glob("*/tile.toml"))):
         listing = to / "survey.toml"
-        listing.write_text(listing.read_text().replace(tile.parent.name, f"folder-{i}"))
+        listing.write_text(
+            listing.read_text(encoding="utf-8").replace(tile.parent.name, f"folder-{i}"), encoding="utf-8"
+        )
         tile.parent.rename(to / f"folder-{i}")
     return to
 
 
 def contents(out: Path) -> dict[str, str]:
     """Digests of all results, by tile and step."""
-    manifests = [json.loads(path.read_text()) for path in (out / "steps").glob("*/*/*/manifest.json")]
+    manifests = [json.loads(path.read_text(encoding="utf-8")) for path in (out / "steps").glob("*/*/*/manifest.json")]
     return {manifest["label"]: manifest["content"] for manifest in manifests}
 
 

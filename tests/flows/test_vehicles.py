@@ -60,7 +60,7 @@ def test_what_is_parked_is_kept_and_what_moved_is_not(tmp_path: Path) -> None:
         for name, (x, y) in places.items()
         if name != "alone"  # told to be a vehicle's, but of no vehicle that was found
     ]
-    (tmp_path / "things.geojson").write_text(json.dumps({"features": features}))
+    (tmp_path / "things.geojson").write_text(json.dumps({"features": features}), encoding="utf-8")
     inputs = {"cloud": tmp_path / "cloud.npz", "things": tmp_path / "things.geojson"}
     (tmp_path / "out").mkdir()
     done = SPLIT.run(inputs, SplitParams(vehicles="keep"), tmp_path / "out", silent)
@@ -83,8 +83,8 @@ def test_a_world_with_its_parked_cars(tmp_path: Path) -> None:
     assert not list((tmp_path / "remove").rglob("vehicle.*"))
     meshes = next((tmp_path / "keep" / "world" / "models").rglob("meshes"))
     assert {"vehicle.obj", "vehicle.dae", "vehicle.mtl", "vehicle_0.png"} <= {f.name for f in meshes.iterdir()}
-    assert "vehicle.obj" in (meshes.parent / "model.sdf").read_text()
-    report = json.loads((tmp_path / "keep" / "report.json").read_text())
+    assert "vehicle.obj" in (meshes.parent / "model.sdf").read_text(encoding="utf-8")
+    report = json.loads((tmp_path / "keep" / "report.json").read_text(encoding="utf-8"))
     assert 0 < report["geometry"]["triangles"]["vehicle"] <= 50_000
     assert report["texture"]["coverage_by_class"]["vehicle"] > 0.3
     made = Mesh.load(next((tmp_path / "keep" / "steps" / "decimate.vehicle").rglob("mesh.npz")))

@@ -26,11 +26,11 @@ class ToyParams(Params):
 
 def toy(inputs: Inputs, params: ToyParams, out: Path, report: Report) -> Done:
     """Write the sum of all inputs and the value."""
-    with open(params.log, "a") as file:
+    with open(params.log, "a", encoding="utf-8") as file:
         file.write(params.name + "\n")
-    params.log.with_name(f"pid_{params.name}").write_text(str(os.getpid()))
-    total = params.value + sum(int(path.read_text()) for path in inputs.values())
-    (out / "number.txt").write_text(str(total))
+    params.log.with_name(f"pid_{params.name}").write_text(str(os.getpid()), encoding="utf-8")
+    total = params.value + sum(int(path.read_text(encoding="utf-8")) for path in inputs.values())
+    (out / "number.txt").write_text(str(total), encoding="utf-8")
     if params.does == "fail":
         raise DataError("toy", "was told to fail", "Tell it otherwise")
     if params.does == "bug":

@@ -42,7 +42,7 @@ def written(name: str, text: str) -> Make:
 
 def tile(folder: Path) -> list[Path]:
     """A tile with a camera, a photo, a trajectory, a cell and classes."""
-    (folder / "path.csv").write_text("time,x,y,z\n1,500000,5400000,101\n2,500001,5400000,101\n")
+    (folder / "path.csv").write_text("time,x,y,z\n1,500000,5400000,101\n2,500001,5400000,101\n", encoding="utf-8")
     more = {"trajectory": "path.csv", "classes": {"65": "noise"}, "cell": {"seed": [500_010.0, 5_400_010.0]}}
     save(folder, body(folder, **more))
     return [folder / "tile.toml", folder / "path.csv"]
@@ -107,10 +107,10 @@ def photos(folder: Path) -> list[Path]:
     cloud(folder / "c.laz")
     cv2.imwrite(str(folder / "1.png"), np.zeros((48, 64, 3), np.uint8))
     (folder / "photos.csv").write_text(
-        "file,x,y,z,qw,qx,qy,qz,time,camera\n1.png,500010,5400010,102,1,0,0,0,3.5,front\n"
+        "file,x,y,z,qw,qx,qy,qz,time,camera\n1.png,500010,5400010,102,1,0,0,0,3.5,front\n", encoding="utf-8"
     )
     heading = "camera,model,width,height,fx,fy,cx,cy,k1,k2,p1,p2"
-    (folder / "cameras.csv").write_text(f"{heading}\nfront,opencv,64,48,50,50,31.5,23.5,0.1,0,0,0\n")
+    (folder / "cameras.csv").write_text(f"{heading}\nfront,opencv,64,48,50,50,31.5,23.5,0.1,0,0,0\n", encoding="utf-8")
     return [folder / "photos.csv", folder / "cameras.csv", folder / "1.png"]
 
 
@@ -134,7 +134,7 @@ def trajectory(suffix: str) -> tuple[Make, Read]:
 def camera_file(folder: Path) -> list[Path]:
     """Cameras alone, and extrinsics."""
     camera = {"id": "c", "model": "opencv", "size": [64, 48], "focal": [50.0, 50.0], "centre": [31.5, 23.5]}
-    (folder / "cameras.toml").write_text(tomli_w.dumps({"cameras": [camera]}))
+    (folder / "cameras.toml").write_text(tomli_w.dumps({"cameras": [camera]}), encoding="utf-8")
     np.savetxt(folder / "T.txt", np.eye(4)[:3], "%.9f")
     return [folder / "cameras.toml", folder / "T.txt"]
 

@@ -46,10 +46,10 @@ def earlier(folder: Path) -> Path:
     """A folder with a tile, a survey's mark, and results of an earlier run."""
     folder.mkdir()
     save(folder, body(folder, photos=[], cameras=[]))
-    (folder / "survey.toml").write_text("# earlier")
+    (folder / "survey.toml").write_text("# earlier", encoding="utf-8")
     for name in ("world/town.sdf", "world/models/town/model.sdf", "report.html", "steps/ingest/k/manifest.json"):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_text("earlier")
+        (folder / name).write_text("earlier", encoding="utf-8")
     return folder
 
 

@@ -27,7 +27,7 @@ def built() -> str:
     if shutil.which("cmake") is None:
         return "cmake is not installed (tests/gazebo/packages.txt)"
     BUILD.mkdir(exist_ok=True)
-    with open(BUILD / "lock", "w") as lock:  # tests may run in several processes
+    with open(BUILD / "lock", "w", encoding="utf-8") as lock:  # tests may run in several processes
         fcntl.flock(lock, fcntl.LOCK_EX)
         made = _run("cmake", "-S", HERE, "-B", BUILD, "-DCMAKE_BUILD_TYPE=Release")
         if made.returncode:
@@ -63,7 +63,7 @@ def check_world(world: Path, *bodies: Body) -> dict[str, Any]:
     Raises:
         Refused: with the first problem.
     """
-    expected = json.loads((world.parent / "metadata.json").read_text())["triangles_by_file"]
+    expected = json.loads((world.parent / "metadata.json").read_text(encoding="utf-8"))["triangles_by_file"]
     files = [f"{file}={count}" for file, count in expected.items() if file.startswith("models/")]
     dropped = [f"{kind}@{x:.4f},{y:.4f},{z:.4f}" for kind, (x, y, z) in bodies]
     done = _run(program("check_world"), world, *dropped, *files)

@@ -102,9 +102,9 @@ def test_a_split_local_world_with_collada_visuals(tmp_path: Path) -> None:
 
 
 def _edit(path: Path, old: str, new: str) -> None:
-    text = path.read_text()
+    text = path.read_text(encoding="utf-8")
     assert old in text
-    path.write_text(text.replace(old, new))
+    path.write_text(text.replace(old, new), encoding="utf-8")
 
 
 def test_a_missing_texture_is_refused(world: Path) -> None:
@@ -115,8 +115,8 @@ def test_a_missing_texture_is_refused(world: Path) -> None:
 
 def test_a_missing_or_broken_mesh_is_refused(world: Path) -> None:
     meshes = world.parent / "models/street/meshes"
-    whole = (meshes / "building.dae").read_text()
-    (meshes / "building.dae").write_text(whole[: len(whole) // 2])
+    whole = (meshes / "building.dae").read_text(encoding="utf-8")
+    (meshes / "building.dae").write_text(whole[: len(whole) // 2], encoding="utf-8")
     with pytest.raises(Refused, match=r"building\.dae"):
         check_world(world)
     (meshes / "building.obj").unlink()
@@ -126,8 +126,8 @@ def test_a_missing_or_broken_mesh_is_refused(world: Path) -> None:
 
 def test_a_dropped_triangle_is_refused(world: Path) -> None:
     path = world.parent / "models/street/meshes/terrain.obj"
-    lines = path.read_text().splitlines()
-    path.write_text("\n".join(lines[:-1]) + "\n")
+    lines = path.read_text(encoding="utf-8").splitlines()
+    path.write_text("\n".join(lines[:-1]) + "\n", encoding="utf-8")
     with pytest.raises(Refused, match="3199 triangles where 3200 are expected"):
         check_world(world)
 
@@ -140,8 +140,10 @@ def test_unknown_elements_are_refused(world: Path) -> None:
 
 def test_a_collision_mesh_that_physics_would_ignore_is_refused(world: Path) -> None:
     path = world.parent / "models/street/meshes/collision_terrain.obj"
-    lines = [line for line in path.read_text().splitlines() if not line.startswith("vn ")]
-    path.write_text("\n".join(" ".join(p.split("//")[0] for p in line.split(" ")) for line in lines) + "\n")
+    lines = [line for line in path.read_text(encoding="utf-8").splitlines() if not line.startswith("vn ")]
+    path.write_text(
+        "\n".join(" ".join(p.split("//")[0] for p in line.split(" ")) for line in lines) + "\n", encoding="utf-8"
+    )
     with pytest.raises(Refused, match="normal count"):
         check_world(world)
 

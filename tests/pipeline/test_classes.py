@@ -72,7 +72,9 @@ def test_classes_that_the_user_names(tmp_path: Path) -> None:
     for text, message in (refused | {"256=6": "no code"}).items():
         with pytest.raises(SettingError, match=message):
             parse(text)
-    (tmp_path / "tile.toml").write_text('name = "t"\ncrs = "local"\nclouds = ["a.las"]\n[classes]\n65 = "fog"\n')
+    (tmp_path / "tile.toml").write_text(
+        'name = "t"\ncrs = "local"\nclouds = ["a.las"]\n[classes]\n65 = "fog"\n', encoding="utf-8"
+    )
     foreign(tmp_path / "a.las")
     with pytest.raises(InputError, match=r"tile\.toml: field `classes`: there is no class 'fog'.*pole"):
         read_tile(tmp_path)

@@ -372,7 +372,7 @@ def test_clouds_of_all_kinds_join_as_in_a_tile(tmp_path: Path) -> None:
     xyz[5] = np.nan
     (folder / "2.ply").write_bytes(text.encode() + xyz.astype("<f8").tobytes())
     body = {"name": "bend", "crs": UTM.crs, "clouds": ["0.laz", "1.laz", "2.ply"], "trajectory": "path.csv"}
-    (folder / "tile.toml").write_text(tomli_w.dumps(body))
+    (folder / "tile.toml").write_text(tomli_w.dumps(body), encoding="utf-8")
     warned: list[str] = []
     made = tiles(cut_survey(folder, tmp_path / "out", CUT, warn=warned.append))
     assert "2.ply: 1 points with NaN coordinates left out" in warned
@@ -479,7 +479,7 @@ def test_a_trajectory_elsewhere_is_told(tmp_path: Path) -> None:
 
 def test_surveys_that_are_wrong_are_named(tmp_path: Path) -> None:
     out = cut_survey(corridor(tmp_path / "corridor", n=20_000), tmp_path / "out", CUT)
-    text = out.read_text()
+    text = out.read_text(encoding="utf-8")
     with pytest.raises(InputError, match="there is no survey here"):
         read_survey(tmp_path)
     for old, new, cause in (
@@ -489,12 +489,12 @@ def test_surveys_that_are_wrong_are_named(tmp_path: Path) -> None:
         ("bend_0001", "bend_0009", "bend_0009.*is missing"),
         ("bend_0001", "bend_0000", "names two tiles bend_0000"),
     ):
-        out.write_text(text.replace(old, new))
+        out.write_text(text.replace(old, new), encoding="utf-8")
         with pytest.raises(InputError, match=cause):
             read_survey(out)
-    out.write_text(text)
+    out.write_text(text, encoding="utf-8")
     other = tmp_path / "out/bend_0001/tile.toml"
-    other.write_text(other.read_text().replace("EPSG:32632", "EPSG:32633"))
+    other.write_text(other.read_text(encoding="utf-8").replace("EPSG:32632", "EPSG:32633"), encoding="utf-8")
     with pytest.raises(InputError, match=r"two CRS: bend_0001 is in EPSG:32633, bend_0000 in EPSG:32632"):
         read_survey(out)
 

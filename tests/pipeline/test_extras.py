@@ -139,8 +139,8 @@ def test_a_package_that_is_missing_ends_all_commands_alike(
     (tmp_path / "frames").mkdir()
     for number in range(2):
         cv2.imwrite(str(tmp_path / "frames" / f"{number}.png"), np.zeros((8, 16), np.uint8))
-    (tmp_path / "truth.csv").write_text("time,x,y,z\n0,0,0,0\n1,1,0,0\n2,2,1,0\n3,3,1,0\n")
-    (tmp_path / "ept.json").write_text('{"dataType": "zstandard"}')
+    (tmp_path / "truth.csv").write_text("time,x,y,z\n0,0,0,0\n1,1,0,0\n2,2,1,0\n3,3,1,0\n", encoding="utf-8")
+    (tmp_path / "ept.json").write_text('{"dataType": "zstandard"}', encoding="utf-8")
     for name in ("video.mp4", "cloud.e57"):
         (tmp_path / name).touch()
     monkeypatch.chdir(tmp_path)
@@ -172,7 +172,7 @@ def test_the_demo_needs_nothing_but_the_core(monkeypatch: pytest.MonkeyPatch, tm
 
 
 def test_every_extra_is_there_and_brings_its_package() -> None:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     core = {re.split(r"[^\w.-]", line)[0] for line in project["dependencies"]}
     for package, extra in EXTRA_OF.items():
         named = {"pxr": "usd_core", "yaml": "pyyaml", "OpenSSL": "pyopenssl", "can": "python_can"}.get(package, package)
@@ -181,7 +181,9 @@ def test_every_extra_is_there_and_brings_its_package() -> None:
 
 
 def test_hints_work_for_those_who_have_no_checkout() -> None:
-    extras = set(tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"])
+    extras = set(
+        tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    )
     pages = [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]
     rooms = ("pipeline", "flows", "segmentation", "texturing", "slam", "services", "data_samples")
     for file in [*pages, *(path for room in rooms for path in (ROOT / room).rglob("*.py"))]:

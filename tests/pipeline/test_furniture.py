@@ -40,7 +40,7 @@ def _run(street: tuple[Path, Path], out: Path, **params: Any) -> tuple[list[dict
     cloud = {"cloud": street[0]}
     found = FINDS.run(cloud | {"path": street[1]}, FindsParams(**params), out, silent)
     done = FURNITURE.run(cloud | found.files, FurnitureParams(**params), out, silent)
-    features = json.loads(done.files["geojson"].read_text())["features"]
+    features = json.loads(done.files["geojson"].read_text(encoding="utf-8"))["features"]
     return [f["properties"] | {"at": np.array(f["geometry"]["coordinates"]) - FRAME.origin} for f in features], done
 
 

@@ -99,7 +99,7 @@ class Tile:
     @property
     def rows(self) -> list[dict[str, Any]]:
         """What is listed, with the place `at` beside the middle."""
-        features = json.loads(self.furniture.files["geojson"].read_text())["features"]
+        features = json.loads(self.furniture.files["geojson"].read_text(encoding="utf-8"))["features"]
         return [f["properties"] | {"at": np.array(f["geometry"]["coordinates"]) - (X, Y, Z)} for f in features]
 
     @property
@@ -249,7 +249,10 @@ def test_a_tile_whose_neighbour_is_not_made_shows_its_own(
 
 
 def test_all_agree_in_whatever_order_they_ask(tiles: dict[str, Tile]) -> None:
-    finds = {name: [Thing.from_json(row) for row in json.loads(tile.found.read_text())] for name, tile in tiles.items()}
+    finds = {
+        name: [Thing.from_json(row) for row in json.loads(tile.found.read_text(encoding="utf-8"))]
+        for name, tile in tiles.items()
+    }
     assert all(len(told) >= 3 for told in finds.values())  # both know of what stands on the border
     backwards = {name: finds[name] for name in reversed(finds)}
     one, other = agreed(finds, SEEDS), agreed(backwards, {name: SEEDS[name] for name in reversed(SEEDS)})
@@ -258,7 +261,7 @@ def test_all_agree_in_whatever_order_they_ask(tiles: dict[str, Tile]) -> None:
 
 
 def test_two_poles_side_by_side_on_a_border_stay_two(tiles: dict[str, Tile]) -> None:
-    told = [Thing.from_json(row) for row in json.loads(tiles["west"].found.read_text())]
+    told = [Thing.from_json(row) for row in json.loads(tiles["west"].found.read_text(encoding="utf-8"))]
     (sign,) = [thing for thing in told if thing.kind == "sign"]
     beside = sign.moved(np.array([-0.3, 0.0, 0.0]))
     jitter = np.array([0.02, -0.01, 0.0])

@@ -30,7 +30,7 @@ def boxes(path: Path, *kinds: str, heading: float = 0.0) -> Path:
         {"type": "Feature", "geometry": {"type": "Polygon", "coordinates": [ring.tolist()]},
          "properties": {"kind": kind, **properties}} for kind in kinds
     ]  # fmt: skip
-    path.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": features}), encoding="utf-8")
     return path
 
 

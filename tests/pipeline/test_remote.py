@@ -46,7 +46,7 @@ def test_a_place_is_itself_or_has_a_likeness(monkeypatch: pytest.MonkeyPatch, tm
 
 
 def test_another_machine_goes_on_where_the_first_one_stopped(s3: str, tmp_path: Path) -> None:
-    (tmp_path / "source.txt").write_text("1")
+    (tmp_path / "source.txt").write_text("1", encoding="utf-8")
     log = tmp_path / "log"
 
     def machine(name: str, **changes: dict[str, object]) -> dict[str, object]:
@@ -56,9 +56,9 @@ def test_another_machine_goes_on_where_the_first_one_stopped(s3: str, tmp_path: 
         return {name: manifest.facts["total"] for name, manifest in outcome.of_tile().items()}
 
     assert set(machine("first", c={"does": "fail"})) == {"a", "b"}
-    assert sorted(log.read_text().split()) == ["a", "b", "c"]
+    assert sorted(log.read_text(encoding="utf-8").split()) == ["a", "b", "c"]
     assert machine("second") == {"a": 1, "b": 1, "c": 1, "d": 2}
-    assert sorted(log.read_text().split()) == ["a", "b", "c", "c", "d"]
+    assert sorted(log.read_text(encoding="utf-8").split()) == ["a", "b", "c", "c", "d"]
     assert machine("third") == {"a": 1, "b": 1, "c": 1, "d": 2}  # no file but manifests is fetched
     assert not list((tmp_path / "third").rglob("number.txt"))
 
@@ -66,45 +66,47 @@ def test_another_machine_goes_on_where_the_first_one_stopped(s3: str, tmp_path: 
 def test_a_likeness_follows_what_it_is_like(s3: str, tmp_path: Path) -> None:
     here, there = Remote(f"{s3}/tiles", tmp_path / "here"), Remote(f"{s3}/tiles", tmp_path / "there")
     (here.local / "a").mkdir(parents=True)
-    (here.local / "a" / "one.txt").write_text("1")
-    (here.local / "two.txt").write_text("2")
+    (here.local / "a" / "one.txt").write_text("1", encoding="utf-8")
+    (here.local / "two.txt").write_text("2", encoding="utf-8")
     here.push_all(["a/one.txt", "two.txt"])
     assert there.pull_all() == tmp_path / "there"
-    assert (there.local / "a" / "one.txt").read_text() == "1" and (there.local / "two.txt").read_text() == "2"
+    assert (there.local / "a" / "one.txt").read_text(encoding="utf-8") == "1" and (there.local / "two.txt").read_text(
+        encoding="utf-8"
+    ) == "2"
     untouched = (there.local / "two.txt").stat().st_mtime_ns
-    (here.local / "a" / "one.txt").write_text("11")
+    (here.local / "a" / "one.txt").write_text("11", encoding="utf-8")
     here.push_all(["a/one.txt", "two.txt"])
     there.pull_all()
-    assert (there.local / "a" / "one.txt").read_text() == "11"
+    assert (there.local / "a" / "one.txt").read_text(encoding="utf-8") == "11"
     assert (there.local / "two.txt").stat().st_mtime_ns == untouched
 
 
 def test_a_source_that_is_not_here_is_fetched(s3: str, tmp_path: Path) -> None:
     first, second = Remote(f"{s3}/src", tmp_path / "a"), Remote(f"{s3}/src", tmp_path / "b")
     first.local.mkdir()
-    (first.local / "cloud.laz").write_text("points")
+    (first.local / "cloud.laz").write_text("points", encoding="utf-8")
     first.push(["cloud.laz"])
     store = Store(tmp_path / "steps", sources=second)
-    assert store.source(second.local / "cloud.laz").read_text() == "points"
+    assert store.source(second.local / "cloud.laz").read_text(encoding="utf-8") == "points"
 
 
 def test_what_was_damaged_here_is_fetched_again_and_there_is_made_anew(s3: str, tmp_path: Path) -> None:
-    (tmp_path / "source.txt").write_text("1")
+    (tmp_path / "source.txt").write_text("1", encoding="utf-8")
     log, remote = tmp_path / "log", Remote(f"{s3}/damaged", tmp_path / "here")
 
     def machine(**changes: dict[str, object]) -> list[str]:
         store = Store(tmp_path / "here", remote)
         log.unlink(missing_ok=True)
         execute(plan(chain(tmp_path / "source.txt", log, **changes), store), store, jobs=1, watch=lambda *_: None)
-        return sorted(log.read_text().split())
+        return sorted(log.read_text(encoding="utf-8").split())
 
     assert machine() == ["a", "b", "c", "d"]
     (number,) = (tmp_path / "here" / "a").rglob("number.txt")
-    number.write_text("7")
-    assert machine(b={"value": 5}) == ["b", "d"] and number.read_text() == "1"
-    number.write_text("7")
+    number.write_text("7", encoding="utf-8")
+    assert machine(b={"value": 5}) == ["b", "d"] and number.read_text(encoding="utf-8") == "1"
+    number.write_text("7", encoding="utf-8")
     remote.push([number.relative_to(remote.local).as_posix()])
-    assert machine(b={"value": 6}) == ["a", "b", "d"] and number.read_text() == "1"
+    assert machine(b={"value": 6}) == ["a", "b", "d"] and number.read_text(encoding="utf-8") == "1"
 
 
 def test_a_key_that_leads_out_of_its_folder_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -43,7 +43,7 @@ def item(out: Path, name: str, frame: Frame, **more: Any) -> TileItem:
     folder = out / "tiles" / name
     cloud = scanned(folder, frame)
     for file in ("world.sdf", "world.glb", "report.html"):
-        (folder / file).write_text(file)
+        (folder / file).write_text(file, encoding="utf-8")
     made = {"world": folder / "world.sdf", "glb": folder / "world.glb", "report": folder / "report.html"}
     return TileItem(name, frame, (cloud,), DATE, **(made | more))
 
@@ -82,7 +82,7 @@ def test_the_catalogue_is_read_back_and_finds_every_file(tmp_path: Path) -> None
             assert Path(asset.get_absolute_href() or "").is_file()
             assert asset.roles and asset.media_type and asset.title
     assert sorted(path.name for path in moved.iterdir()) == ["stac", "tiles"]
-    assert str(tmp_path) not in "".join(path.read_text() for path in moved.glob("stac/**/*.json"))
+    assert str(tmp_path) not in "".join(path.read_text(encoding="utf-8") for path in moved.glob("stac/**/*.json"))
 
 
 def test_an_item_says_where_its_data_is(tmp_path: Path) -> None:
@@ -128,7 +128,7 @@ def test_an_item_names_the_rasters_that_were_made(tmp_path: Path) -> None:
     out = tmp_path / "out"
     made = item(out, "tile0", made_up.UTM)
     raster = out / "tiles" / "tile0" / "tile0_dsm.tif"
-    raster.write_text("heights")
+    raster.write_text("heights", encoding="utf-8")
     _, (one,) = read(stac.write(out, "town", "", [replace(made, rasters={"dsm": raster})]))
     asset = one.assets["dsm"]
     assert asset.media_type == "image/tiff; application=geotiff; profile=cloud-optimized"
@@ -195,7 +195,7 @@ def test_the_virtual_point_cloud_has_what_its_readers_ask_for(tmp_path: Path) ->
     second = scanned(tmp_path / "tiles/tile0", tiles[0].frame, "second.las")
     tiles[0] = replace(tiles[0], clouds=(*tiles[0].clouds, second))
     path = stac.write_vpc(tmp_path / "town.vpc", tiles)
-    body = json.loads(path.read_text())
+    body = json.loads(path.read_text(encoding="utf-8"))
     assert body["type"] == "FeatureCollection"
     features = body["features"]
     assert [feature["id"] for feature in features] == ["tile0_0", "tile0_1", "tile1", "tile2"]
@@ -215,6 +215,6 @@ def test_the_virtual_point_cloud_has_what_its_readers_ask_for(tmp_path: Path) ->
 
 def test_a_virtual_point_cloud_of_a_local_survey(tmp_path: Path) -> None:
     path = stac.write_vpc(tmp_path / "town.vpc", survey(tmp_path, Frame()))
-    feature = json.loads(path.read_text())["features"][0]
+    feature = json.loads(path.read_text(encoding="utf-8"))["features"][0]
     assert feature["properties"]["proj:wkt2"] == ""  # a string, or wrench stops
     assert feature["geometry"] == feature["properties"]["proj:geometry"]

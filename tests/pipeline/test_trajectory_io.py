@@ -53,7 +53,7 @@ def test_what_is_written_comes_back(tmp_path: Path, suffix: str, frame: Frame) -
 def test_files_hold_coordinates_of_the_crs(tmp_path: Path) -> None:
     path = Trajectory(np.array([0.0, 1.0]), np.array([[1.0, 2.0, 3.0], [2.0, 2.0, 3.0]]))
     trajectory.write(tmp_path / "a.csv", path, UTM)
-    assert (tmp_path / "a.csv").read_text().splitlines()[:2] == [
+    assert (tmp_path / "a.csv").read_text(encoding="utf-8").splitlines()[:2] == [
         "time,x,y,z",
         "0.000000,500001.000000,5400002.000000,203.000000",
     ]
@@ -72,22 +72,22 @@ def test_other_suffixes_are_told_by_their_first_line(tmp_path: Path) -> None:
     for suffix in (".csv", ".tum", ".kitti"):
         trajectory.write(tmp_path / f"a{suffix}", made_up())
         text = tmp_path / f"{suffix[1:]}.txt"
-        text.write_text((tmp_path / f"a{suffix}").read_text())
+        text.write_text((tmp_path / f"a{suffix}").read_text(encoding="utf-8"), encoding="utf-8")
         assert np.allclose(trajectory.read(text).positions, made_up().positions)
 
 
 def test_partial_columns_in_any_order(tmp_path: Path) -> None:
-    (tmp_path / "a.csv").write_text("# Z, Y ,X,TIME,sx,sy,sz\n\n3,2,1,10,1,1,2\n6,5,4,11,1,1,2\n")
+    (tmp_path / "a.csv").write_text("# Z, Y ,X,TIME,sx,sy,sz\n\n3,2,1,10,1,1,2\n6,5,4,11,1,1,2\n", encoding="utf-8")
     path = trajectory.read(tmp_path / "a.csv")
     assert path.positions.tolist() == [[1, 2, 3], [4, 5, 6]] and path.rotations is None
     assert path.covariance is not None
     assert np.diag(path.covariance[0]).tolist() == [1, 1, 4, np.inf, np.inf, np.inf]
     trajectory.write(tmp_path / "b.csv", path)
-    assert (tmp_path / "b.csv").read_text().startswith("time,x,y,z,sx,sy,sz\n")
+    assert (tmp_path / "b.csv").read_text(encoding="utf-8").startswith("time,x,y,z,sx,sy,sz\n")
 
 
 def test_times_out_of_order_are_refused_or_sorted(tmp_path: Path) -> None:
-    (tmp_path / "a.csv").write_text("t,e,n,h\n2,5,0,0\n1,4,0,0\n")
+    (tmp_path / "a.csv").write_text("t,e,n,h\n2,5,0,0\n1,4,0,0\n", encoding="utf-8")
     with pytest.raises(InputError, match=r"a\.csv: is no trajectory \(line 3: its time doesn't follow.*Sort it"):
         trajectory.read(tmp_path / "a.csv")
     assert trajectory.read(tmp_path / "a.csv", ordered=False).positions[:, 0].tolist() == [4, 5]
@@ -112,7 +112,7 @@ def test_times_out_of_order_are_refused_or_sorted(tmp_path: Path) -> None:
     ],
 )
 def test_bad_files_are_refused_by_line(tmp_path: Path, name: str, text: str, message: str) -> None:
-    (tmp_path / name).write_text(text)
+    (tmp_path / name).write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match=message):
         trajectory.read(tmp_path / name)
 
@@ -128,7 +128,7 @@ def test_unreadable_files(tmp_path: Path) -> None:
 def test_what_cannot_be_written_leaves_the_old_file(tmp_path: Path) -> None:
     only_positions = Trajectory(np.arange(2.0), np.zeros((2, 3)))
     trajectory.write(tmp_path / "a.csv", only_positions)
-    before = (tmp_path / "a.csv").read_text()
+    before = (tmp_path / "a.csv").read_text(encoding="utf-8")
     with pytest.raises(DataError, match=r"holds NaN"):
         trajectory.write(tmp_path / "a.csv", Trajectory(np.arange(2.0), np.full((2, 3), np.nan)))
     with pytest.raises(SettingError, match=r"needs rotations"):
@@ -139,13 +139,13 @@ def test_what_cannot_be_written_leaves_the_old_file(tmp_path: Path) -> None:
         trajectory.write(tmp_path / "a.geojson", only_positions)
     with pytest.raises((InputError, SpaceError)):
         trajectory.write(tmp_path / "none" / "a.csv", only_positions)
-    assert (tmp_path / "a.csv").read_text() == before and len(list(tmp_path.iterdir())) == 1
+    assert (tmp_path / "a.csv").read_text(encoding="utf-8") == before and len(list(tmp_path.iterdir())) == 1
 
 
 def test_geojson_shows_the_path_and_where_it_is_unsure(tmp_path: Path) -> None:
     path = made_up()
     trajectory.write(tmp_path / "a.geojson", path, UTM)
-    whole, *stretches = json.loads((tmp_path / "a.geojson").read_text())["features"]
+    whole, *stretches = json.loads((tmp_path / "a.geojson").read_text(encoding="utf-8"))["features"]
     lat, lon, height = present(crs.to_wgs84(UTM, path.positions[7]))
     assert whole["geometry"]["type"] == "LineString"
     assert whole["geometry"]["coordinates"][7] == pytest.approx([lon, lat, height], abs=1e-3)

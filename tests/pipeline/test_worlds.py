@@ -80,7 +80,7 @@ def test_levels_contain_their_models(tmp_path: Path, row: Sequence[TileWorld]) -
     levels = plugin.findall("level")
     assert [level.findtext("ref") for level in levels] == ["tile0", "tile1", "tile2"]
     assert len({level.get("name") for level in levels}) == 3
-    metadata = json.loads((path.parent / "metadata.json").read_text())
+    metadata = json.loads((path.parent / "metadata.json").read_text(encoding="utf-8"))
     for level in levels:
         centre, size = _vector(level, "pose")[:3], _vector(level, "geometry/box/size")
         tile = metadata["tiles"][level.findtext("ref")]
@@ -93,7 +93,7 @@ def test_levels_contain_their_models(tmp_path: Path, row: Sequence[TileWorld]) -
 
 def test_metadata_tells_of_all_files_and_places(tmp_path: Path, row: Sequence[TileWorld]) -> None:
     folder = assemble(tmp_path, "town", row).parent
-    metadata = json.loads((folder / "metadata.json").read_text())
+    metadata = json.loads((folder / "metadata.json").read_text(encoding="utf-8"))
     assert metadata["world_origin_m"] == list(row[1].frame.origin) and metadata["crs"] == "EPSG:32632"
     assert metadata["wgs84"]["latitude_deg"] == pytest.approx(48.1399, abs=1e-4)
     assert metadata["tiles"]["tile2"]["origin_m"] == list(row[2].frame.origin)
@@ -116,7 +116,9 @@ def test_a_surveys_world_can_be_exported_whole(tmp_path: Path, row: Sequence[Til
     scene = read_scene(tmp_path)
     assert (scene.name, [tile.offset for tile in scene.tiles]) == ("town", [(-25, 0, 1), (0, 0, 0), (25, 0, -1)])
     scenes.write(scene, ["gazebo"], tmp_path / "out", SceneParams(), silent)
-    assert (tmp_path / "out" / "town.sdf").read_text() == (folder / "town.sdf").read_text()
+    assert (tmp_path / "out" / "town.sdf").read_text(encoding="utf-8") == (folder / "town.sdf").read_text(
+        encoding="utf-8"
+    )
     for path in (path for path in (folder / "models").rglob("*") if path.is_file()):
         assert (tmp_path / "out" / path.relative_to(folder)).read_bytes() == path.read_bytes(), path.name
 
@@ -125,7 +127,7 @@ def test_nothing_is_done_where_nothing_has_changed(tmp_path: Path) -> None:
     row = tiles(tmp_path, 2)
     folder = assemble(tmp_path, "town", row).parent
     edited = folder / "models/tile0/model.sdf"
-    edited.write_text(edited.read_text() + "\n")
+    edited.write_text(edited.read_text(encoding="utf-8") + "\n", encoding="utf-8")
     before = _snapshot(folder)
     warned: list[str] = []
     assemble(tmp_path, "town", row, warn=warned.append)
@@ -143,11 +145,11 @@ def test_nothing_is_done_where_nothing_has_changed(tmp_path: Path) -> None:
     assemble(tmp_path, "town", row, buffer=5)
     assert damaged.read_bytes() == whole
     source = row[0].model / "meshes/terrain.obj"
-    text = source.read_text()
+    text = source.read_text(encoding="utf-8")
     source.unlink()  # as a rebuilt result is: a new file, not new bytes in the old one
-    source.write_text("# new\n" + text)
+    source.write_text("# new\n" + text, encoding="utf-8")
     assemble(tmp_path, "town", row, buffer=5)
-    assert (folder / "models/tile0/meshes/terrain.obj").read_text().startswith("# new")
+    assert (folder / "models/tile0/meshes/terrain.obj").read_text(encoding="utf-8").startswith("# new")
 
 
 def test_an_earlier_world_stays_until_the_new_one_is_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -196,4 +198,4 @@ def test_a_local_survey_has_no_georeference(tmp_path: Path) -> None:
     made = [made_up.world(tmp_path / f"t{i}", frame=f, name=f"t{i}").files["world"] for i, f in enumerate(frames)]
     path = assemble(tmp_path, "town", [TileWorld(f"t{i}", made[i], frames[i]) for i in range(2)])
     assert _root(path).find("spherical_coordinates") is None
-    assert json.loads((path.parent / "metadata.json").read_text())["wgs84"] is None
+    assert json.loads((path.parent / "metadata.json").read_text(encoding="utf-8"))["wgs84"] is None

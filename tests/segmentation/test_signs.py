@@ -98,12 +98,12 @@ def _run(folder: Path, plates: list[Plate], known: list[Plate], theirs: bool = F
     Mesh(FRAME, vertices.astype(np.float32), faces, classification=classification).save(folder / "building.npz")
     flat = np.array([(-20, -20, 0), (40, -20, 0), (40, 20, 0), (-20, 20, 0)], np.float32)
     Mesh(FRAME, flat, np.array([[0, 1, 2], [0, 2, 3]], np.int32)).save(folder / "terrain.npz")
-    (folder / "plates.json").write_text(json.dumps([plate.to_json() for plate in known]))
+    (folder / "plates.json").write_text(json.dumps([plate.to_json() for plate in known]), encoding="utf-8")
     foot = (14.05, -3.0, 0.0)
-    (folder / "beside.json").write_text(json.dumps([foot] if theirs else []))
+    (folder / "beside.json").write_text(json.dumps([foot] if theirs else []), encoding="utf-8")
     place = FRAME.to_crs(foot).tolist()
     pole = {"geometry": {"coordinates": place}, "properties": {"kind": "pole", "height_m": 3.0, "radius_m": 0.04}}
-    (folder / "furniture.geojson").write_text(json.dumps({"features": [] if theirs else [pole]}))
+    (folder / "furniture.geojson").write_text(json.dumps({"features": [] if theirs else [pole]}), encoding="utf-8")
     inputs = {f"mesh.{group}": folder / f"{group}.npz" for group in ("terrain", "building")}
     inputs |= {name: folder / f"{name}.json" for name in ("plates", "beside")} | {
         "geojson": folder / "furniture.geojson"
@@ -142,7 +142,7 @@ def test_a_sign_is_whole_where_photos_show_it(tmp_path: Path, known: list[Plate]
     pole = mesh.vertices[np.unique(mesh.faces[mesh.classification == CODE["pole"]])]
     assert ((pole - SIGN.centre) @ SIGN.normal).max() < 0  # it stands behind its plate
     assert (mesh.classification == 0).sum() == 1  # what points made before the plate is gone
-    (feature,) = json.loads(done.files["geojson"].read_text())["features"]
+    (feature,) = json.loads(done.files["geojson"].read_text(encoding="utf-8"))["features"]
     row = feature["properties"]
     assert row["kind"] == "sign" and row["shape"] == "disc" and row["radius_m"] == 0.04
     assert row["height_m"] == pytest.approx(3.5, abs=0.03) and row["plate_width_m"] == pytest.approx(0.6, abs=0.03)

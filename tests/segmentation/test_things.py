@@ -85,7 +85,7 @@ def classified(done: Done, *more: F32) -> dict[str, np.ndarray]:
 
 
 def features(done: Done) -> list[dict[str, Any]]:
-    found: list[dict[str, Any]] = json.loads(done.files["things"].read_text())["features"]
+    found: list[dict[str, Any]] = json.loads(done.files["things"].read_text(encoding="utf-8"))["features"]
     return found
 
 

@@ -37,7 +37,7 @@ def ended(address: str, monkeypatch: pytest.MonkeyPatch) -> object:
 
 
 def test_who_is_ready_ends_well_and_who_is_not_says_why(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    (tmp_path / "token").write_text("0123456789abcdef")
+    (tmp_path / "token").write_text("0123456789abcdef", encoding="utf-8")
     monkeypatch.setenv("http_proxy", "http://localhost:9")
     states = [True]
     address = served(states, Served(port=0, token=tmp_path / "token"))

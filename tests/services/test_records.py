@@ -87,7 +87,9 @@ def test_a_full_disk_share_drops_the_oldest_and_says_how_many(tmp_path: Path) ->
 
 
 def test_what_holds_no_records_is_told_with_a_remedy(tmp_path: Path) -> None:
-    (tmp_path / "records").write_text("these are no records, but a text that is longer than a header" * 99)
+    (tmp_path / "records").write_text(
+        "these are no records, but a text that is longer than a header" * 99, encoding="utf-8"
+    )
     with pytest.raises(InputError, match="records"):
         Spool(tmp_path / "records")
 
@@ -215,7 +217,7 @@ def test_two_of_one_name_keep_apart_and_what_dead_ones_left_is_taken_over(
 
 
 def test_a_state_folder_that_cannot_be_is_told_with_a_remedy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "file").write_text("")
+    (tmp_path / "file").write_text("", encoding="utf-8")
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
     with pytest.raises(SpaceError, match="XDG_STATE_HOME"):
         spools.opened("/talker", "monitor_data")

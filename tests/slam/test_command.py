@@ -58,7 +58,7 @@ def test_it_writes_the_trajectory_in_all_formats_and_says_that_there_is_no_gps(
         assert (out / name).is_file()
     assert "there is no GPS" in said
     assert not (out / "trajectory.geojson").exists()
-    assert json.loads((out / "slam.json").read_text())["frames"] == len(found)
+    assert json.loads((out / "slam.json").read_text(encoding="utf-8"))["frames"] == len(found)
     assert list((out / "steps").rglob("state*")) == []
 
 
@@ -199,7 +199,7 @@ def test_an_interrupted_run_goes_on_only_from_what_the_same_code_made_of_the_sam
         (lambda p: None, ("VIDEO", "--set", "track.windows=3"), "track.windows"),
         (lambda p: None, ("VIDEO", "--camera", "pinhole", "--until", "1"), "nothing tells its focal length"),
         (lambda p: (p / "m.png").write_bytes(b"x"), ("VIDEO", "--mask", "m.png"), "can't be read"),
-        (lambda p: (p / "g.csv").write_text("a,b\n1,2\n"), ("VIDEO", "--gps", "g.csv"), "g.csv"),
+        (lambda p: (p / "g.csv").write_text("a,b\n1,2\n", encoding="utf-8"), ("VIDEO", "--gps", "g.csv"), "g.csv"),
     ],
 )
 def test_bad_input_is_named(
@@ -246,10 +246,10 @@ def test_half_a_video_file_is_read_as_far_as_it_goes(corridor: Drive, tmp_path: 
 def test_frames_out_of_order_are_left_out_and_told(corridor: Drive, tmp_path: Path) -> None:
     for i in range(4):
         cv2.imwrite(str(tmp_path / f"{i}.png"), corridor.greys[i])
-    (tmp_path / "times.txt").write_text("0\n0.1\n0.05\n0.2\n")
+    (tmp_path / "times.txt").write_text("0\n0.1\n0.05\n0.2\n", encoding="utf-8")
     said: list[str] = []
     frames = list(open_video(tmp_path, times=tmp_path / "times.txt").frames(warn=said.append))
     assert [f.name for f in frames] == ["0.png", "1.png", "3.png"] and "out of order" in said[0]
-    (tmp_path / "times.txt").write_text("0\n0.1\n")
+    (tmp_path / "times.txt").write_text("0\n0.1\n", encoding="utf-8")
     with pytest.raises(InputError, match="2 times for 4 pictures"):
         open_video(tmp_path, times=tmp_path / "times.txt")

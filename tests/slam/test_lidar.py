@@ -176,13 +176,13 @@ def test_what_cannot_be_matched_is_told(sweeps: Path, tmp_path: Path) -> None:
     for i in range(3):
         las.write(far / f"{i}.laz", PointCloud(Frame(), np.full((5, 3), 500 + i, np.float32)))
     assert "has no points within range" in run(far)
-    (tmp_path / "gps.csv").write_text("time,x,y,z\n0,0,0,0\n1,8,0,0\n")
+    (tmp_path / "gps.csv").write_text("time,x,y,z\n0,0,0,0\n1,8,0,0\n", encoding="utf-8")
     assert "its sweeps have no times" in run(apart, "--gps", str(tmp_path / "gps.csv"))
-    (tmp_path / "late.csv").write_text("time,x,y,z\n900,0,0,0\n901,8,0,0\n")
+    (tmp_path / "late.csv").write_text("time,x,y,z\n900,0,0,0\n901,8,0,0\n", encoding="utf-8")
     assert "spans 900.00 to 901.00 s" in run(sweeps, "--gps", str(tmp_path / "late.csv"))
     assert "has no times of its points" in run(apart, "--deskew", "times")
     names = tmp_path / "times.txt"
-    names.write_text("0\n2\n1\n")
+    names.write_text("0\n2\n1\n", encoding="utf-8")
     assert "time doesn't follow" in run(far, "--times", str(names))
 
 

@@ -97,7 +97,7 @@ def test_a_folder_with_everything(tmp_path: Path) -> None:
     ]  # fmt: skip
     assert all(f.is_file() for f in files) and len(list((tmp_path / "out").rglob("*"))) == len(files) + 1
     assert np.allclose(trajectory_io.read(files[0], UTM).positions, path.positions)
-    assert "500000 5400000 200 in EPSG:32633" in files[4].read_text()
+    assert "500000 5400000 200 in EPSG:32633" in files[4].read_text(encoding="utf-8")
 
 
 def test_what_is_not_known_is_not_written(tmp_path: Path) -> None:

@@ -31,7 +31,10 @@ def grainy(pose: F64) -> U8:
 
 def rows_of(folder: Path) -> dict[str, Any]:
     """What `agreement` said of each photo, by name."""
-    return {row["name"]: row for row in json.loads((folder.parent / "agreement" / "agreement.json").read_text())}
+    return {
+        row["name"]: row
+        for row in json.loads((folder.parent / "agreement" / "agreement.json").read_text(encoding="utf-8"))
+    }
 
 
 def test_a_passing_car_leaves_no_ghost(street: Street) -> None:

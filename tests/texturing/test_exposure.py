@@ -103,6 +103,6 @@ def test_switched_off_or_alone_nothing_changes(taken: Street, tmp_path: Path) ->
 
 
 def test_no_exposure_file_is_refused_by_name(tmp_path: Path) -> None:
-    (tmp_path / "prior.json").write_text('{"gain": {"a": [1, 1]}}')
+    (tmp_path / "prior.json").write_text('{"gain": {"a": [1, 1]}}', encoding="utf-8")
     with pytest.raises(InputError, match=r"prior\.json"):
         Exposures.load(tmp_path / "prior.json")

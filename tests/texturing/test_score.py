@@ -61,7 +61,7 @@ def test_a_held_out_photo_is_told_by_class_and_by_distance(scored: Done) -> None
 
 def test_every_held_out_photo_has_its_error_picture(scored: Done) -> None:
     folder = scored.files["error"]
-    (entry,) = json.loads((folder / "index.json").read_text())
+    (entry,) = json.loads((folder / "index.json").read_text(encoding="utf-8"))
     assert (entry["role"], entry["title"]) == ("error", "photo1") and "dB" in entry["caption"]
     picture = image.read_rgb(folder / entry["file"])
     assert picture is not None and picture.shape[1] <= 1600
@@ -72,7 +72,7 @@ def test_without_held_out_photos_figures_are_none(street: Street, tmp_path: Path
     done = score(inputs_of(street), ScoreParams(), tmp_path, silent)
     facts = strict(done.facts)
     assert facts["held_out"] == 0 and facts["psnr_db"] is None and facts["sharpness"] is None
-    assert json.loads((done.files["error"] / "index.json").read_text()) == []
+    assert json.loads((done.files["error"] / "index.json").read_text(encoding="utf-8")) == []
 
 
 def test_held_out_photos_of_what_the_world_lacks_count_and_those_that_cannot_be_read_are_named(

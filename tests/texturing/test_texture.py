@@ -155,7 +155,9 @@ def test_the_black_below_a_car_that_was_taken_out_is_painted_over(street: Street
     car = {"kind": "car", "moved": False}
     feature = {"type": "Feature", "properties": car, "geometry": {"type": "Polygon", "coordinates": [ring]}}
     street.files["things"] = street.folder / "things.geojson"
-    street.files["things"].write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
+    street.files["things"].write_text(
+        json.dumps({"type": "FeatureCollection", "features": [feature]}), encoding="utf-8"
+    )
     rgb, seen, _, x, y = from_above(street.run(continued=True, exposure={"solve": False})[0])
     assert before > 500 and black(rgb) < 0.02 * before
     assert not (seen[(abs(x + 1.5) < 1.0) & (abs(y) < 0.5)] == 255).any()

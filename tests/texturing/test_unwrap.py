@@ -41,7 +41,7 @@ def with_fin(mesh: Mesh) -> Mesh:
 def run(mesh: Mesh, tmp_path: Path, **params: Any) -> tuple[Mesh, list[dict[str, int]], Done]:
     mesh.save(tmp_path / "in.npz")
     done = unwrap({"mesh": tmp_path / "in.npz"}, UnwrapParams(**params), tmp_path, silent)
-    return Mesh.load(done.files["mesh"]), json.loads(done.files["pages"].read_text()), done
+    return Mesh.load(done.files["mesh"]), json.loads(done.files["pages"].read_text(encoding="utf-8")), done
 
 
 def owners(mesh: Mesh, pages: list[dict[str, int]], k: int) -> npt.NDArray[np.int64]:
@@ -140,7 +140,7 @@ def test_what_an_orthophoto_drapes_is_laid_flat_at_half_its_pixels(tmp_path: Pat
     mesh.save(tmp_path / "in.npz")
     inputs = {"mesh": tmp_path / "in.npz", "views": tmp_path / "views.json", "choice": tmp_path / "choice.npz"}
     done = unwrap(inputs, UnwrapParams(texel=0.01), tmp_path, silent)
-    laid, pages = Mesh.load(done.files["mesh"]), json.loads(done.files["pages"].read_text())
+    laid, pages = Mesh.load(done.files["mesh"]), json.loads(done.files["pages"].read_text(encoding="utf-8"))
     assert len(pages) == 1 and np.all(laid.page == 0)
     size = np.array([pages[0]["width"], pages[0]["height"]])
     a, b, c = np.moveaxis(laid.uv * size, 1, 0)

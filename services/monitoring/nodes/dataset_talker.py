@@ -55,7 +55,7 @@ def read_events(path: Path) -> Iterator[tuple[float, int]]:
         InputError: a line that isn't so.
     """
     try:
-        text = path.read_text()
+        text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(path, f"can't be read ({error})", "Give a CSV file: seconds, bytes") from None
     before = 0.0

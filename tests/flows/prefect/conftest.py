@@ -33,6 +33,7 @@ QUIET = {
     "PREFECT_CLI_COLORS": "false",
     "PREFECT_CLI_WRAP_LINES": "false",
     "DO_NOT_TRACK": "1",
+    "PYTHONUTF8": "1",  # its command prints what other encodings cannot hold
     # a new schedule's first runs are made by a service that runs once a minute, unless its deployment is seconds old
     "PREFECT_SERVER_SERVICES_SCHEDULER_LOOP_SECONDS": "2",
     "RAY_USAGE_STATS_ENABLED": "0",

@@ -33,7 +33,7 @@ def test_a_flow_and_its_workers_tell_of_one_run(runner: str, server: Server, fol
         ended = runs and runs[0]["details"]["last"] and runs[0]["details"]["last"]["state"] != "running"
         if (ended and len(hosts) == TILES * len(STEPS)) or time.monotonic() > end:
             break
-    assert process.wait(60) == 0, (folder / "output").read_text()
+    assert process.wait(60) == 0, (folder / "output").read_text(encoding="utf-8")
     (run,) = runs
     last = run["details"]["last"]
     assert (last["command"], last["source"], last["state"]) == ("survey", str(folder), "done")

@@ -41,7 +41,7 @@ def test_what_is_missing_is_named(server: Server) -> None:
     assert "work pool 'scan2sim-process' which does not exist" in deployed.stdout
     with server.worker("scan2sim-process"):
         log = server.home / "scan2sim-process.log"
-        wait_for("a warning", lambda: "Work pool 'scan2sim-process' not found!" in log.read_text())
+        wait_for("a warning", lambda: "Work pool 'scan2sim-process' not found!" in log.read_text(encoding="utf-8"))
 
 
 @on("sqlite")
@@ -89,7 +89,7 @@ def test_a_schedule_fires_a_worker_runs_it_and_nothing_disturbs_it(toys: Server,
     state = toys.ended(first["id"])
     assert (state["type"], state["message"]) == ("COMPLETED", "total 4")
     assert first["auto_scheduled"]
-    assert len((folder / "log").read_text().split()) == 3
+    assert len((folder / "log").read_text(encoding="utf-8").split()) == 3
 
     with toys.scheduled(nightly, parameters, cron="0 2 * * *", timezone="Etc/UTC"):
         # with SQLAlchemy 2.1, PostgreSQL never got there
@@ -124,8 +124,8 @@ def test_a_worker_of_another_version_says_so(toys: Server, folder: Path) -> None
 
 @pytest.mark.slow
 def test_a_run_whose_worker_died_too_is_found_out_and_run_again(tmp_path: Path, folder: Path) -> None:
-    text = (ROOT / "deploy" / "automations.yaml").read_text().replace("name: reprocess", "name: toy")
-    (tmp_path / "automations.yaml").write_text(text)
+    text = (ROOT / "deploy" / "automations.yaml").read_text(encoding="utf-8").replace("name: reprocess", "name: toy")
+    (tmp_path / "automations.yaml").write_text(text, encoding="utf-8")
     with serving("sqlite", tmp_path) as server:
         server.env |= {"PREFECT_FLOWS_HEARTBEAT_FREQUENCY": "30", "TOY_FOLDER": str(folder)}
         assert server.cli("work-pool", "create", "toys", "--type", "process").returncode == 0

@@ -64,13 +64,13 @@ class Survey:
         """Steps that have begun and not ended, and the worker that runs each."""
         if not (self.folder / "started").exists():
             return {}
-        begun = dict(line.split()[::2] for line in (self.folder / "started").read_text().splitlines())
+        begun = dict(line.split()[::2] for line in (self.folder / "started").read_text(encoding="utf-8").splitlines())
         ended = {label.replace("/", "-") for label in self.done()}
         return {name: int(worker) for name, worker in begun.items() if name not in ended}
 
     def runs(self) -> Counter[str]:
         """How often each step came to its end."""
-        return Counter((self.folder / "log").read_text().split())
+        return Counter((self.folder / "log").read_text(encoding="utf-8").split())
 
     def finish(self, process: subprocess.Popen[bytes]) -> str:
         """Wait for the end; returns what was printed."""
@@ -79,7 +79,7 @@ class Survey:
 
     def output(self) -> str:
         """What was printed since it was last started."""
-        return self._outputs[-1].read_text()
+        return self._outputs[-1].read_text(encoding="utf-8")
 
 
 @pytest.fixture
@@ -147,7 +147,7 @@ def test_ctrl_c_ends_a_run_and_the_server_that_it_started(tmp_path: Path) -> Non
         "--runner",
         "dask",
     ]
-    with open(log, "w") as file:
+    with open(log, "w", encoding="utf-8") as file:
         process = subprocess.Popen(
             command, env=environment(tmp_path), cwd=ROOT, stdout=file, stderr=file, start_new_session=True
         )
@@ -158,13 +158,13 @@ def test_ctrl_c_ends_a_run_and_the_server_that_it_started(tmp_path: Path) -> Non
         wait_for("the end of all that it started", lambda: not processes("PREFECT_HOME", str(tmp_path)), 30)
     finally:
         kill(process)
-    assert "the same command goes on from there" in log.read_text()
+    assert "the same command goes on from there" in log.read_text(encoding="utf-8")
 
 
 def test_a_killed_command_takes_the_server_that_it_started_along(tmp_path: Path) -> None:
     out, log = tmp_path / "out", tmp_path / "log"
     command = [sys.executable, "-m", "scan2sim.flows.cli", "survey", "data_samples/tile", "--out", str(out)]
-    with open(log, "w") as file:
+    with open(log, "w", encoding="utf-8") as file:
         process = subprocess.Popen(
             [*command, "--runner", "threads"], env=environment(tmp_path), cwd=ROOT, stdout=file, stderr=file,
             start_new_session=True,

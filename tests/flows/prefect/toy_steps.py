@@ -26,9 +26,9 @@ class SlowParams(ToyParams):
 def slow(inputs: Inputs, params: SlowParams, out: Path, report: Report) -> Done:
     """As `toy`, later; tells beside the log who runs it: its own process, and the worker that asked for it."""
     parent = multiprocessing.parent_process()
-    with open(params.log.with_name("started"), "a") as file:
+    with open(params.log.with_name("started"), "a", encoding="utf-8") as file:
         file.write(f"{params.name} {os.getpid()} {parent.pid if parent else 0}\n")
-    (out / "half").write_text("made")
+    (out / "half").write_text("made", encoding="utf-8")
     time.sleep(params.seconds)
     while params.gate is not None and not params.gate.exists():
         time.sleep(0.1)

@@ -48,7 +48,7 @@ def test_the_origin_is_the_points_whatever_the_header_says(
     tmp_path: Path, suffix: str, bounds: list[float], n: int
 ) -> None:
     path = patch(made(tmp_path / f"c{suffix}", n), "bounds", *bounds)
-    (tmp_path / "tile.toml").write_text(f'name = "t"\ncrs = "local"\nclouds = ["{path.name}"]\n')
+    (tmp_path / "tile.toml").write_text(f'name = "t"\ncrs = "local"\nclouds = ["{path.name}"]\n', encoding="utf-8")
     tile = read_tile(tmp_path)
     assert np.abs(np.subtract(tile.frame.origin, (700_010, 5_400_010, 100))).max() <= 1
     params = IngestParams(crs=tile.frame.crs, origin=tile.frame.origin, unit=tile.frame.unit)
@@ -115,7 +115,7 @@ def test_pipes_and_folders_are_no_files(tmp_path: Path) -> None:
     made(tmp_path / "c.las")
     with pytest.raises(InputError, match="pipe"):
         clouds.read_header(pipe(tmp_path, "p.laz"))
-    (tmp_path / "tile.toml").write_text('name = "t"\ncrs = "local"\nclouds = ["p.laz"]\n')
+    (tmp_path / "tile.toml").write_text('name = "t"\ncrs = "local"\nclouds = ["p.laz"]\n', encoding="utf-8")
     with pytest.raises(InputError, match=r"pipe or device.*named under `clouds`"):
         read_tile(tmp_path)
     (tmp_path / "tile.toml").unlink()
@@ -144,7 +144,7 @@ def test_photos_that_are_pipes_or_folders_are_left_out_and_no_digest_waits_for_t
     ids=["nested", "digits", "large"],
 )
 def test_toml_that_would_exhaust_the_reader(tmp_path: Path, text: str) -> None:
-    (tmp_path / "tile.toml").write_text(text)
+    (tmp_path / "tile.toml").write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match=r"tile\.toml: is (not valid TOML|of .* bytes)"):
         read_tile(tmp_path)
 

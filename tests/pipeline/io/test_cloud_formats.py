@@ -117,7 +117,7 @@ def write_pcd(path: Path, rows: np.ndarray, data: str, count: int | None = None)
         cells = {name: rows[name].tolist() for name in names}
         cells |= {name: ["0 0 0"] * len(rows) for name in names if name == "_"}
         lines = [" ".join(str(cells[name][i]) for name in names) for i in range(len(rows))]
-        path.write_text(head + "\n".join(lines) + "\n")
+        path.write_text(head + "\n".join(lines) + "\n", encoding="utf-8")
     elif data == "binary":
         path.write_bytes(head.encode() + rows.tobytes())
     else:
@@ -170,7 +170,7 @@ def text(delimiter: str, heading: str | None, wide: bool = False) -> Callable[[P
             rows.append(
                 delimiter.join([*(f"{v:.4f}" for v in place), *map(str, rgb), str(intensity), str(classification)])
             )
-        path.write_text("\n".join(rows) + "\n")
+        path.write_text("\n".join(rows) + "\n", encoding="utf-8")
 
     return write
 
@@ -210,11 +210,11 @@ def ept(kind: str) -> Callable[[Path, PointCloud], None]:
                 zstandard = pytest.importorskip("zstandard", reason="zstd tiles are written by zstandard")
                 file.with_suffix(".zst").write_bytes(zstandard.ZstdCompressor().compress(rows.tobytes()))
         first, second = {"0-0-0-0": 300, "1-0-0-0": 400, "1-1-0-1": -1}, {"1-1-0-1": len(cloud) - 700}
-        (path.parent / "ept-hierarchy" / "0-0-0-0.json").write_text(json.dumps(first))
-        (path.parent / "ept-hierarchy" / "1-1-0-1.json").write_text(json.dumps(second))
+        (path.parent / "ept-hierarchy" / "0-0-0-0.json").write_text(json.dumps(first), encoding="utf-8")
+        (path.parent / "ept-hierarchy" / "1-1-0-1.json").write_text(json.dumps(second), encoding="utf-8")
         srs = {"authority": "EPSG", "horizontal": "32632", "wkt": CRS(FRAME.crs).to_wkt()}
         info = {"version": "1.1.0", "dataType": kind, "hierarchyType": "json", "points": len(cloud), "span": 128}
-        path.write_text(json.dumps(info | {"schema": schema, "srs": srs}))
+        path.write_text(json.dumps(info | {"schema": schema, "srs": srs}), encoding="utf-8")
 
     return write
 
@@ -413,7 +413,7 @@ def test_pcd_files_of_open3d(tmp_path: Path, compressed: bool) -> None:
     ],
 )
 def test_columns_are_sniffed_and_what_was_assumed_is_told(tmp_path: Path, lines: str, note: str) -> None:
-    (tmp_path / "c.txt").write_text(lines)
+    (tmp_path / "c.txt").write_text(lines, encoding="utf-8")
     assert note in clouds.read_header(tmp_path / "c.txt").notes[0]
     assert clouds.read(tmp_path / "c.txt", Frame()).xyz.tolist() == [[1, 2, 3], [4, 5, 6]]
     warned: list[str] = []
@@ -438,14 +438,14 @@ def test_columns_are_sniffed_and_what_was_assumed_is_told(tmp_path: Path, lines:
     ],
 )
 def test_a_text_that_is_no_cloud_is_refused(tmp_path: Path, lines: str, cause: str) -> None:
-    (tmp_path / "c.xyz").write_text(lines)
+    (tmp_path / "c.xyz").write_text(lines, encoding="utf-8")
     with pytest.raises(InputError, match=cause):
         clouds.read(tmp_path / "c.xyz", Frame())
 
 
 def test_a_line_that_never_ends_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("scan2sim.pipeline.io.text.BLOCK", 1 << 10)
-    (tmp_path / "c.xyz").write_text("1 2 " + "3" * 5000)
+    (tmp_path / "c.xyz").write_text("1 2 " + "3" * 5000, encoding="utf-8")
     with pytest.raises(InputError, match="line of more than|is no cloud"):
         clouds.read(tmp_path / "c.xyz", Frame())
 
@@ -471,7 +471,7 @@ BINARY = """{"dataType": "binary", "schema": [{"name": "X", "type": "signed", "s
 )
 def test_a_broken_ept_is_refused(tmp_path: Path, file: str, body: str, cause: str) -> None:
     ept("binary")(tmp_path / "ept.json", made(N))
-    (tmp_path / file).write_text(body)
+    (tmp_path / file).write_text(body, encoding="utf-8")
     with pytest.raises(InputError, match=cause):
         clouds.read(tmp_path / "ept.json", FRAME)
 

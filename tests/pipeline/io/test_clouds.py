@@ -70,7 +70,7 @@ def test_ply_keeps_double_coordinates_colours_and_classes(tmp_path: Path, form: 
 def test_a_ply_without_colours_and_classes(tmp_path: Path) -> None:
     rows = "\n".join(f"{x} 0 0" for x in range(5))
     heading = "ply\nformat ascii 1.0\nelement vertex 5\nproperty float x\nproperty float y\nproperty float z\n"
-    (tmp_path / "c.ply").write_text(f"{heading}end_header\n{rows}\n")
+    (tmp_path / "c.ply").write_text(f"{heading}end_header\n{rows}\n", encoding="utf-8")
     read = clouds.read(tmp_path / "c.ply", Frame())
     assert read.xyz[:, 0].tolist() == [0, 1, 2, 3, 4]
     assert read.rgb is None and read.classification is None
@@ -99,6 +99,6 @@ def write_ply(path: Path, cloud: PointCloud, form: str, class_name: str) -> None
     heading = f"ply\nformat {form} 1.0\nelement vertex {len(rows)}\n{types}end_header\n"
     if form == "ascii":
         body = "\n".join(" ".join(repr(v) for v in row) for row in rows.tolist()) + "\n"
-        path.write_text(heading + body)
+        path.write_text(heading + body, encoding="utf-8")
     else:
         path.write_bytes(heading.encode() + rows.tobytes())

@@ -61,7 +61,7 @@ def make_model(folder: Path, kinds: list[str], n: int = 40) -> tuple[Any, dict[s
     for form in ("bin", "txt"):
         (folder / form).mkdir()
     model.write_binary(folder / "bin")
-    model.write_text(folder / "txt")
+    model.write_text(folder / "txt", encoding="utf-8")
     return model, pixels
 
 
@@ -83,7 +83,7 @@ def test_text_and_binary_give_the_same_tile(tmp_path: Path) -> None:
     tiles = [
         import_model("colmap", tmp_path / f, tmp_path / "images", tmp_path / f"t_{f}", name="t") for f in ("bin", "txt")
     ]
-    assert tiles[0].read_text() == tiles[1].read_text()
+    assert tiles[0].read_text(encoding="utf-8") == tiles[1].read_text(encoding="utf-8")
     first, second = (read_tile(tile) for tile in tiles)
     a, b = (clouds.read(tile.clouds[0], tile.frame) for tile in (first, second))
     assert np.array_equal(a.xyz, b.xyz) and np.array_equal(present(a.rgb), present(b.rgb))
@@ -212,7 +212,7 @@ def fused(folder: Path) -> Path:
     for k, point in enumerate(wall):
         track = pycolmap.Track([pycolmap.TrackElement(i + 1, k) for i in range(n)])
         model.add_point3D(point, track, np.array([9, 9, 9], np.uint8))
-    (folder / "stereo" / "fusion.cfg").write_text("".join(f"{i}.png\n" for i in range(n)))
+    (folder / "stereo" / "fusion.cfg").write_text("".join(f"{i}.png\n" for i in range(n)), encoding="utf-8")
     model.write(folder / "sparse")
     options = pycolmap.StereoFusionOptions()
     options.min_num_pixels, options.check_num_images = 2, n - 1

@@ -86,7 +86,7 @@ def table(heading: str, delimiter: str = ",") -> str:
     ],
 )
 def test_all_formats_say_the_same(tmp_path: Path, name: str, text: str, sigma: float | None) -> None:
-    (tmp_path / name).write_text(text)
+    (tmp_path / name).write_text(text, encoding="utf-8")
     track = gps.read(tmp_path / name)
     assert np.allclose(track.times, START + np.arange(8), atol=1e-3)
     assert track.frame.crs == "EPSG:32633"
@@ -101,14 +101,14 @@ def test_all_formats_say_the_same(tmp_path: Path, name: str, text: str, sigma: f
 
 
 def test_local_metres_are_left_where_they_are(tmp_path: Path) -> None:
-    (tmp_path / "a.csv").write_text("time,x,y\n1,10,20\n0,5,20\n1,99,99\n2,15,20\n")
+    (tmp_path / "a.csv").write_text("time,x,y\n1,10,20\n0,5,20\n1,99,99\n2,15,20\n", encoding="utf-8")
     track = gps.read(tmp_path / "a.csv")
     assert track.frame == Frame() and track.times.tolist() == [0, 1, 2]
     assert track.positions.tolist() == [[5, 20, 0], [10, 20, 0], [15, 20, 0]]
 
 
 def test_date_of_fixes_before_the_only_rmc(tmp_path: Path) -> None:
-    (tmp_path / "a.nmea").write_text("\n".join([*(gga(*row) for row in points()), rmc(START + 8)]))
+    (tmp_path / "a.nmea").write_text("\n".join([*(gga(*row) for row in points()), rmc(START + 8)]), encoding="utf-8")
     assert np.allclose(gps.read(tmp_path / "a.nmea").times, START + np.arange(8))
 
 
@@ -130,7 +130,7 @@ def test_date_of_fixes_before_the_only_rmc(tmp_path: Path) -> None:
     ],
 )
 def test_bad_files_are_refused(tmp_path: Path, name: str, text: str, message: str) -> None:
-    (tmp_path / name).write_text(text)
+    (tmp_path / name).write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match=message):
         gps.read(tmp_path / name)
 

@@ -32,7 +32,7 @@ def photos(folder: Path, heading: str, *rows: str) -> Path:
         file.parent.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(file), np.zeros((48, 64, 3), np.uint8))
     path = folder / "photos.csv"
-    path.write_text("\n".join([heading, *rows]) + "\n")
+    path.write_text("\n".join([heading, *rows]) + "\n", encoding="utf-8")
     return path
 
 
@@ -80,7 +80,7 @@ def test_cameras_may_have_a_file_of_their_own_and_masks_come_along(tmp_path: Pat
         "b/1.png,500011,5400005,102,1,0,0,0,ball,",
     )
     cameras = tmp_path / "cameras.csv"
-    cameras.write_text(f"camera,{CAMERA}\nleft,{VALUES}\nball,equirectangular,64,32,,,,\n")
+    cameras.write_text(f"camera,{CAMERA}\nleft,{VALUES}\nball,equirectangular,64,32,,,,\n", encoding="utf-8")
     tile = read_tile(
         import_las([cloud(tmp_path / "c.laz")], tmp_path / "tile", photos=sheet, cameras=cameras, link=True)
     )

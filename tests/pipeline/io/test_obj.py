@@ -37,7 +37,7 @@ def test_triangles_uv_and_pages_survive(tmp_path: Path, make: Callable[[], Mesh]
 def test_texture_coordinates_are_said_once_and_v_goes_up(tmp_path: Path) -> None:
     surface = present(textured.read(made_up.textured(tmp_path / "in", made_up.house())))
     obj.write(tmp_path / "a.obj", surface, NAMES)
-    lines = (tmp_path / "a.obj").read_text().splitlines()
+    lines = (tmp_path / "a.obj").read_text(encoding="utf-8").splitlines()
     vt = [line for line in lines if line.startswith("vt ")]
     assert len(vt) == len(set(vt)) == 10
     v = [tuple(map(float, line.split()[1:])) for line in lines if line.startswith("v ")]

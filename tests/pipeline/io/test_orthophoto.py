@@ -35,7 +35,7 @@ def pixel_of(view: View, xyz: npt.ArrayLike) -> F32:
 @pytest.mark.parametrize("suffix", [".wld", ".jgw", ".jpgw", ".JGW"])
 def test_a_world_file_in_feet(suffix: str, tmp_path: Path) -> None:
     file = picture(tmp_path / "map.jpg")
-    (tmp_path / f"map{suffix}").write_text("2.0\n0\n0\n-2.0\n1000\n2000\n")
+    (tmp_path / f"map{suffix}").write_text("2.0\n0\n0\n-2.0\n1000\n2000\n", encoding="utf-8")
     view = read_view(file, FEET, highest=50.0)
     corner, other = FEET.to_local([(1000, 2000, 0), (1020, 1990, 100)])
     np.testing.assert_allclose(pixel_of(view, [corner, other]), [(0, 0), (10, 5)], atol=1e-3)
@@ -62,7 +62,7 @@ def test_a_geotiffs_tags(raster: int, shift: float, tmp_path: Path) -> None:
                                   "nan 0 0 -1 0 0"])  # fmt: skip
 def test_world_files_that_say_nothing_are_named(text: str, tmp_path: Path) -> None:
     file = picture(tmp_path / "map.png")
-    (tmp_path / "map.pgw").write_text(text)
+    (tmp_path / "map.pgw").write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match="map.pgw"):
         read_view(file, FEET, highest=1.0)
 
@@ -79,7 +79,7 @@ def test_large_ones_are_measured_by_the_projects_limit_not_pillows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = picture(tmp_path / "map.png")
-    (tmp_path / "map.pgw").write_text("1\n0\n0\n-1\n0\n0\n")
+    (tmp_path / "map.pgw").write_text("1\n0\n0\n-1\n0\n0\n", encoding="utf-8")
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 100)
     assert read_view(file, FEET, highest=0.0).camera.width == 60
     monkeypatch.setattr(image, "MAX_PIXELS", 100)

@@ -145,7 +145,9 @@ def test_the_command_places_model_and_cloud(tmp_path: Path) -> None:
         pose = {"rotation": turn.as_rotvec().tolist(), "translation": (-turn.apply(centre)).tolist()}
         shots[f"{i:03d}.jpg"] = {**pose, "camera": "c"}
     camera = {"projection_type": "perspective", "width": 64, "height": 48, "focal": 0.9}
-    (tmp_path / "reconstruction.json").write_text(json.dumps([{"cameras": {"c": camera}, "shots": shots}]))
+    (tmp_path / "reconstruction.json").write_text(
+        json.dumps([{"cameras": {"c": camera}, "shots": shots}]), encoding="utf-8"
+    )
     points = places + [2.0, 3.0, 1.0]
     np.savetxt(tmp_path / "dense.xyz", in_model(points), "%.6f")
     options = [str(tmp_path / "reconstruction.json"), str(tmp_path / "images"), "-o", str(tmp_path / "t")]

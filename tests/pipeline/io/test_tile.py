@@ -47,7 +47,7 @@ def body(folder: Path, **changes: Any) -> dict[str, Any]:
 
 
 def save(folder: Path, content: dict[str, Any]) -> Path:
-    (folder / "tile.toml").write_text(tomli_w.dumps(content))
+    (folder / "tile.toml").write_text(tomli_w.dumps(content), encoding="utf-8")
     return folder
 
 
@@ -62,7 +62,7 @@ def test_a_tile_says_what_was_written_and_photos_may_be_missing_still(tmp_path: 
 
 def test_what_write_tile_writes_read_tile_reads(tmp_path: Path) -> None:
     cloud(tmp_path / "cloud.laz")
-    (tmp_path / "path.csv").write_text("time,x,y,z\n2,500001,5400000,101\n1,500000,5400000,101\n")
+    (tmp_path / "path.csv").write_text("time,x,y,z\n2,500001,5400000,101\n1,500000,5400000,101\n", encoding="utf-8")
     camera = Camera("opencv", 64, 48, 50.0, 51.0, 31.0, 23.0, (0.1, 0.0, 0.0, 0.0))
     rotation = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
     position = np.array([500_001.0, 5_400_002.0, 103.0])
@@ -116,9 +116,9 @@ def test_what_write_tile_writes_read_tile_reads(tmp_path: Path) -> None:
 def test_bad_tiles_are_refused_by_name(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
     cloud(tmp_path / "bare.laz", crs="local")
     cloud(tmp_path / "lambert.laz", crs="EPSG:2154")
-    (tmp_path / "cloud.shp").write_text("0 0 0")
-    (tmp_path / "text.laz").write_text("no cloud")
-    (tmp_path / "bad.csv").write_text("time,x,y,z\n1,2\n")
+    (tmp_path / "cloud.shp").write_text("0 0 0", encoding="utf-8")
+    (tmp_path / "text.laz").write_text("no cloud", encoding="utf-8")
+    (tmp_path / "bad.csv").write_text("time,x,y,z\n1,2\n", encoding="utf-8")
     with pytest.raises(InputError, match=message):
         read_tile(save(tmp_path, body(tmp_path, **changes)))
 
@@ -133,7 +133,7 @@ def test_two_cameras_of_one_id_are_refused(tmp_path: Path) -> None:
 def test_no_tile_and_bad_toml(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"tile\.toml: there is no tile here.*scan2sim import"):
         read_tile(tmp_path)
-    (tmp_path / "tile.toml").write_text("name = \n")
+    (tmp_path / "tile.toml").write_text("name = \n", encoding="utf-8")
     with pytest.raises(InputError, match=r"tile\.toml: is not valid TOML \(.*line 1.*Mend the line"):
         read_tile(tmp_path)
 
@@ -144,7 +144,7 @@ def test_a_truncated_cloud_is_named_before_or_while_it_is_read(tmp_path: Path, s
     path = cloud(tmp_path / f"cloud{suffix}", n=20_000)
     data = path.read_bytes()
     path.write_bytes(data[: int(len(data) * kept)])
-    (tmp_path / "tile.toml").write_text(f'name = "t"\nclouds = ["{path.name}"]\n')
+    (tmp_path / "tile.toml").write_text(f'name = "t"\nclouds = ["{path.name}"]\n', encoding="utf-8")
     with pytest.raises(InputError, match=rf"cloud{suffix}: is .*again"):
         clouds.read(path, read_tile(tmp_path).frame)
 
@@ -153,7 +153,7 @@ def test_feet_become_metres(tmp_path: Path) -> None:
     frame = Frame(FT_CRS, (200_000.0, 250_000.0, 100.0), 0.3048)
     xyz = np.array([[0, 0, 0], [30.48, 60.96, 3.048]], np.float32)
     las.write(tmp_path / "feet.laz", PointCloud(frame, xyz))
-    (tmp_path / "tile.toml").write_text('name = "t"\nclouds = ["feet.laz"]\n')
+    (tmp_path / "tile.toml").write_text('name = "t"\nclouds = ["feet.laz"]\n', encoding="utf-8")
     tile = read_tile(tmp_path)
     read = clouds.read(tile.clouds[0], tile.frame).xyz
     assert tile.frame.unit == pytest.approx(0.3048)
@@ -164,7 +164,9 @@ def test_feet_become_metres(tmp_path: Path) -> None:
 
 def test_a_local_tile_may_be_in_feet(tmp_path: Path) -> None:
     cloud(tmp_path / "bare.las", crs="local")
-    (tmp_path / "tile.toml").write_text('name = "t"\ncrs = "local"\nunits = "ft"\nclouds = ["bare.las"]\n')
+    (tmp_path / "tile.toml").write_text(
+        'name = "t"\ncrs = "local"\nunits = "ft"\nclouds = ["bare.las"]\n', encoding="utf-8"
+    )
     tile = read_tile(tmp_path)
     assert tile.frame.unit == 0.3048
     assert np.ptp(clouds.read(tile.clouds[0], tile.frame).xyz[:, 0]) < 20 * 0.31
@@ -172,7 +174,7 @@ def test_a_local_tile_may_be_in_feet(tmp_path: Path) -> None:
 
 def test_a_real_survey_in_feet_has_metric_size(real_data: Path, tmp_path: Path) -> None:
     (tmp_path / "autzen.laz").write_bytes((real_data / "las" / "autzen_trim.laz").read_bytes())
-    (tmp_path / "tile.toml").write_text('name = "autzen"\nclouds = ["autzen.laz"]\n')
+    (tmp_path / "tile.toml").write_text('name = "autzen"\nclouds = ["autzen.laz"]\n', encoding="utf-8")
     tile = read_tile(tmp_path)
     xyz = clouds.read(tile.clouds[0], tile.frame).xyz
     assert tile.frame.unit == pytest.approx(0.3048)

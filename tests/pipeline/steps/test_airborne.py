@@ -147,7 +147,9 @@ def test_walls_that_were_seen_are_left_alone(house: dict[str, Path], tmp_path: P
 def test_footprints_say_where_walls_stand(house: dict[str, Path], tmp_path: Path) -> None:
     ring = np.array([(-5.5, -3.5), (8.5, -3.5), (8.5, 3.5), (-5.5, 3.5), (-5.5, -3.5)]) + FRAME.origin[:2]
     file = tmp_path / "houses.geojson"
-    file.write_text(json.dumps(polygon(ring) | {"crs": {"type": "name", "properties": {"name": "EPSG:32633"}}}))
+    file.write_text(
+        json.dumps(polygon(ring) | {"crs": {"type": "name", "properties": {"name": "EPSG:32633"}}}), encoding="utf-8"
+    )
     inputs = {name: house[name] for name in ("building", "terrain", "ground")} | {"footprints": file}
     done = go(WALLS, tmp_path / "walls", inputs)
     x, y, _ = PointCloud.load(done.files["made"]).xyz.T
@@ -190,7 +192,7 @@ def test_footprints_come_to_the_tiles_coordinates(kind: str, tmp_path: Path) -> 
     if "gpkg" in kind:
         geopackage(file, ring, 4326 if "degrees" in kind else 32633)
     else:
-        file.write_text(json.dumps(polygon(ring)))
+        file.write_text(json.dumps(polygon(ring)), encoding="utf-8")
     (found,) = footprints.read(file, FRAME)
     assert found[np.lexsort(found.T)] == pytest.approx(np.array([(0, 0), (12, 0), (0, 8), (12, 8)]), abs=1e-3)
     x, y = (found - found[0]).T

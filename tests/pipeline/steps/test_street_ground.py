@@ -47,7 +47,7 @@ def things(path: Path, *, moved: bool = False) -> Path:
     ring = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]]) + FRAME.origin[:2]
     feature = {"type": "Feature", "properties": {"kind": "car", "moved": moved}}
     feature["geometry"] = {"type": "Polygon", "coordinates": [ring.tolist()]}
-    path.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}), encoding="utf-8")
     return path
 
 

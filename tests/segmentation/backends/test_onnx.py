@@ -124,7 +124,7 @@ def test_labels_may_lie_beside_the_file(tmp_path: Path) -> None:
     (tmp_path / "net.labels.txt").write_bytes(b"\xff\xfe\x80")
     assert error_of(path).where == str(tmp_path / "net.labels.txt")
     for too_few in ("", "road\nsky\n"):
-        (tmp_path / "net.labels.txt").write_text(too_few)
+        (tmp_path / "net.labels.txt").write_text(too_few, encoding="utf-8")
         assert "label" in error_of(path).cause
     (tmp_path / "net.labels.txt").unlink()
     error = error_of(path)

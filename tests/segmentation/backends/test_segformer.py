@@ -60,8 +60,10 @@ def reference(rgb: np.ndarray, mean: Any = (0.485, 0.456, 0.406), std: Any = (0.
 
 
 def change(file: Path, **changes: object) -> None:
-    config = json.loads(file.read_text())
-    file.write_text(json.dumps({key: value for key, value in {**config, **changes}.items() if value is not None}))
+    config = json.loads(file.read_text(encoding="utf-8"))
+    file.write_text(
+        json.dumps({key: value for key, value in {**config, **changes}.items() if value is not None}), encoding="utf-8"
+    )
 
 
 def error_of(path: Path) -> InputError:
@@ -120,14 +122,14 @@ def test_a_single_file_beside_its_config_will_do(folder: Path, kind: str) -> Non
 
 def test_photos_are_normalised_as_the_folder_tells(folder: Path) -> None:
     config = {"image_mean": [0.5, 0.4, 0.3], "image_std": [0.2, 0.3, 0.4], "do_normalize": True}
-    (folder / "preprocessor_config.json").write_text(json.dumps(config))
+    (folder / "preprocessor_config.json").write_text(json.dumps(config), encoding="utf-8")
     found = load("segformer", folder, "cpu").probabilities(photo())
     assert np.abs(found - reference(photo(), config["image_mean"], config["image_std"])).max() < 1e-4
     change(folder / "preprocessor_config.json", do_normalize=False)
     found = load("segformer", folder, "cpu").probabilities(photo())
     assert np.abs(found - reference(photo(), (0, 0, 0), (1, 1, 1))).max() < 1e-4
     for wrong in ([0.5, 0.4], "grey", [1, 1, 0], None):
-        (folder / "preprocessor_config.json").write_text(json.dumps({"image_std": wrong}))
+        (folder / "preprocessor_config.json").write_text(json.dumps({"image_std": wrong}), encoding="utf-8")
         assert error_of(folder).where.endswith("preprocessor_config.json")
 
 
@@ -147,7 +149,7 @@ def test_narrow_photos_are_looked_at_too(folder: Path) -> None:
 )
 def test_the_licence_is_told_on(folder: Path, readme: str | None, licence: str) -> None:
     if readme:
-        (folder / "README.md").write_text(readme)
+        (folder / "README.md").write_text(readme, encoding="utf-8")
     assert load("segformer", folder, "cpu").facts.licence == licence
 
 
@@ -227,7 +229,7 @@ def test_another_architecture_is_named(folder: Path, changes: dict[str, object],
 
 @pytest.mark.parametrize("text", ["", "{", "[1]", '"segformer"'])
 def test_a_config_that_is_none_is_refused(folder: Path, text: str) -> None:
-    (folder / "config.json").write_text(text)
+    (folder / "config.json").write_text(text, encoding="utf-8")
     assert error_of(folder).where == str(folder / "config.json")
 
 

@@ -37,7 +37,7 @@ ros.shutdown()
 
 
 def records(path: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in path.read_text().splitlines()]
+    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
 
 
 def flows(path: Path, topic: str, direction: str = "incoming") -> list[dict[str, Any]]:

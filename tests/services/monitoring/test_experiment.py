@@ -28,10 +28,12 @@ def test_a_rush_is_given_workers_and_loses_nothing(
 ) -> None:
     # a quiet second, three of 50 events a second, a quiet while: one worker does 20 a second
     times = [0.1, *(1 + number / 50 for number in range(150)), 6.0]
-    (tmp_path / "data.csv").write_text("".join(f"{seconds},100000\n" for seconds in times))
-    (tmp_path / "rules.toml").write_text("[[rules]]\nname = 'queue'\nmetric = 'queue_length'\nabove = 5\n")
+    (tmp_path / "data.csv").write_text("".join(f"{seconds},100000\n" for seconds in times), encoding="utf-8")
+    (tmp_path / "rules.toml").write_text(
+        "[[rules]]\nname = 'queue'\nmetric = 'queue_length'\nabove = 5\n", encoding="utf-8"
+    )
     days = tmp_path / "days.csv"  # an event every ten seconds of a day
-    days.write_text("".join(f"{seconds},1000\n" for seconds in range(0, 86_400, 10)))
+    days.write_text("".join(f"{seconds},1000\n" for seconds in range(0, 86_400, 10)), encoding="utf-8")
     options = [days if one == days.name else one for one in forecast]
     serve = shlex.join(worker.command(0.05))
     alarms = start(*CLI, "alarms", tmp_path / "rules.toml")
@@ -45,7 +47,7 @@ def test_a_rush_is_given_workers_and_loses_nothing(
     states: list[dict[str, float]] = []
     while sum(one["done"] for one in states) < len(times) and time.monotonic() < end:
         time.sleep(0.5)
-        states = [json.loads(line) for line in (tmp_path / "scale.log").read_text().splitlines()]
+        states = [json.loads(line) for line in (tmp_path / "scale.log").read_text(encoding="utf-8").splitlines()]
     assert sum(one["done"] for one in states) == sum(one["arrived"] for one in states) == len(times)
     assert max(one["wanted"] for one in states) == max(one["workers"] for one in states) >= workers
     alarms.terminate()

@@ -72,7 +72,7 @@ OF_THE_MISSION = {
 
 
 def records(path: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in path.read_text().splitlines()]
+    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
 
 
 def end(*processes: subprocess.Popen[str]) -> None:

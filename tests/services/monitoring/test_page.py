@@ -355,7 +355,7 @@ def test_impossible_ranges_are_refused(query: str, filled: Shown) -> None:
 
 
 def test_it_asks_for_the_token(tmp_path: Path, page: Page) -> None:
-    (tmp_path / "token").write_text(TOKEN)
+    (tmp_path / "token").write_text(TOKEN, encoding="utf-8")
     with shown(PageParams(port=0, token=tmp_path / "token"), reading=False) as served:
         with pytest.raises(urllib.error.HTTPError, match="401"):
             served.get("api/history?from=0&to=5")

@@ -98,7 +98,7 @@ def test_publishers_and_subscribers_are_compared(arrives: float | None, raised: 
     ],
 )
 def test_what_is_no_rule_is_told(text: str, cause: str, tmp_path: Path) -> None:
-    (tmp_path / "rules.toml").write_text(text)
+    (tmp_path / "rules.toml").write_text(text, encoding="utf-8")
     with pytest.raises(InputError) as caught:
         read(tmp_path / "rules.toml")
     assert str(caught.value.where) == str(tmp_path / "rules.toml")

@@ -52,5 +52,5 @@ def osm(fake: Fake) -> Iterator[Osm]:
 @pytest.fixture
 def town(tmp_path: Path) -> Path:
     path = tmp_path / "services.toml"
-    path.write_text(TOWN)
+    path.write_text(TOWN, encoding="utf-8")
     return path

@@ -18,7 +18,9 @@ def measured(folder: Path, environment: str, toolbox: str = "detect", **failed: 
     for metric, value in failed.items():
         rows.append({"metric": metric, "required": "at least 8", "measured": value, "passed": False})
     path = folder / f"{environment}.json"
-    path.write_text(json.dumps({"toolbox": toolbox, "environment": environment, "rows": rows, "more": 1}))
+    path.write_text(
+        json.dumps({"toolbox": toolbox, "environment": environment, "rows": rows, "more": 1}), encoding="utf-8"
+    )
     return path
 
 
@@ -41,6 +43,6 @@ def test_measurements_of_something_else_are_refused(tmp_path: Path) -> None:
         placement.place("detect", [placement.read(measured(tmp_path, "edge", "segment"))])
     bad = tmp_path / "bad.json"
     for text in ("{}", "[", "[" * 5000, '{"toolbox": "detect", "environment": "moon", "rows": []}'):
-        bad.write_text(text)
+        bad.write_text(text, encoding="utf-8")
         with pytest.raises(InputError, match="no measurement"):
             placement.read(bad)

@@ -105,7 +105,7 @@ def test_all_is_gone_when_its_maker_is_killed(tmp_path: Path) -> None:
     os.killpg(maker.pid, signal.SIGKILL)
     maker.communicate()
     end = time.monotonic() + 10
-    while Path(f"/proc/{pid}/cmdline").exists() and Path(f"/proc/{pid}/cmdline").read_text():
+    while Path(f"/proc/{pid}/cmdline").exists() and Path(f"/proc/{pid}/cmdline").read_text(encoding="utf-8"):
         assert time.monotonic() < end
         time.sleep(0.05)
     while set(names) & {*namespaces.ip("netns", "list").split()}:

@@ -116,7 +116,7 @@ def test_networks_are_read_from_files(tmp_path: Path) -> None:
     assert network(Environment.ROBOT) is None
     cloud = network(Environment.CLOUD)
     assert cloud and cloud.there.rate and cloud.there.delay > 0.01
-    (tmp_path / "mine.toml").write_text("[there]\nrate = 1\n[back]\n")
+    (tmp_path / "mine.toml").write_text("[there]\nrate = 1\n[back]\n", encoding="utf-8")
     with pytest.raises(InputError, match=r"there\.rate"):
         network(Environment.EDGE, tmp_path / "mine.toml")
     assert {path.stem for path in environments.FOLDER.glob("*.toml")} == {"edge", "cloud"}

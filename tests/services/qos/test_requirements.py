@@ -46,7 +46,7 @@ def test_bounds() -> None:
 )
 def test_what_is_no_requirement_names_the_file_and_the_field(tmp_path: Path, text: str, about: str) -> None:
     path = tmp_path / "mine.toml"
-    path.write_text(text)
+    path.write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match=about) as caught:
         read(path)
     assert str(path) in str(caught.value)

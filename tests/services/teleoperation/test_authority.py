@@ -56,7 +56,7 @@ def test_what_holds_is_kept_what_ends_or_is_asked_for_is_renewed(made: Path, tmp
     assert [one.made for one in certify(folder, stations=["desk"], days=3000)] == [True]  # a third of that isn't left
     assert [one.made for one in certify(folder, gateway=["elsewhere"])] == [True]
     assert Identity.read(folder / "gateway").me.hosts == ("elsewhere",)
-    (folder / "vehicle-van-2" / "certificate.pem").write_text("damaged")
+    (folder / "vehicle-van-2" / "certificate.pem").write_text("damaged", encoding="utf-8")
     assert [one.made for one in certify(folder, vehicles=["van-2"])] == [True]
 
 

@@ -133,21 +133,21 @@ def test_what_a_full_disk_keeps_from_the_audit_is_not_done(tmp_path: Path, monke
             fleet.hand_over("car", "other", "operator")
     assert car.pair() == desk.pair() == 1, "who drives goes on driving"
     fleet.hand_over("car", "other", "operator")
-    lines = (tmp_path / "audit.jsonl").read_text().splitlines()
+    lines = (tmp_path / "audit.jsonl").read_text(encoding="utf-8").splitlines()
     assert [json.loads(line)["pair"] for line in lines] == [1, 2]
 
 
 def test_an_audit_that_a_crash_cut_short_goes_on(tmp_path: Path) -> None:
-    (tmp_path / "audit.jsonl").write_text('{"what": "join", "pair": 1}\n{"wha')
+    (tmp_path / "audit.jsonl").write_text('{"what": "join", "pair": 1}\n{"wha', encoding="utf-8")
     fleet = Fleet(tmp_path)
     there(fleet)
     fleet.join("car", "desk", "operator")
-    lines = (tmp_path / "audit.jsonl").read_text().splitlines()
+    lines = (tmp_path / "audit.jsonl").read_text(encoding="utf-8").splitlines()
     assert json.loads(lines[-1])["what"] == "join" and len(Fleet(tmp_path).audit.newest) == 2
 
 
 def test_a_damaged_state_is_refused_in_words(tmp_path: Path) -> None:
-    (tmp_path / "fleet.json").write_text("[1, {]")
+    (tmp_path / "fleet.json").write_text("[1, {]", encoding="utf-8")
     with pytest.raises(InputError, match="found again"):
         Fleet(tmp_path)
 

@@ -172,7 +172,7 @@ def test_rubbish_and_strangers_are_not_obeyed(at_work: At, tmp_path: Path) -> No
 def test_others_machines_are_listened_to_with_a_key_only(tmp_path: Path) -> None:
     with pytest.raises(SettingError, match="--key"):
         Translating(Toy(), TranslateParams(host="0.0.0.0", port=0))
-    (tmp_path / "short").write_text("abc\n")
+    (tmp_path / "short").write_text("abc\n", encoding="utf-8")
     with pytest.raises(InputError, match="3 bytes"):
         Translating(Toy(), TranslateParams(port=0, key=tmp_path / "short"))
 
@@ -218,7 +218,7 @@ def connect(params):
 def boat(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
     """A translator of a new vehicle, one file, as a process."""
     (tmp_path / "more").mkdir()
-    (tmp_path / "more" / "boat.py").write_text(NEW)
+    (tmp_path / "more" / "boat.py").write_text(NEW, encoding="utf-8")
     program = f"""
 import sys, threading
 from scan2sim.services import transport
@@ -260,13 +260,13 @@ print("drives", flush=True)
     try:
         assert unit.stdout is not None and unit.stdout.readline() == "drives\n"
         log = tmp_path / "log"
-        until(lambda: log.read_text().endswith("1.0 0.0\n"))
+        until(lambda: log.read_text(encoding="utf-8").endswith("1.0 0.0\n"))
         unit.send_signal(signal.SIGSTOP)
-        until(lambda: log.read_text().endswith("0.0 1.0\n"))
+        until(lambda: log.read_text(encoding="utf-8").endswith("0.0 1.0\n"))
         unit.send_signal(signal.SIGCONT)  # it goes on, its driver's foot still down
         end = time.monotonic() + 0.5
         while time.monotonic() < end:
-            assert log.read_text().splitlines()[-1] == "0.0 1.0"
+            assert log.read_text(encoding="utf-8").splitlines()[-1] == "0.0 1.0"
     finally:
         unit.kill()
         unit.communicate()
@@ -388,10 +388,10 @@ def test_a_stop_reaches_the_bus_when_a_car_unit_falls_silent(vehicle: Any, at_wo
 def test_a_dbc_file_that_lacks_something_is_told(
     tmp_path: Path, change: tuple[str, str], params: dict[str, Any], cause: str, remedy: str
 ) -> None:
-    text = EXAMPLE.read_text()
+    text = EXAMPLE.read_text(encoding="utf-8")
     assert change[0] in text
     path = tmp_path / "other.dbc"
-    path.write_text(text.replace(*change))
+    path.write_text(text.replace(*change), encoding="utf-8")
     with pytest.raises(ScanError, match=cause) as caught:
         connect(dbc=path, **params)
     assert re.search(remedy, caught.value.remedy)
@@ -407,7 +407,7 @@ def test_a_file_that_is_not_there_and_an_interface_that_is_none_are_told(tmp_pat
 
 def test_other_names_and_a_steering_the_other_way(vehicle: Any, tmp_path: Path) -> None:
     path = tmp_path / "other.dbc"
-    path.write_text(EXAMPLE.read_text().replace("Steering", "Lenkung"))
+    path.write_text(EXAMPLE.read_text(encoding="utf-8").replace("Steering", "Lenkung"), encoding="utf-8")
     one = connect(dbc=path, steering="-DriveCommand.Lenkung", gear="", counter="", horn="", gear_in="")
     one.obey(GO)
     said = heard(vehicle, path)

@@ -130,7 +130,7 @@ def test_a_model_that_fails_is_an_error_of_the_server(client: TestClient) -> Non
 
 def test_without_the_token_nothing_is_done(engine: Engine, tmp_path: Path) -> None:
     path = tmp_path / "token"
-    path.write_text("0123456789abcdef")
+    path.write_text("0123456789abcdef", encoding="utf-8")
     client = TestClient(application(engine, Served(token=path)), base_url="http://localhost")
     for headers in ({}, {"Authorization": "Bearer wrong"}, {"Authorization": "0123456789abcdef"}):
         assert client.post(INFER, content=jpeg(1), headers=headers).status_code == 401

@@ -31,10 +31,10 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_pictures_come_with_boxes_and_go_on_where_they_ended(made: Path) -> None:
     found, names = labelled.read(made)
-    before = (made / "boxes.jsonl").read_text()
+    before = (made / "boxes.jsonl").read_text(encoding="utf-8")
     for _ in boxes.write(made, 60, 500, processes=1):
         pass
-    assert (made / "boxes.jsonl").read_text() == before
+    assert (made / "boxes.jsonl").read_text(encoding="utf-8") == before
     assert {"car", "train"} <= {names[int(k)] for one in found for k in one.classes}
     rng = np.random.default_rng(0)
     for one in found[::7]:

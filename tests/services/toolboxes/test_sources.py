@@ -48,7 +48,7 @@ def levels(out: Path) -> list[int]:
 def test_a_folders_pictures_are_worked_on_in_order_and_drawn(engine: Engine, tmp_path: Path) -> None:
     for level in (30, 10, 20):
         Image.fromarray(shaky.image(level)).save(tmp_path / f"{level}.png")
-    (tmp_path / "notes.txt").write_text("no picture")
+    (tmp_path / "notes.txt").write_text("no picture", encoding="utf-8")
     (tmp_path / "25.jpg").write_bytes(b"broken")
     ended = offline.work_through(engine, tmp_path, tmp_path / "out", silent)
     assert ended == {"done": 3, "refused": 1} and levels(tmp_path / "out") == [10, 20, 30]
