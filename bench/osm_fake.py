@@ -2,8 +2,8 @@
 
 `python -m bench.osm_fake [--port 9999] [--seconds 2]` serves one by HTTP, user and password admin: `scan2sim
 orchestrate ... --osm http://localhost:9999` takes it for OSM. What it answers was recorded from OSM's own interface
-(Release 8, its lifecycle manager stubbed), and agrees with OSM's OpenAPI file; nothing runs behind it: an operation
-takes some seconds and is done.
+(Release 8, its lifecycle manager stubbed), and agrees with OSM's OpenAPI file; parameters of operations are returned as
+strings of JSON, as current releases do. Nothing runs behind it: an operation takes some seconds and is done.
 """
 
 from __future__ import annotations
@@ -28,6 +28,9 @@ TOKEN_LASTS = 3600.0
 CUT_BEFORE, CUT_AFTER = "cut before", "cut after"
 """Faults beside statuses: the connection ends before a request is worked on, or after it, without an answer."""
 
+ENCODED = ("primitive_params", "additionalParamsForVnf")
+"""Parameters that current releases store, and return, as strings of JSON."""
+
 Fault = int | str | None
 Faults = Callable[[str, str], Fault]
 """What goes wrong with a request, by its method and path; None: nothing."""
@@ -49,6 +52,8 @@ class State:
     Attributes:
         seconds: that an operation takes.
         outcome: how an operation ends, by its kind and its instance's name: "COMPLETED", "FAILED", "never".
+        as_json: return an operation's `primitive_params` or `additionalParamsForVnf` as a string of JSON, as current
+            releases do; False: as the objects that were sent, as Release 8 did.
         resources: ids of instances for which something runs: what is here without its instance is an orphan.
         asked: when, method and path of all requests.
         running: operations that weren't over, at each of these.
@@ -56,6 +61,7 @@ class State:
 
     seconds: float = 0.3
     outcome: Callable[[str, str], str] = lambda kind, name: "COMPLETED"
+    as_json: bool = True
     token_lasts: float = TOKEN_LASTS
     faults: Faults = lambda method, path: None
     tokens: dict[str, float] = field(default_factory=dict)
@@ -91,6 +97,15 @@ class State:
         )
         names = [sorted(str(one.get("id")) for one in group.values()) for group in (self.functions, self.services)]
         return {"instances": instances, "functions": names[0], "services": names[1]}
+
+    def returned_operations(self) -> dict[str, Record]:
+        """Operations as they are returned: of each, one parameter may be encoded as JSON (OSM's own `elif`)."""
+        return {key: self._encoded(one) if self.as_json else one for key, one in self.operations.items()}
+
+    def _encoded(self, operation: Record) -> Record:
+        given = operation["operationParams"]
+        name = next((name for name in ENCODED if given.get(name)), None)
+        return operation if name is None else operation | {"operationParams": given | {name: json.dumps(given[name])}}
 
     def settle(self) -> None:
         """Have operations end whose time has come."""
@@ -142,7 +157,7 @@ class _Interface:
             case ["nslcm", "v1", "ns_instances", *rest]:
                 return self._instances(method, rest, body)
             case ["nslcm", "v1", "ns_lcm_op_occs", *rest]:
-                return self._read(self.state.operations, method, rest, query)
+                return self._read(self.state.returned_operations(), method, rest, query)
             case ["admin", "v1", "vim_accounts", *rest]:
                 return self._read(self.state.vims, method, rest, query)
             case ["admin", "v1", "k8sclusters", *rest]:

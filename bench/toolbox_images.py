@@ -14,6 +14,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import secrets
 import shlex
 import subprocess
 import sys
@@ -87,7 +88,8 @@ def measured(box: str, port: int) -> tuple[float, list[str]]:
         network = copied_models(path, folder)
         models = sum(file.stat().st_size for file in network) / 1e6
         lacking = sorted(needed(environment)[1].keys() - ALWAYS - NEVER_LOADED.keys())
-        command = [*entry_point(path), "--port", str(port)]
+        (token := folder / "token").write_text(secrets.token_hex(32))
+        command = [*entry_point(path), "--port", str(port), "--token", str(token)]
         command = [part.replace("/models/", f"{folder}/") for part in command]
         command[0] = str(environment / "bin" / command[0])
         waited = seconds_until_ready(command, f"http://localhost:{port}", folder)

@@ -13,7 +13,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from scan2sim import __version__
-from scan2sim.pipeline.errors import INTERRUPTED, ScanError, exit_code, from_os_error
+from scan2sim.pipeline.errors import INTERRUPTED, IncompleteError, ScanError, exit_code, from_os_error
 
 PAGES = Path(__file__).parents[1] / "docs"
 """Where the pages are that help and errors name as docs/NAME.md: they come with a wheel, too."""
@@ -91,11 +91,19 @@ def _root(
 
 
 def _through_prefect(*arguments: Any) -> None:
-    """Make a survey as a flow of Prefect; arguments as the flow's."""
+    """Make a survey as a flow of Prefect; arguments as the flow's.
+
+    Raises:
+        IncompleteError: side products failed; the world is finished.
+    """
     from scan2sim.flows.deployed.survey import check_server, survey
+    from scan2sim.flows.deployed.tile import WITH_WARNINGS
 
     check_server()
-    survey(*arguments)
+    state: Any = survey(*arguments, return_state=True)
+    report = Path(state.result())
+    if state.name == WITH_WARNINGS:
+        raise IncompleteError(report.parent / "world", state.message or "")
 
 
 def main() -> None:
@@ -112,7 +120,8 @@ def main() -> None:
             error = from_os_error(error, error.filename or "a file")
 
         if isinstance(error, ScanError):
-            typer.secho(f"error: {error.where}: {error.cause}", fg="red", err=True)
+            level, colour = ("warning", "yellow") if isinstance(error, IncompleteError) else ("error", "red")
+            typer.secho(f"{level}: {error.where}: {error.cause}", fg=colour, err=True)
             remedy = re.sub(r"(?<![\w/])docs(?=/\w+\.md)", str(PAGES), error.remedy)
             typer.echo(f"  {remedy}{'' if remedy.endswith('?') else '.'}", err=True)
         else:

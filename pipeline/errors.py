@@ -10,6 +10,7 @@ import errno
 from pathlib import Path
 
 REBUILT = "Run again: it is rebuilt, and nothing else"
+RETRIED = "Run again to retry what failed; run.log has the details"
 
 
 class ScanError(Exception):
@@ -71,6 +72,13 @@ class UnsureError(ScanError):
     """What came out is there, but most of it was guessed, not seen."""
 
 
+class IncompleteError(ScanError):
+    """The world is finished, but side products (roads, pictures, the report) failed; `where` is the world's folder."""
+
+    def __init__(self, where: str | Path, cause: str, remedy: str = RETRIED) -> None:
+        super().__init__(where, cause, remedy)
+
+
 class UnavailableError(ScanError):
     """Something that is not installed or can't run on this machine."""
 
@@ -85,6 +93,7 @@ EXIT_CODES: dict[type[BaseException], tuple[int, int, str]] = {
     UnavailableError: (7, 501, "something needed is not installed or can't run here"),
     BusyError: (8, 409, "another run is at work in the same folder"),
     UnsureError: (9, 422, "the result is there, but most of it was guessed, not seen"),
+    IncompleteError: (10, 500, "the world is finished, but a side product failed (roads, pictures, the report, ...)"),
     KeyboardInterrupt: (130, 499, "interrupted; what was finished is kept"),
 }
 
@@ -105,6 +114,18 @@ def http_status(error: BaseException) -> int:
         if isinstance(error, kind):
             return status
     return 500
+
+
+def from_exception(error: Exception, where: str, folder: Path) -> ScanError:
+    """Turn any exception of `where`, a step or a side product that writes into `folder`, into an error for the user."""
+    if isinstance(error, ScanError):
+        return error
+    if isinstance(error, OSError):
+        return from_os_error(error, folder)
+    if isinstance(error, MemoryError):
+        return StepError(where, "ran out of memory", "Use a smaller tile, or larger voxels")
+    cause = f"failed unexpectedly ({type(error).__name__}: {error})"
+    return StepError(where, cause, "The log holds the details; please report it")
 
 
 def from_os_error(error: OSError, path: str | Path) -> ScanError:

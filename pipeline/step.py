@@ -94,6 +94,7 @@ class Step:
             machine (a package is missing, say); called before any step runs, and quick. None: it always can.
         per_class: whether it is run for each class apart.
         resumes: whether it goes on where it was killed.
+        side_product: whether the world is made without its results where it fails (`flows.recipes.tile`).
         memory: GB at least, and GB for every GB that it reads (photos not counted), as measured on generated streets
             (docs/scale.md).
     """
@@ -106,4 +107,5 @@ class Step:
     check: Callable[[Any], None] | None = None
     per_class: bool = False
     resumes: bool = False
+    side_product: bool = False
     memory: tuple[float, float] = (0.5, 6)

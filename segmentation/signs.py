@@ -171,4 +171,4 @@ def _ground(vertices: F32, place: F64) -> float:
     return float(vertices[np.hypot(*(vertices[:, :2] - place[:2]).T).argmin(), 2]) if len(vertices) else float(place[2])
 
 
-SIGNS = Step("signs", 4, signs, SignsParams)
+SIGNS = Step("signs", 4, signs, SignsParams, side_product=True)

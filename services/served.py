@@ -5,28 +5,45 @@ from __future__ import annotations
 import socket
 import ssl
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from scan2sim.pipeline.errors import InputError, SettingError
 from scan2sim.pipeline.ranges import File
 from scan2sim.pipeline.step import Params
+from scan2sim.services.loopback import is_loopback, require_protection
 
 SHORTEST_TOKEN = 16
 """Characters of a token, at least."""
 
 
 class Served(Params):
-    """Of all that listens."""
+    """Options of every HTTP service.
 
-    host: Annotated[str, Field(description="Address to listen on; 0.0.0.0 for all of this machine.")] = "127.0.0.1"
+    Raises:
+        SettingError: it would listen beyond the loopback without a token or a certificate.
+    """
+
+    host: Annotated[
+        str,
+        Field(
+            description="Address to listen on; 0.0.0.0 for all of this machine. Other machines reach all but 127.0.0.1 "
+            "and ::1, so these need --token, or --certificate and --key."
+        ),
+    ] = "127.0.0.1"
     port: Annotated[int, Field(ge=0, le=65535, description="Port to listen on; 0 for any that is free.")] = 8080
     token: Annotated[
         File | None, Field(description="File that holds a token; who asks for anything must bring it (Bearer).")
     ] = None
     certificate: Annotated[File | None, Field(description="Certificate (PEM): serve by TLS; with --key.")] = None
     key: Annotated[File | None, Field(description="The certificate's private key (PEM).")] = None
+
+    @model_validator(mode="after")
+    def _is_protected(self) -> Self:
+        protected = self.token is not None or self.certificate is not None
+        require_protection(self.host, protected=protected, options="--token FILE, or --certificate and --key")
+        return self
 
     def secret(self) -> str | None:
         """The token; None: everybody may ask.
@@ -81,11 +98,11 @@ class Served(Params):
         return f"{'https' if self.certificate else 'http'}://{host}:{port}/"
 
     def is_local(self) -> bool:
-        """Whether this machine's users alone reach it."""
-        return self.host in ("localhost", "::1") or self.host.startswith("127.")
+        """Whether only this machine reaches it."""
+        return is_loopback(self.host)
 
     def is_open(self) -> bool:
-        """Whether others may ask, without a token."""
+        """Whether other machines may use it without a token."""
         return self.token is None and not self.is_local()
 
 

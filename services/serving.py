@@ -107,7 +107,10 @@ def run(app: FastAPI, served: Served, listening: Callable[[str], None]) -> None:
     served.check_tls()
     allow_many()
     with served.listen() as listener:
-        listening(served.address(listener.getsockname()[1]))
+        address = served.address(listener.getsockname()[1])
+        listening(address)
+        if served.is_open():
+            log.warning("everybody who reaches %s may use it: --token FILE asks for a token", address)
         config = uvicorn.Config(
             app,
             log_level="warning",

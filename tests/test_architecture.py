@@ -28,7 +28,7 @@ HEAVY = ("open3d", "torch", "prefect", "numba", "cv2", "scipy", "trimesh", "pypr
 def imported(file: Path) -> set[str]:
     """What a file imports, anywhere in it: rooms by their own names, other modules by their first."""
     names = set()
-    for node in ast.walk(ast.parse(file.read_text())):
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
@@ -55,7 +55,7 @@ def arrows() -> dict[str, set[str]]:
 
     def wanted(file: Path) -> set[str]:
         found = set()
-        for node in ast.walk(ast.parse(file.read_text())):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
             names = [alias.name for alias in node.names] if isinstance(node, (ast.Import, ast.ImportFrom)) else []
             of = f"{node.module}." if isinstance(node, ast.ImportFrom) else ""
             for name in (f"{of}{name}".removeprefix("scan2sim.") for name in names):
@@ -86,7 +86,9 @@ def test_prefect_is_known_to_what_it_deploys_alone() -> None:
 def test_hints_to_install_work_without_a_checkout() -> None:
     for room in ROOMS:
         for file in (ROOT / room).rglob("*.py"):
-            assert not re.search(r"pip install[^\n]*(-e |constraints)", file.read_text()), file.relative_to(ROOT)
+            assert not re.search(r"pip install[^\n]*(-e |constraints)", file.read_text(encoding="utf-8")), (
+                file.relative_to(ROOT)
+            )
 
 
 def loaded_by(code: str, names: tuple[str, ...] = HEAVY) -> set[str]:
@@ -125,7 +127,7 @@ def test_the_recipe_is_planned_without_anything_heavy() -> None:
 def test_every_setting_is_documented() -> None:
     from scan2sim.flows.recipes.steps import STEPS
 
-    text = (ROOT / "docs" / "settings.md").read_text()
+    text = (ROOT / "docs" / "settings.md").read_text(encoding="utf-8")
     for step in STEPS:
         for param in step.params.model_fields:
             assert f"`{step.name}.{param}`" in text, f"docs/settings.md lacks {step.name}.{param}"
@@ -134,13 +136,13 @@ def test_every_setting_is_documented() -> None:
 def test_every_exit_code_is_documented() -> None:
     from scan2sim.pipeline.errors import EXIT_CODES
 
-    text = (ROOT / "docs" / "formats.md").read_text()
+    text = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
     for code, _, meaning in EXIT_CODES.values():
         assert f"| {code} |" in text and meaning in text
 
 
 def test_architecture_names_every_file_of_the_core() -> None:
-    text = (ROOT / "docs" / "architecture.md").read_text()
+    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
     for room in ("pipeline", "flows"):
         for file in (ROOT / room).glob("*.py" if room == "pipeline" else "**/*.py"):
             if file.name != "__init__.py":
@@ -148,7 +150,7 @@ def test_architecture_names_every_file_of_the_core() -> None:
 
 
 def test_walks_stop_at_files_that_there_are_and_at_none_twice() -> None:
-    text = (ROOT / "docs" / "architecture.md").read_text().split("## Three walks")[1].split("\n## ")[0]
+    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8").split("## Three walks")[1].split("\n## ")[0]
     walks = [re.findall(r"`([\w/]+\.py)`", walk) for walk in text.split("\n\n")[2:] if walk.strip()]
     assert len(walks) == 3
     for stops in walks:

@@ -43,7 +43,10 @@ class Exposures:
     def save(self, path: Path) -> None:
         """Write as JSON."""
         body = {"gain": {k: list(v) for k, v in self.gain.items()}}
-        path.write_text(json.dumps(body | {"vignetting": {k: list(v) for k, v in self.vignetting.items()}}, indent=1))
+        path.write_text(
+            json.dumps(body | {"vignetting": {k: list(v) for k, v in self.vignetting.items()}}, indent=1),
+            encoding="utf-8",
+        )
 
     @classmethod
     def load(cls, path: Path) -> Exposures:

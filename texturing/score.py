@@ -176,4 +176,4 @@ def _seen_from_near(inputs: Inputs, places: F32, normals: F32, near: float) -> B
     return seen
 
 
-SCORE = Step("score", 4, score, ScoreParams, memory=(1.3, 3))
+SCORE = Step("score", 4, score, ScoreParams, side_product=True, memory=(1.3, 3))

@@ -93,7 +93,8 @@ class RunDisplay:
             if event in ("done", "failed"):
                 self._bars.remove_task(self._tasks.pop(node.full_name))
                 seconds = time.perf_counter() - self._started[node.full_name]
-                mark = "[green]✓[/]" if event == "done" else "[red]✗[/]"
+                failed = "[yellow]✗[/]" if node.step.side_product else "[red]✗[/]"
+                mark = "[green]✓[/]" if event == "done" else failed
                 console.print(f"{mark} {node.full_name:<22}[dim]{seconds:7.1f} s  {self._done}/{self._nodes}")
 
 

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from scan2sim.flows.reports.side_products import SideProducts
 from scan2sim.pipeline.errors import ScanError, from_os_error
 
 
@@ -21,6 +22,11 @@ class Log:
         """Append lines, the first with the time."""
         with open(self.path, "a", encoding="utf-8") as file:
             file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} " + "".join(f"{line.rstrip()}\n" for line in lines))
+
+    def write_failed(self, side: SideProducts) -> None:
+        """Append the side products that failed, with the details of each."""
+        for text, error in zip(side.warnings(), side.failed.values(), strict=True):
+            self.write(text, *getattr(error, "__notes__", ()))
 
     @contextmanager
     def errors(self, out: Path) -> Iterator[None]:

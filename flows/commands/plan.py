@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 
 from rich.table import Table
@@ -11,6 +12,7 @@ from scan2sim.flows.commands.display import console
 from scan2sim.flows.commands.drive import DRIVE, PREPARED, plan_drive
 from scan2sim.flows.engine.planning import STORE, Planned, check
 from scan2sim.flows.engine.planning import plan as plan_nodes
+from scan2sim.flows.recipes.graph import NodeId
 from scan2sim.flows.recipes.settings import Settings
 from scan2sim.flows.recipes.tile import recipe
 from scan2sim.pipeline.errors import SettingError
@@ -54,15 +56,17 @@ def show_plan(path: Path, out: Path, settings: Settings, *, force: bool = False,
     console.print(table)
 
 
-def plan_tile(tile: Tile, out: Path, settings: Settings, force: bool, start: str | None) -> tuple[list[Planned], Store]:
-    """What would run of a tile, and the store that keeps its results.
+def plan_tile(
+    tile: Tile, out: Path, settings: Settings, force: bool, start: str | None, without: Collection[NodeId] = ()
+) -> tuple[list[Planned], Store]:
+    """What would run of a tile, without side products that failed, and the store that keeps its results.
 
     Raises:
         SettingError: as `recipe`; there is no step `start`.
     """
-    nodes = recipe(tile, settings)
+    nodes = recipe(tile, settings, without=without)
     names = {node.step.name for node in nodes}
-    if start is not None and start not in names:
+    if start is not None and start not in names | {node.step for node in without}:
         raise SettingError(f"--from {start}", "there is no such step", f"Steps are: {', '.join(sorted(names))}")
     store = Store(out / STORE)
     return plan_nodes(nodes, store, force=force, start=start), store

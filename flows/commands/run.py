@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated
 
@@ -13,16 +14,20 @@ from scan2sim.flows.commands.app import App, Bus, Config, Force, From, HoldOut, 
 from scan2sim.flows.commands.display import console, warn
 from scan2sim.flows.commands.log import Log
 from scan2sim.flows.commands.plan import plan_tile
-from scan2sim.flows.commands.shown import execute_shown, show_findings, show_results
-from scan2sim.flows.engine.execution import Executor
+from scan2sim.flows.commands.shown import execute_shown, show_failed, show_findings, show_results
+from scan2sim.flows.engine.execution import Executor, run_to_world
+from scan2sim.flows.engine.frontier import Outcome
 from scan2sim.flows.engine.lock import locked
-from scan2sim.flows.engine.planning import drop_damaged
+from scan2sim.flows.engine.planning import Planned, drop_damaged
 from scan2sim.flows.engine.progress import PublishedRun, published
 from scan2sim.flows.engine.versions import versions
+from scan2sim.flows.recipes.graph import NodeId
 from scan2sim.flows.recipes.settings import Settings
 from scan2sim.flows.reports.publish import publish, to_read
-from scan2sim.flows.reports.tile import write_report
+from scan2sim.flows.reports.side_products import SideProducts
+from scan2sim.flows.reports.tile import DATA, PAGE, write_report
 from scan2sim.pipeline.io.tile import read_tile
+from scan2sim.pipeline.store import Store
 
 app = App()
 
@@ -65,10 +70,11 @@ def run_tile(
         run: runs the steps; by default up to `jobs` processes at a time, and `bus` is told.
 
     Raises:
+        IncompleteError: side products failed; the world is finished.
         ScanError: see `pipeline.errors`; earlier results stay.
     """
     began = time.perf_counter()
-    tile = read_tile(path)
+    tile, side, report = read_tile(path), SideProducts(out), None
     with locked(out):
         planned, store = plan_tile(tile, out, settings, force, start)
         if drop_damaged(planned, store, to_read(store, planned, out)):
@@ -77,18 +83,31 @@ def run_tile(
         log.write(f"tile {tile.path}, settings {json.dumps(settings.values)}, versions {json.dumps(versions())}")
         missing = sum(p.reason is not None for p in planned)
         with log.errors(out):
-            outcome = run(planned, store) if run else execute_shown(planned, store, log, jobs, bus=bus)
-            outcome.check()
+
+            def execute(planned: list[Planned], store: Store) -> Outcome:
+                return execute_shown(planned, store, log, jobs, bus=bus)
+
+            def replan(without: Collection[NodeId]) -> list[Planned]:
+                return plan_tile(tile, out, settings, force, start, without)[0]
+
+            planned, outcome = run_to_world(planned, replan, store, run or execute)
+            side.add(outcome.side_failed)
             done = outcome.of_tile()
             changed = publish(store, planned, done, out, tile, settings)
-            report = write_report(tile, planned, done, store, out, seconds=time.perf_counter() - began)
+            with side.attempt("report", out / PAGE, out / DATA):
+                seconds = time.perf_counter() - began
+                report = write_report(tile, planned, done, store, out, seconds=seconds, failed=side.failed)
+            log.write_failed(side)
         store.sweep({p.node.id.name: p.key for p in planned})
     for warning in changed:
         warn(warning)
+    show_failed(side, log)
     show_findings(done)
     show_results(out / "world" / f"{tile.name}.sdf", report)
     if missing == 0:
         console.print(
             f"[dim]nothing to do: all is as the tile and the settings say ({time.perf_counter() - began:.1f} s)"
         )
+    side.check()
+    assert report is not None, "without a report the check has raised"
     return report

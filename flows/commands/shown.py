@@ -15,6 +15,7 @@ from scan2sim.flows.engine.progress import PublishedRun
 from scan2sim.flows.recipes.graph import Node
 from scan2sim.flows.reports import gazebo
 from scan2sim.flows.reports.findings import findings
+from scan2sim.flows.reports.side_products import SideProducts
 from scan2sim.pipeline.store import Manifest, Store, digest
 
 WORST = 3
@@ -81,9 +82,9 @@ def run_shown(
     return planned, outcome.of_tile()
 
 
-def show_results(world: Path, report: Path) -> None:
+def show_results(world: Path, report: Path | None) -> None:
     """Where the world and the report are, and how to open them, on the screen."""
-    lines = [*gazebo.lines(world), f"Report: {report}"]
+    lines = [*gazebo.lines(world), *([f"Report: {report}"] if report else [])]
     console.print("\n".join(lines), highlight=False, soft_wrap=True, markup=False)
 
 
@@ -96,6 +97,12 @@ def show_findings(done: Mapping[str, Manifest]) -> None:
         warn(f"{one.about}: {one.text}")
     if len(found) > WORST:
         console.print(f"[dim]{len(found) - WORST} more in the report")
+
+
+def show_failed(side: SideProducts, log: Log) -> None:
+    """The side products that failed, a line each, on the screen."""
+    for text in side.warnings():
+        warn(f"{text} (details: {log.path})")
 
 
 def show_warnings(done: Mapping[str, Manifest]) -> None:

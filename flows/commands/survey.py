@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -15,7 +15,7 @@ from scan2sim.flows.commands.app import App, Bus, Config, HoldOut, Sets, setting
 from scan2sim.flows.commands.display import console, warn
 from scan2sim.flows.commands.drive import survey_of
 from scan2sim.flows.commands.log import Log
-from scan2sim.flows.commands.shown import default_jobs, execute_shown, show_results
+from scan2sim.flows.commands.shown import default_jobs, execute_shown, show_failed, show_results
 from scan2sim.flows.engine import workers
 from scan2sim.flows.engine.execution import Executor, limit_cores
 from scan2sim.flows.engine.frontier import Outcome
@@ -30,6 +30,7 @@ from scan2sim.flows.recipes.survey import survey_recipe
 from scan2sim.flows.recipes.tile import check_here
 from scan2sim.flows.reports.finish import TILES, Made, finish, is_finished
 from scan2sim.flows.reports.publish import to_read
+from scan2sim.flows.reports.side_products import SideProducts
 from scan2sim.pipeline import libraries
 from scan2sim.pipeline.errors import ScanError, SettingError, SpaceError, StepError
 from scan2sim.pipeline.extras import need
@@ -126,37 +127,42 @@ def make_survey(place: str | Path, target: str | Path, settings: Settings, run: 
 
     Raises:
         StepError: tiles failed; all others are finished.
+        IncompleteError: side products failed; the world is finished.
         ScanError: see `pipeline.errors`; earlier results stay.
     """
     began = time.perf_counter()
     sources, results = _remote(place), _remote(target)
     survey = read_survey(sources.pull_all() if sources else Path(place))
     out = likeness(target)
-    log = Log(out / "run.log")
+    log, side = Log(out / "run.log"), SideProducts(out)
     with locked(out), log.errors(out):
         log.write(f"survey {survey.path}, settings {json.dumps(settings.values)}, versions {json.dumps(versions())}")
         store = _store(place, target)
         digests = Digests(store.root / "digests.json")
-        made = _make(survey, settings, store, run, digests, out)
-        report = finish(survey, made, store, out, settings, digests, warn)
+        made = _make(survey, settings, store, run, digests, side)
+        report = finish(survey, made, store, out, settings, digests, side, warn)
         digests.save()
+        log.write_failed(side)
         failed = [one for one in made if one.error is not None]
         for one in failed:
             log.write(f"{one.name}: failed: {one.error}")
         if results:
             files = (path.relative_to(out) for path in sorted(out.rglob("*")) if path.is_file())
             results.push_all(file.as_posix() for file in files if file.parts[0] not in (STORE, ".lock"))
+    show_failed(side, log)
     kept = all(one.kept for one in made)
     show_results(out / "world" / f"{survey.name}.sdf", report)
-    if kept and not failed:
+    if kept and not failed and not side.failed:
         console.print(f"[dim]nothing to do: all is as the survey says ({time.perf_counter() - began:.1f} s)")
     if failed:
         first = failed[0].error
         raise StepError(
-            report,
+            report or out,
             f"{len(failed)} of {len(made)} tiles failed: {', '.join(one.name for one in failed)} ({first})",
             "Mend what the report names and run again: what is finished is kept",
         )
+    side.check()
+    assert report is not None, "without a report the check has raised"
     return report
 
 
@@ -173,16 +179,24 @@ def read_tiles(survey: Survey) -> tuple[dict[str, Tile], dict[str, ScanError]]:
 
 
 def plan_survey(
-    tiles: Mapping[str, Tile], store: Store, settings: Settings, digest: Callable[[Path], str]
+    tiles: Mapping[str, Tile],
+    store: Store,
+    settings: Settings,
+    digest: Callable[[Path], str],
+    without: Collection[NodeId] = (),
 ) -> list[Planned]:
-    """What would run of all tiles, and why."""
-    return plan(survey_recipe(list(tiles.values()), settings), store, digest=digest)
+    """What would run of all tiles, without side products that failed, and why."""
+    return plan(survey_recipe(list(tiles.values()), settings, without), store, digest=digest)
 
 
-def _make(survey: Survey, settings: Settings, store: Store, run: Executor, digests: Digests, out: Path) -> list[Made]:
-    """Run all tiles; without those that fail, until none does."""
+def _make(
+    survey: Survey, settings: Settings, store: Store, run: Executor, digests: Digests, side: SideProducts
+) -> list[Made]:
+    """Run all tiles; again without tiles and side products that fail, until none does."""
+    out = side.out
     tiles, failed = read_tiles(survey)
     unread = set(failed)
+    side_failed: dict[NodeId, ScanError] = {}
     ran: dict[tuple[NodeId, str], Reason] = {}  # why, of what an earlier round of this run has made
     before: dict[NodeId, set[str]] = {}  # what there was, of all that is run
     first = plan_survey(tiles, store, settings, digests)
@@ -191,7 +205,7 @@ def _make(survey: Survey, settings: Settings, store: Store, run: Executor, diges
         if not is_finished(store.within(name), own, out / TILES / name):
             drop_damaged(own, store, to_read(store.within(name), own, out / TILES / name))
     while True:
-        planned = plan_survey(tiles, store, settings, digests)
+        planned = plan_survey(tiles, store, settings, digests, side_failed)
         planned = [replace(item, reason=item.reason or ran.get((item.node.id, item.key))) for item in planned]
         ran |= {(item.node.id, item.key): item.reason for item in planned if item.reason is not None}
         for node in {item.node.id for item in planned if item.reason is not None} - before.keys():
@@ -200,11 +214,13 @@ def _make(survey: Survey, settings: Settings, store: Store, run: Executor, diges
         for error in outcome.failed.values():
             if isinstance(error, (SpaceError, SettingError)):  # no tile's fault
                 raise error
-        if not outcome.failed:
+        side_failed |= outcome.side_failed
+        if not (outcome.failed or outcome.side_failed):
             break
         for node, error in outcome.failed.items():
             failed.setdefault(node.tile, error)
         tiles = {name: tile for name, tile in tiles.items() if name not in failed}
+    side.add({node: error for node, error in side_failed.items() if node.tile in tiles})
     return [
         Made(name, None if name in unread else read_tile(path), error=failed[name])
         if name in failed

@@ -12,7 +12,7 @@ from prefect.states import Completed
 from scan2sim.flows.commands.drive import survey_of
 from scan2sim.flows.commands.survey import changes
 from scan2sim.flows.deployed.survey import survey
-from scan2sim.flows.deployed.tile import by_tasks
+from scan2sim.flows.deployed.tile import WITH_WARNINGS, by_tasks
 from scan2sim.flows.engine.progress import published
 from scan2sim.flows.recipes.settings import Settings
 from scan2sim.pipeline.errors import BusyError
@@ -37,7 +37,10 @@ def reprocess(
             get_run_logger().info(f"{tile}: {reasons}")
         if not found:
             return Completed(message="Nothing has changed")
-        report = survey(path, out, None, None, settings, runner, workers, memory, cores, address, bus)
+        state = survey(path, out, None, None, settings, runner, workers, memory, cores, address, bus, return_state=True)
+        report = state.result()
     except BusyError as error:
         return Completed(message=f"Skipped: {error}", name="Skipped")
-    return Completed(message=f"{len(found)} tiles made anew: {report}", data=report)
+    if state.name == WITH_WARNINGS:
+        return Completed(name=WITH_WARNINGS, message=state.message, data=report)
+    return Completed(message=f"{len(found)} tiles rebuilt: {report}", data=report)

@@ -13,16 +13,18 @@ import scan2sim.flows.deployed.prefect_settings  # noqa: F401  # isort: skip  # 
 from prefect import flow
 from prefect.artifacts import create_image_artifact, create_markdown_artifact, create_table_artifact
 from prefect.client.orchestration import get_client
+from prefect.client.schemas.objects import State
 from prefect.settings import PREFECT_API_URL
+from prefect.states import Completed
 
 from scan2sim.flows.commands.drive import survey_of
 from scan2sim.flows.commands.survey import make_survey
 from scan2sim.flows.deployed.ephemeral import guard
-from scan2sim.flows.deployed.tile import artifact_key, by_tasks
+from scan2sim.flows.deployed.tile import artifact_key, by_tasks, with_warnings
 from scan2sim.flows.engine.progress import published
 from scan2sim.flows.recipes.settings import Settings
-from scan2sim.flows.reports.survey import overview, rows
-from scan2sim.pipeline.errors import INTERRUPTED, StepError, UnavailableError, exit_code
+from scan2sim.flows.reports.survey import PAGE, overview, rows
+from scan2sim.pipeline.errors import INTERRUPTED, IncompleteError, StepError, UnavailableError, exit_code
 from scan2sim.pipeline.io.remote import likeness
 
 
@@ -68,8 +70,10 @@ def survey(
     source: str, out: str, length: float | None = None, buffer: float | None = None,
     settings: dict[str, Any] | None = None, runner: str = "threads", workers: int = 2,
     memory: str | None = None, cores: int | None = None, address: str | None = None, bus: str | None = None,
-) -> str:  # fmt: skip
+) -> State[str]:  # fmt: skip
     """Make a survey's worlds, a task per tile and step; what an earlier run has finished is kept.
+
+    The result is the report's path.
 
     Args:
         source: a drive, a corridor or a survey (`commands.drive`).
@@ -83,13 +87,16 @@ def survey(
         address: of a Dask scheduler or a Ray cluster; default: started here.
         bus: that is told how steps fare, by the flow and by its workers (`services.monitoring.outlets`).
     """
-    with published(bus, "survey", source, here=False) as on_bus:
-        run = by_tasks(runner, workers, address, memory, cores, on_bus)
-        path = survey_of(source, out, run, length=length, buffer=buffer)
-        try:
-            report = make_survey(path, out, Settings(settings), run)
-        except StepError:  # tiles failed, the others are there
-            publish(likeness(out))
-            raise
+    try:
+        with published(bus, "survey", source, here=False) as on_bus:
+            run = by_tasks(runner, workers, address, memory, cores, on_bus)
+            path = survey_of(source, out, run, length=length, buffer=buffer)
+            try:
+                report = str(make_survey(path, out, Settings(settings), run))
+            except (StepError, IncompleteError):  # tiles or side products failed, all else is there
+                publish(likeness(out))
+                raise
+    except IncompleteError as error:
+        return with_warnings(error, likeness(out) / PAGE)
     publish(likeness(out))
-    return str(report)
+    return Completed(message=f"The world is finished: {report}", data=report)

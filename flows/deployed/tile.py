@@ -11,6 +11,8 @@ import scan2sim.flows.deployed.prefect_settings  # noqa: F401  # isort: skip  # 
 from prefect import flow, get_run_logger, task
 from prefect.artifacts import create_progress_artifact, update_progress_artifact
 from prefect.cache_policies import NO_CACHE
+from prefect.client.schemas.objects import State
+from prefect.states import Completed
 
 from scan2sim.flows.commands.run import run_tile
 from scan2sim.flows.engine.dispatch import dispatch
@@ -22,7 +24,11 @@ from scan2sim.flows.engine.progress import PublishedRun, published
 from scan2sim.flows.engine.versions import versions
 from scan2sim.flows.engine.workers import workers
 from scan2sim.flows.recipes.settings import Settings
+from scan2sim.pipeline.errors import IncompleteError
 from scan2sim.pipeline.store import Manifest, Store
+
+WITH_WARNINGS = "CompletedWithWarnings"
+"""Name of a flow's final state where the world is finished, but side products failed."""
 
 
 @task(name="step", task_run_name="{node}", cache_policy=NO_CACHE)
@@ -95,8 +101,18 @@ def artifact_key(*parts: str) -> str:
 def tile(
     path: str, out: str, settings: dict[str, Any] | None = None, memory: str | None = None, cores: int | None = None,
     bus: str | None = None,
-) -> str:  # fmt: skip
-    """Make one tile's world, a task a step, in threads of this process; returns the report's path."""
-    with published(bus, "tile", path, here=False) as on_bus:
-        run = by_tasks(memory=memory, cores=cores, bus=on_bus)
-        return str(run_tile(Path(path), Path(out), Settings(settings), run=run))
+) -> State[str]:  # fmt: skip
+    """Make one tile's world, a task a step, in threads of this process; the result is the report's path."""
+    try:
+        with published(bus, "tile", path, here=False) as on_bus:
+            run = by_tasks(memory=memory, cores=cores, bus=on_bus)
+            report = str(run_tile(Path(path), Path(out), Settings(settings), run=run))
+    except IncompleteError as error:
+        return with_warnings(error, Path(out) / "report.html")
+    return Completed(message=f"The world is finished: {report}", data=report)
+
+
+def with_warnings(error: IncompleteError, report: Path) -> State[str]:
+    """The final state of a flow whose world is finished, but side products failed."""
+    get_run_logger().warning(str(error))
+    return Completed(name=WITH_WARNINGS, message=error.cause, data=str(report))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerProcess
 
@@ -13,6 +14,7 @@ from scan2sim.flows.engine.memory import need, share
 from scan2sim.flows.engine.planning import Planned, check
 from scan2sim.flows.engine.progress import Channel, published_step
 from scan2sim.flows.engine.versions import check_version
+from scan2sim.flows.recipes.graph import NodeId
 from scan2sim.pipeline import libraries
 from scan2sim.pipeline.errors import DamagedError, ScanError
 from scan2sim.pipeline.store import Manifest, Store
@@ -33,7 +35,8 @@ def execute(
     """Run what the plan says is missing, up to `jobs` nodes at a time, each in a process of its own.
 
     Args:
-        to_the_end: run all that doesn't depend on what has failed, rather than stop at the first failure.
+        to_the_end: run all that doesn't depend on what has failed, rather than stop at the first failure. Side
+            products never stop a run.
         memory: GB that nodes may need together (`engine.memory`); one that needs more runs alone.
 
     Raises:
@@ -68,7 +71,7 @@ def execute(
                     front.again(item, error)
                 except ScanError as error:
                     front.fail(item, error)
-                    if not to_the_end:
+                    if not (to_the_end or item.node.step.side_product):
                         return front.outcome
                 else:
                     if manifest is None:
@@ -80,6 +83,36 @@ def execute(
         for _, process, _ in running.values():
             processes.stop(process)
     return front.outcome
+
+
+def run_to_world(
+    planned: list[Planned], plan: Callable[[Collection[NodeId]], list[Planned]], store: Store, run: Executor
+) -> tuple[list[Planned], Outcome]:
+    """Run a plan; where side products fail, again without them, until nothing more fails.
+
+    Args:
+        planned: what to run first.
+        plan: plans without the side products that failed.
+        store: that keeps results.
+        run: runs a plan.
+
+    Returns:
+        The last plan and its outcome, with all side products that failed.
+
+    Raises:
+        ScanError: of a node that isn't a side product.
+    """
+    failed: dict[NodeId, ScanError] = {}
+    made: dict[NodeId, str] = {}
+    while True:
+        outcome = run(planned, store)
+        outcome.check()
+        if not outcome.side_failed:
+            return planned, replace(outcome, side_failed=failed)
+        failed |= outcome.side_failed
+        made |= {item.node.id: item.key for item in planned if item.node.id in outcome.done}
+        # what was forced to run again has by now
+        planned = [replace(item, reason=None) if made.get(item.node.id) == item.key else item for item in plan(failed)]
 
 
 def limit_cores(cores: int | None) -> None:

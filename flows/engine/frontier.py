@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 from scan2sim.flows.engine.planning import Planned
@@ -27,17 +27,19 @@ class Outcome:
     Attributes:
         done: results, what is kept from before among them.
         failed: why others failed; what depends on them is in neither.
+        side_failed: the same of side products.
     """
 
     done: Mapping[NodeId, Manifest]
     failed: Mapping[NodeId, ScanError]
+    side_failed: Mapping[NodeId, ScanError] = field(default_factory=dict)
 
     def of_tile(self, tile: str = "") -> dict[str, Manifest]:
         """Results of one tile by their names within it (`poisson.terrain`)."""
         return {node.name: manifest for node, manifest in self.done.items() if node.tile == tile}
 
     def check(self) -> None:
-        """Raise the first error, if any node failed."""
+        """Raise the first error, if any node failed that isn't a side product."""
         for error in self.failed.values():
             raise error
 
@@ -47,12 +49,13 @@ class Frontier:
 
     Attributes:
         done: results; what is kept from before comes by itself.
-        failed: why others failed.
+        failed, side_failed: why others failed.
     """
 
     def __init__(self, planned: Sequence[Planned], store: Store, watch: Watch) -> None:
         self.done: dict[NodeId, Manifest] = {}
         self.failed: dict[NodeId, ScanError] = {}
+        self.side_failed: dict[NodeId, ScanError] = {}
         self._store, self._watch = store, watch
         self._planned = {item.node.id: item for item in planned}
         self._by_name = {item.node.full_name: item.node.id for item in planned}
@@ -66,7 +69,7 @@ class Frontier:
     @property
     def outcome(self) -> Outcome:
         """As far as the plan has come."""
-        return Outcome(self.done, self.failed)
+        return Outcome(self.done, self.failed, self.side_failed)
 
     def ready(self) -> Iterator[Planned]:
         """Nodes that can run now, in the plan's order; to be taken, or offered again."""
@@ -109,5 +112,5 @@ class Frontier:
         """The node, and whatever depends on it, will not be done."""
         self.take(item)
         self._lost.add(item.node.id)
-        self.failed[item.node.id] = error
+        (self.side_failed if item.node.step.side_product else self.failed)[item.node.id] = error
         self._watch(item.node, "failed", 1.0, error.cause)

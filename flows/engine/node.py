@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 
 from scan2sim.flows.engine.planning import Planned
-from scan2sim.pipeline.errors import ScanError, StepError, from_os_error
+from scan2sim.pipeline.errors import ScanError, from_exception
 from scan2sim.pipeline.step import Report, silent
 from scan2sim.pipeline.store import Manifest, Store
 
@@ -40,16 +40,8 @@ def run_node(item: Planned, store: Store, inputs: dict[str, Path], report: Repor
         return store.commit(node.full_name, item.key, folder, result, about)
     except ScanError:
         raise
-    except OSError as error:
-        raise from_os_error(error, folder) from error
-    except MemoryError as error:
-        raise StepError(node.full_name, "ran out of memory", "Use a smaller tile, or larger voxels") from error
     except Exception as error:
-        raise StepError(
-            node.full_name,
-            f"failed unexpectedly ({type(error).__name__}: {error})",
-            "The log holds the details; please report it",
-        ) from error
+        raise from_exception(error, node.full_name, folder) from error
     finally:
         shutil.rmtree(folder, ignore_errors=True)  # moved away by now, unless it failed
 

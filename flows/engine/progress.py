@@ -21,7 +21,7 @@ from typing import Literal
 from scan2sim.flows.engine.frontier import Event, Watch, unwatched
 from scan2sim.flows.engine.planning import Planned
 from scan2sim.flows.recipes.graph import Node, NodeId
-from scan2sim.pipeline.errors import DamagedError, ScanError, printable
+from scan2sim.pipeline.errors import DamagedError, IncompleteError, ScanError, printable
 from scan2sim.pipeline.store import Store, read_manifest
 from scan2sim.services.monitoring import outlets
 from scan2sim.services.monitoring.events import Events, Outlet, RunState, StepState
@@ -197,6 +197,9 @@ def published(where: str | None, command: str, source: str, *, here: bool = True
     run = PublishedRun(where, command, source, here=here)
     try:
         yield run
+    except IncompleteError as error:
+        run.end("done", str(error))
+        raise
     except BaseException as error:
         stopped = isinstance(error, (KeyboardInterrupt, SystemExit))
         run.end("stopped" if stopped else "failed", "" if stopped else str(error))

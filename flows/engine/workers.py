@@ -61,7 +61,8 @@ def _dask(count: int, address: str | None) -> Iterator[Call]:
     from distributed import Client
 
     # Dask would count a step's memory as its worker's, and kill it
-    own: dict[str, Any] = {"n_workers": count, "threads_per_worker": 1, "memory_limit": 0, "dashboard_address": ":0"}
+    own: dict[str, Any] = {"n_workers": count, "threads_per_worker": 1, "memory_limit": 0}
+    own["dashboard_address"] = "127.0.0.1:0"  # it asks for no token
     unwatched = {"distributed.worker.profile.enabled": False}  # a hundred looks a second at what a worker does
     try:
         with dask.config.set(unwatched):

@@ -67,7 +67,9 @@ STEPS: tuple[Step, ...] = (
 Sources = dict[str, Path | Output]
 
 
-def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None) -> list[Node]:
+def recipe(
+    tile: Tile, settings: Settings, beside: Collection[str] | None = None, without: Collection[NodeId] = ()
+) -> list[Node]:
     """The graph of a tile, each node after those that it reads of the same tile.
 
     Args:
@@ -75,12 +77,13 @@ def recipe(tile: Tile, settings: Settings, beside: Collection[str] | None = None
         settings: of all steps.
         beside: names of the tiles of its survey that are made, too: nodes are `tile/step` then, and what happens at the
             borders reads neighbours' results. Without it the tile is made for itself, and ends at its borders.
+        without: side products that failed, of this tile and its neighbours: the graph is as if they were switched off.
 
     Raises:
         SettingError: a setting that doesn't exist or is out of range.
     """
     settings.check(STEPS)
-    graph = _Graph(tile, settings, beside)
+    graph = _Graph(tile, settings, beside, without)
     evidence = graph.classes()
     graph.parts(graph.whole())
     made = graph.made_up(evidence)
@@ -111,9 +114,11 @@ class _Graph:
         groups: classes that get a surface; `parted`: all that the cloud is split into.
     """
 
-    def __init__(self, tile: Tile, settings: Settings, beside: Collection[str] | None) -> None:
+    def __init__(
+        self, tile: Tile, settings: Settings, beside: Collection[str] | None, without: Collection[NodeId]
+    ) -> None:
         self.nodes: list[Node] = []
-        self.tile, self.settings = tile, settings
+        self.tile, self.settings, self._without = tile, settings, without
         self._name = "" if beside is None else tile.name
         self.cell: dict[str, Any] = {}
         if tile.cell:
@@ -133,13 +138,19 @@ class _Graph:
         """An output of a node of this tile, or of the neighbour `other`."""
         return Output(NodeId(step.name, group, self._name if other is None else other), name)
 
+    def runs(self, step: Step, other: str | None = None) -> bool:
+        """Whether a side product of this tile, or of the neighbour `other`, has not failed."""
+        return NodeId(step.name, tile=self._name if other is None else other) not in self._without
+
     def add(self, step: Step, inputs: Mapping[str, Path | Output], group: str = "", **given: Any) -> None:
-        """One more node."""
-        self.nodes.append(Node(step, self.settings.params(step, group, **given), inputs, group, self._name))
+        """One more node, unless it is a side product that failed."""
+        if self.runs(step):
+            self.nodes.append(Node(step, self.settings.params(step, group, **given), inputs, group, self._name))
 
     def of_neighbours(self, step: Step, name: str, group: str = "", prefix: str | None = None) -> Sources:
         """An output of all neighbours' nodes, by `prefix` (default: its name) and the tile's name."""
-        return {f"{prefix or name}.{tile}": self.at(step, name, group, tile) for tile in self.adjoining}
+        made = [tile for tile in self.adjoining if self.runs(step, tile)]
+        return {f"{prefix or name}.{tile}": self.at(step, name, group, tile) for tile in made}
 
     def classes(self) -> Sources:
         """What each point is, by photos and shape; returns what photos tell of points."""
@@ -194,8 +205,10 @@ class _Graph:
 
     def parts(self, cloud: Output) -> None:
         """Furniture taken out, the rest split by class and thinned."""
-        if (self.scanner or self.adjoining) and self.settings.params(FURNITURE).when == "auto":
+        wanted = (self.scanner or self.adjoining) and self.settings.params(FURNITURE).when == "auto"
+        if wanted:
             self.add(FINDS, {"cloud": cloud} | self.scanner, **self.cell)
+        if wanted and self.runs(FINDS) and self.runs(FURNITURE):
             found = {"finds": self.at(FINDS, "finds")} | self.of_neighbours(FINDS, "finds")
             self.add(FURNITURE, {"cloud": cloud} | found, name=self.tile.name, **self.cell)
             names = (*GROUPS[1:], "taken", "plates", "beside", "geojson", "csv")
@@ -281,7 +294,7 @@ class _Graph:
         lists: Sources = {}
         if self.standing and self.scanner:
             lists = {"furniture": self.standing["geojson"], "furniture_csv": self.standing["csv"]}
-        if self.settings.params(SPLIT).vegetation != "mesh":
+        if self.settings.params(SPLIT).vegetation != "mesh" and self.runs(PLANTS):
             clouds = {name: self.at(VOXEL, "cloud", name) for name in ("vegetation", "terrain")}
             self.add(PLANTS, clouds, **self.cell)
             lists |= {"plants": self.at(PLANTS, "geojson"), "plants_csv": self.at(PLANTS, "csv")}
@@ -290,7 +303,7 @@ class _Graph:
     def planted(self, output: str) -> Sources:
         """Models of plants, where there is no mesh of vegetation."""
         wanted = self.settings.params(PLANTS).models and self.settings.params(SPLIT).vegetation == "locations"
-        return {"vegetation": self.at(PLANTS, output)} if wanted else {}
+        return {"vegetation": self.at(PLANTS, output)} if wanted and self.runs(PLANTS) else {}
 
     def photos(self, evidence: Sources, lists: Sources) -> tuple[Sources, Sources]:
         """What photos see of the meshes, and how well they agree; signs are fitted to them, and listed in `lists`.
@@ -304,7 +317,7 @@ class _Graph:
         if self.photographed and self.settings.params(REFINE).when == "auto":
             add(REFINE, _meshes(surfaces) | {"cloud.rest": clouds["cloud.rest"]} | self._moving() | seen)
             seen = {"views": at(REFINE, "views")}
-        if self.photographed and self.standing and self.settings.params(SIGNS).when == "auto":
+        if self.photographed and self.standing and self.settings.params(SIGNS).when == "auto" and self.runs(SIGNS):
             plates = {name: self.standing[name] for name in ("plates", "beside", "geojson")}
             add(SIGNS, _meshes(surfaces) | plates | seen | {"labels": evidence["labels"]}, **self.cell)
             surfaces |= {group: at(SIGNS, group) for group in self.groups if group in ("building", "vegetation")}
@@ -344,11 +357,13 @@ class _Graph:
 
     def roads(self, textured: Sources) -> Sources:
         """Roads as data, and the path, for the export."""
-        if not self.scanner or self.settings.params(ROADS).when == "never":
+        if not self.scanner or self.settings.params(ROADS).when == "never" or not self.runs(ROADS):
             return self.scanner
         ground = {"cloud": self.at(SPLIT, "terrain"), "textured": textured["terrain"]}
-        self.add(ROADS, ground | self.scanner, **self.cell)
-        return self.scanner | {"roads": self.at(ROADS, "geojson"), "roads_seen": self.at(ROADS, "seen")}
+        origin = self.settings.params(EXPORT).world_origin
+        self.add(ROADS, ground | self.scanner, name=self.tile.name, world_origin=origin, **self.cell)
+        outputs = {"roads": "geojson", "roads_seen": "seen", "opendrive": "opendrive"}
+        return self.scanner | {name: self.at(ROADS, output) for name, output in outputs.items()}
 
     def results(
         self, surfaces: Sources, textured: Sources, seen: Sources, lists: Sources, made: Mapping[str, Sources]

@@ -11,6 +11,7 @@ import numpy as np
 from scan2sim.pipeline import render
 from scan2sim.pipeline.io.scene import Scene
 from scan2sim.pipeline.io.start import courses
+from scan2sim.pipeline.io.trajectory import replacing
 from scan2sim.pipeline.io.video import Encoder
 from scan2sim.pipeline.step import Report
 from scan2sim.pipeline.types import F64, Mesh
@@ -33,7 +34,7 @@ SAMPLES = 2
 
 
 def film(scene: Scene, file: Path, seconds: float, width: int, report: Report) -> None:
-    """Render a flight and write it as MP4 (H.264).
+    """Render a flight and write it as MP4 (H.264), whole or not at all.
 
     Args:
         scene: the world.
@@ -52,7 +53,7 @@ def film(scene: Scene, file: Path, seconds: float, width: int, report: Report) -
     camera = render.pinhole(*size)
     world = render.Renderer([placed(tile.folder / group, tile.offset) for tile in scene.tiles for group in tile.groups])
     poses = flight(scene, round(seconds * FPS))
-    with Encoder(file, size, FPS, preset="medium", crf="20") as encoder:
+    with replacing(file) as fresh, Encoder(fresh, size, FPS, preset="medium", crf="20") as encoder:
         for i, pose in enumerate(poses):
             report(i / len(poses), f"{i / FPS:.1f} s")
             picture = world.view(camera, pose, samples=SAMPLES).rgb

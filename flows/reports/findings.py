@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from scan2sim.pipeline.classes import SURFACES
+from scan2sim.pipeline.errors import ScanError
 from scan2sim.pipeline.store import Manifest
 
 Level = Literal["unusable", "poor", "note"]
@@ -47,13 +48,25 @@ class Finding:
     weight: float = 0.0
 
 
-def findings(done: Mapping[str, Manifest]) -> list[Finding]:
-    """All findings of a run, worst first; those of a level and weight in the order of the steps."""
+def findings(done: Mapping[str, Manifest], failed: Mapping[str, ScanError] | None = None) -> list[Finding]:
+    """All findings of a run, worst first; those of a level and weight in the order of the steps.
+
+    Args:
+        done: results by node.
+        failed: errors of side products, by name.
+    """
     facts = {node: manifest.facts for node, manifest in done.items()}
     checks = (_cameras, _held_out, _unseen, _remains, _moved, _disagreeing)
     found = [one for check in checks for one in check(facts)]
+    found += [Finding("poor", name, without(name, error)) for name, error in (failed or {}).items()]
     found += [Finding("note", node, text) for node, manifest in done.items() for text in manifest.warnings]
     return sorted(found, key=lambda one: (LEVELS.index(one.level), -one.weight))
+
+
+def without(name: str, error: ScanError) -> str:
+    """A sentence on a side product that failed: the world is made without it."""
+    cause = error.cause if name.endswith(error.where) else f"{error.where}: {error.cause}"
+    return f"failed, and the world is made without it: {cause}. {error.remedy}"
 
 
 Facts = Mapping[str, Mapping[str, Any]]

@@ -15,8 +15,11 @@ from scan2sim.flows.engine.planning import Planned
 from scan2sim.flows.recipes.settings import Settings
 from scan2sim.flows.reports.findings import findings
 from scan2sim.flows.reports.publish import publish, published, to_read
+from scan2sim.flows.reports.side_products import SideProducts
+from scan2sim.flows.reports.survey import DATA as SURVEY_DATA
+from scan2sim.flows.reports.survey import PAGE as SURVEY_PAGE
 from scan2sim.flows.reports.survey import TileState, write_survey_report
-from scan2sim.flows.reports.tile import figures, write_report
+from scan2sim.flows.reports.tile import DATA, PAGE, failed_before, figures, write_report
 from scan2sim.pipeline.cells import outline
 from scan2sim.pipeline.errors import ScanError
 from scan2sim.pipeline.io import clouds, geotiff, stac, worlds
@@ -53,52 +56,84 @@ class Made:
 
 
 def finish(
-    survey: Survey, made: Sequence[Made], store: Store, out: Path, settings: Settings, digests: Digests, warn: Warn
-) -> Path:
-    """Write all that users look at below `out`; returns the survey's page.
+    survey: Survey,
+    made: Sequence[Made],
+    store: Store,
+    out: Path,
+    settings: Settings,
+    digests: Digests,
+    side: SideProducts,
+    warn: Warn,
+) -> Path | None:
+    """Write all that users look at below `out`; returns the survey's page, None if it failed.
+
+    Args:
+        survey: that was made.
+        made: its tiles.
+        store: that keeps their results.
+        out: the survey's folder.
+        settings, digests: of the run.
+        side: records the side products that fail: reports, roads of all tiles, the catalogue.
+        warn: gets warnings of files that were edited.
 
     Raises:
         ScanError: see `pipeline.errors`; what was there stays.
     """
     whole = [one for one in made if one.done is not None]
     for one in whole:
-        _finish_tile(one, store.within(one.name), out / TILES / one.name, settings, warn)
+        _finish_tile(one, store.within(one.name), out / TILES / one.name, settings, side, warn)
     if whole:
-        _together(survey, whole, out, digests, warn)
-    return write_survey_report(out, survey.name, [_state(one, out) for one in made])
+        _together(survey, whole, out, digests, side, warn)
+    with side.attempt("report", out / SURVEY_PAGE, out / SURVEY_DATA):
+        return write_survey_report(out, survey.name, [_state(one, out, side) for one in made], failed=side.of_tile(""))
+    return None
 
 
-def _finish_tile(one: Made, store: Store, out: Path, settings: Settings, warn: Warn) -> None:
+def _finish_tile(one: Made, store: Store, out: Path, settings: Settings, side: SideProducts, warn: Warn) -> None:
     """A tile's folder, as `scan2sim run` leaves it; what is no longer of use is removed from the store."""
     assert one.tile is not None and one.done is not None
     planned, done = list(one.planned), dict(one.done)
     keys = {item.node.id.name: item.key for item in planned}
     out.mkdir(parents=True, exist_ok=True)
-    if not (one.kept and is_finished(store, planned, out)):
+    failed = side.of_tile(one.name)
+    if not (one.kept and is_finished(store, planned, out) and failed_before(out) == failed.keys()):
         for node in keys.keys() & to_read(store, planned, out):
             store.read(node, keys[node])
         for warning in publish(store, planned, done, out, one.tile, settings):
             warn(warning)
         seconds = sum(done[item.node.id.name].seconds for item in planned if item.reason is not None)
-        shown = store.folder("pictures", keys["pictures"]) / done["pictures"].files["pictures"] / "hero.jpg"
-        if shown.is_file():
-            shutil.copyfile(shown, out / PICTURE)
-        write_report(one.tile, planned, done, store, out, seconds=seconds)
+        (out / PICTURE).unlink(missing_ok=True)
+        with side.attempt(f"{one.name}/report", out / PAGE, out / DATA):
+            if "pictures" in done:
+                album = store.folder("pictures", keys["pictures"]) / done["pictures"].files["pictures"]
+                shutil.copyfile(album / "hero.jpg", out / PICTURE)
+            write_report(one.tile, planned, done, store, out, seconds=seconds, failed=failed)
     store.sweep(keys)
 
 
 def is_finished(store: Store, planned: Sequence[Planned], out: Path) -> bool:
     """Whether a tile's folder shows its kept results already."""
-    return (out / "report.json").is_file() and (out / "report.html").is_file() and published(store, planned, out)
+    return (out / DATA).is_file() and (out / PAGE).is_file() and published(store, planned, out)
 
 
-def _together(survey: Survey, done: Sequence[Made], out: Path, digests: Digests, warn: Warn) -> None:
-    """The world of all tiles, the STAC catalogue, the virtual point cloud and rasters."""
-    tiles, items = [], []
+def _together(
+    survey: Survey, done: Sequence[Made], out: Path, digests: Digests, side: SideProducts, warn: Warn
+) -> None:
+    """The world of all tiles, their roads, the STAC catalogue, the virtual point cloud and rasters."""
+    tiles = [worlds.TileWorld(one.name, out / TILES / one.name / "world", one.tile.frame) for one in done if one.tile]
+    worlds.assemble(out, survey.name, tiles, warn=warn)
+    with side.attempt("roads"):
+        worlds.add_roads(out)
+    with side.attempt("catalogue"):
+        _catalogue(survey, done, out, digests)
+
+
+def _catalogue(survey: Survey, done: Sequence[Made], out: Path, digests: Digests) -> None:
+    """The STAC catalogue, the virtual point cloud and rasters of all tiles."""
+    items = []
     for one in done:
         assert one.tile is not None
         place = out / TILES / one.name
-        tiles.append(worlds.TileWorld(one.name, place / "world", one.tile.frame))
         sources = tuple(stac.Cloud(path, clouds.read_header(path), digests(path)) for path in one.tile.clouds)
         times = one.tile.trajectory.times if one.tile.trajectory is not None else None
         scanned = datetime.fromtimestamp(max(path.stat().st_mtime for path in one.tile.clouds), UTC)
@@ -107,11 +142,10 @@ def _together(survey: Survey, done: Sequence[Made], out: Path, digests: Digests,
                 one.name, one.tile.frame, sources, scanned,
                 None if times is None or not np.isfinite(times).all() else (float(times[0]), float(times[-1])),
                 _there(place / "world" / f"{one.name}.sdf"), _there(place / "world" / f"{one.name}.glb"),
-                _there(place / "report.html"), _there(place / PICTURE), geotiff.find(place / "rasters", one.name),
+                _there(place / PAGE), _there(place / PICTURE), geotiff.find(place / "rasters", one.name),
             )
         )  # fmt: skip
-    worlds.assemble(out, survey.name, tiles, warn=warn)
-    stac.write(out, survey.name, f"{len(tiles)} tiles of {survey.name}, made by scan2sim", items)
+    stac.write(out, survey.name, f"{len(items)} tiles of {survey.name}, made by scan2sim", items)
     stac.write_vpc(out / f"{survey.name}.vpc", items)
     for kind in geotiff.KINDS:
         whole = out / f"{survey.name}_{kind}.vrt"
@@ -124,20 +158,20 @@ def _there(path: Path) -> Path | None:
     return path if path.is_file() else None
 
 
-def _state(one: Made, out: Path) -> TileState:
+def _state(one: Made, out: Path, side: SideProducts) -> TileState:
     """What the survey's page tells of a tile."""
     cell = one.tile.cell if one.tile else None
     ring = np.zeros((0, 2)) if one.tile is None or cell is None else outline(cell, *_bounds(one.tile))
-    done = one.done or {}
+    done, place = one.done or {}, out / TILES / one.name
     return TileState(
         name=one.name,
         outline=ring,
         state="failed" if one.error else ("done" if one.anew else "kept"),
         reason=str(one.error) if one.error else None,
         figures=_figures(one.tile, done) if one.tile and done else {},
-        report=f"{TILES}/{one.name}/report.html" if done else None,
-        thumbnail=_there(out / TILES / one.name / PICTURE),
-        warnings=[f"{one.about}: {one.text}" for one in findings(done)],
+        report=f"{TILES}/{one.name}/{PAGE}" if done and (place / PAGE).is_file() else None,
+        thumbnail=_there(place / PICTURE),
+        warnings=[f"{one.about}: {one.text}" for one in findings(done, side.of_tile(one.name))],
         borders=_borders(done),
     )
 

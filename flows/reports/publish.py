@@ -45,9 +45,10 @@ def publish(
         if not _current(source, place, keys[node]):
             _publish(source, place, keys[node])
         changed += edited(source, place)
-    if "rasters" not in done and (out / "rasters" / STAMP).is_file():  # of an earlier world
-        shutil.rmtree(out / "rasters")
-    if done["preview"].files:
+    for node, (_, name) in PLACES.items():
+        if not (node in done and done[node].files) and (out / name / STAMP).is_file():  # of an earlier world
+            shutil.rmtree(out / name)
+    if "preview" in done and done["preview"].files:
         shutil.copyfile(PAGES / THREE, out / SCRIPTS / THREE)
     solved = store.folder("exposure", keys["exposure"]) / done["exposure"].files["exposures"]
     shutil.copyfile(solved, out / "exposure.json")  # for the next tile's `exposure.prior`

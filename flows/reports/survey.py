@@ -20,7 +20,7 @@ from scan2sim.flows.engine.versions import versions
 from scan2sim.flows.reports import gazebo
 from scan2sim.flows.reports.tile import write_whole
 from scan2sim.pipeline.classes import SURFACES
-from scan2sim.pipeline.errors import from_os_error
+from scan2sim.pipeline.errors import ScanError, from_os_error
 from scan2sim.pipeline.types import F64
 
 State = Literal["done", "kept", "failed", "waiting"]
@@ -69,20 +69,30 @@ class TileState:
     borders: Sequence[Mapping[str, Any]] = ()
 
 
-def write_survey_report(out: Path, name: str, tiles: Sequence[TileState], *, path: npt.ArrayLike | None = None) -> Path:
+def write_survey_report(
+    out: Path,
+    name: str,
+    tiles: Sequence[TileState],
+    *,
+    path: npt.ArrayLike | None = None,
+    failed: Mapping[str, ScanError] | None = None,
+) -> Path:
     """Write both reports into `out`, each whole or not at all; returns the page's path.
 
     Args:
-        tiles: in the order in which they are told.
+        out: the survey's folder.
+        name: of the survey.
+        tiles: in the order in which they are listed.
         path: (N, 2) or (N, 3) world metres, along the drive, or None.
+        failed: errors of the survey's own side products, by name.
 
     Raises:
         SpaceError: the disk is full or can't be written to.
     """
     drive = np.zeros((0, 2)) if path is None else np.asarray(path, np.float64)[:, :2]
-    body = summary(name, tiles, drive)
     try:
         out.mkdir(parents=True, exist_ok=True)
+        body = summary(name, tiles, drive, failed)
         write_whole(out / DATA, json.dumps(body, indent=1))
         world = out / "world" / f"{name}.sdf"
         write_whole(out / PAGE, _render(body, tiles, drive, gazebo.commands(world)))
@@ -91,7 +101,9 @@ def write_survey_report(out: Path, name: str, tiles: Sequence[TileState], *, pat
     return out / PAGE
 
 
-def summary(name: str, tiles: Sequence[TileState], path: F64) -> dict[str, Any]:
+def summary(
+    name: str, tiles: Sequence[TileState], path: F64, failed: Mapping[str, ScanError] | None = None
+) -> dict[str, Any]:
     """All figures as one JSON-able table; keys as docs/formats.md names them."""
     return {
         "survey": name,
@@ -110,6 +122,7 @@ def summary(name: str, tiles: Sequence[TileState], path: F64) -> dict[str, Any]:
             for tile in tiles
         },
         "borders": _borders(tiles),
+        "failed": {name: {"cause": error.cause, "remedy": error.remedy} for name, error in (failed or {}).items()},
     }
 
 
@@ -121,6 +134,9 @@ def overview(out: Path) -> str:
     totals = body["totals"]
     lines = [f"**{body['survey']}**: " + ", ".join(f"{totals[state]} {state}" for state in STATES)]
     lines += [f"- {name}: {tile['reason']}" for name, tile in body["tiles"].items() if tile["state"] == "failed"]
+    lines += [
+        f"- {name}: failed, and the world is made without it: {one['cause']}" for name, one in body["failed"].items()
+    ]
     return "\n".join(lines)
 
 

@@ -15,11 +15,13 @@ from scan2sim.flows.engine.versions import versions
 from scan2sim.flows.reports import gazebo
 from scan2sim.flows.reports.findings import findings
 from scan2sim.pipeline.classes import SURFACES
+from scan2sim.pipeline.errors import ScanError
 from scan2sim.pipeline.io import crs
 from scan2sim.pipeline.store import Manifest, Store
 from scan2sim.pipeline.types import Tile
 
 TEMPLATE = "tile.html.j2"
+PAGE, DATA = "report.html", "report.json"
 PAGES = Path(__file__).parent / "pages"
 SCRIPTS = "report_files"
 """Folder beside the page: what it loads to show the world."""
@@ -29,11 +31,27 @@ Picture = dict[str, Any]
 
 
 def write_report(
-    tile: Tile, planned: Sequence[Planned], done: Mapping[str, Manifest], store: Store, out: Path, *, seconds: float
+    tile: Tile,
+    planned: Sequence[Planned],
+    done: Mapping[str, Manifest],
+    store: Store,
+    out: Path,
+    *,
+    seconds: float,
+    failed: Mapping[str, ScanError] | None = None,
 ) -> Path:
-    """Write both reports into `out`; returns the page's path."""
-    body = figures(tile, done) | {"seconds_this_run": round(seconds, 2)}
-    write_whole(out / "report.json", json.dumps(body, indent=1))
+    """Write both reports into `out`; returns the page's path.
+
+    Args:
+        tile: that was made.
+        planned, done: its nodes, and results by node.
+        store: that keeps them.
+        out: the run's folder.
+        seconds: that this run took.
+        failed: errors of side products, by name.
+    """
+    body = figures(tile, done, failed) | {"seconds_this_run": round(seconds, 2)}
+    write_whole(out / DATA, json.dumps(body, indent=1))
     keys = {p.node.id.name: p.key for p in planned}
     pictures: list[Picture] = []
     for node, name in (("pictures", "pictures"), ("score", "error")):
@@ -42,17 +60,22 @@ def write_report(
             entries = json.loads((folder / "index.json").read_text(encoding="utf-8"))
             shown = representative(entries, done[node].facts["photos"]) if name == "error" else entries
             pictures += [_with_pixels(entry, folder) for entry in shown]
-    page = out / "report.html"
+    page = out / PAGE
     view = done["preview"].facts if "preview" in done and done["preview"].files else None
     write_whole(page, _render(body, pictures, view, gazebo.commands(out / "world" / f"{tile.name}.sdf")))
     return page
 
 
-def figures(tile: Tile, done: Mapping[str, Manifest]) -> dict[str, Any]:
+def failed_before(out: Path) -> set[str]:
+    """Names of the side products that had failed when the report in `out` was written."""
+    return set(json.loads((out / DATA).read_text(encoding="utf-8")).get("failed", {}))
+
+
+def figures(tile: Tile, done: Mapping[str, Manifest], failed: Mapping[str, ScanError] | None = None) -> dict[str, Any]:
     """All figures of a run as one JSON-able table; keys as docs/formats.md names them."""
     facts = {node: manifest.facts for node, manifest in done.items()}
     geometry: dict[str, dict[str, float]] = {}
-    for group, values in facts["geometry"].items():
+    for group, values in facts.get("geometry", {}).items():
         for name, value in values.items():
             geometry.setdefault(name, {})[group] = value
     seen = {g: facts[f"texture.{g}"] for g in SURFACES if f"texture.{g}" in facts}
@@ -70,9 +93,10 @@ def figures(tile: Tile, done: Mapping[str, Manifest]) -> dict[str, Any]:
         "versions": versions(),
         "seconds": round(sum(m.seconds for m in done.values()), 2),
         "peak_mb": max(m.peak_mb for m in done.values()),
-        "findings": [{"level": one.level, "about": one.about, "text": one.text} for one in findings(done)],
+        "findings": [{"level": one.level, "about": one.about, "text": one.text} for one in findings(done, failed)],
+        "failed": {name: {"cause": error.cause, "remedy": error.remedy} for name, error in (failed or {}).items()},
         "geometry": geometry,
-        "texture": texture | facts["score"],
+        "texture": texture | facts.get("score", {}),
         "world": facts["export"],
         "steps": {
             node: {"seconds": m.seconds, "peak_mb": m.peak_mb, "facts": m.facts, "warnings": m.warnings}

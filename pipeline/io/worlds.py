@@ -19,14 +19,13 @@ import numpy as np
 
 from scan2sim.pipeline.errors import DataError, InputError, from_os_error
 from scan2sim.pipeline.io import crs, scene, sdf
-from scan2sim.pipeline.io.scenes import SceneParams, opendrive
-from scan2sim.pipeline.step import silent
+from scan2sim.pipeline.io.scenes import opendrive
 from scan2sim.pipeline.types import Frame
 
 EDITED = (".sdf", ".config", ".json", ".mtl", ".geojson", ".csv", ".xodr")
 """Suffixes of what users change by hand: copied, never linked."""
-STAMP = ".result"
-VERSION = 3
+STAMP, ROADS_STAMP = ".result", ".roads"
+VERSION = 4
 """Of what is written: another one makes worlds anew."""
 
 
@@ -67,9 +66,8 @@ def assemble(
 ) -> Path:
     """Put the worlds of all tiles into one, `out/world/`, unless it is there and nothing has changed.
 
-    Layout: `<name>.sdf`, `metadata.json`, `models/<tile>/` of every tile, and `scene/`, to export from; where lanes
-    are told, `<name>.xodr` and `<name>_roads.geojson`, of all tiles' roads as one. The world's origin is that of the
-    tile in the middle. An earlier world stays until the new one is complete.
+    Layout: `<name>.sdf`, `metadata.json`, `models/<tile>/` of every tile, and `scene/`, to export from. The world's
+    origin is that of the tile in the middle. An earlier world stays until the new one is complete.
 
     Args:
         name: of the world.
@@ -106,6 +104,26 @@ def assemble(
         for path in _edited(world):
             warn(f"{path} was changed since it was made, and stays so: remove {world} to have it made anew")
     return world / f"{name}.sdf"
+
+
+def add_roads(out: Path) -> None:
+    """Write all tiles' roads as one into the world in `out`, once: `<name>.xodr` and `<name>_roads.geojson`.
+
+    Without lanes neither is written.
+
+    Raises:
+        InputError: the world is incomplete.
+        SpaceError: the disk is full or can't be written to.
+    """
+    world = out / "world"
+    if (world / ROADS_STAMP).is_file():
+        return
+    try:
+        opendrive.write_roads(scene.read_scene(world), world)
+        (world / ROADS_STAMP).touch()
+        os.utime(world / STAMP)  # so that the roads don't count as users' edits
+    except OSError as error:
+        raise from_os_error(error, world) from None
 
 
 def link(source: str, target: str) -> None:
@@ -205,9 +223,6 @@ def _write(folder: Path, name: str, tiles: Sequence[TileWorld], buffer: float, p
         for kept in (Path("models") / tile.name, Path(scene.FOLDER) / tile.name):
             shutil.copytree(tile.world / kept, folder / kept, copy_function=link)
     scene.describe(folder, name, Frame(first.crs, origin, first.unit), [tile.name for tile in tiles])
-    whole = scene.read_scene(folder)
-    if opendrive.has_lanes(whole):
-        opendrive.write(whole, folder, SceneParams(), silent)
     sdf.write_levels(folder / f"{name}.sdf", name, place, placed, buffer, performer)
     about = {
         "name": name,

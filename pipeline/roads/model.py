@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
-from scan2sim.pipeline.roads import clothoid, driven, kerbs, paint, profile
+from scan2sim.pipeline.roads import clothoid, driven, kerbs, observed, paint, profile
 from scan2sim.pipeline.roads.clothoid import Clothoids
 from scan2sim.pipeline.roads.observed import BEYOND, Observed
 from scan2sim.pipeline.roads.profile import Profile
@@ -111,8 +112,25 @@ class Road:
     keeps_right: bool = True
 
 
-def drawn(seen: Observed) -> Road | None:
-    """The road along a way; None where nothing is seen of it that goes on for `SHORTEST` metres."""
+Warn = Callable[[str], None]
+
+
+def unheard(warning: str) -> None:
+    """A `Warn` that ignores warnings."""
+
+
+def network(ways: Sequence[Observed], origin: Sequence[float], warn: Warn = unheard) -> list[Road]:
+    """Roads along all ways (world metres), continued over borders of tiles; metres from `origin` (3,)."""
+    joined = observed.joined([way.moved(-np.asarray(origin)) for way in ways])
+    return [road for way in joined if (road := drawn(way, warn))]
+
+
+def drawn(seen: Observed, warn: Warn = unheard) -> Road | None:
+    """The road along a way; None where nothing is seen of it over `SHORTEST` metres.
+
+    A road whose lines are seen, but no point of its surface beside the reference line, has no heights: it is left out,
+    with a warning.
+    """
     places = driven.extended(seen.way, BEYOND)
     base = clothoid.fit(clothoid.through(places), places)
     seen = _with_stones(base, seen)
@@ -134,7 +152,11 @@ def drawn(seen: Observed) -> Road | None:
         return None
     line = line.part(first, last)
     markings, left, right = _lines(line, seen)
-    height, falls = _surface(line, seen.ground)
+    surface = _surface(line, seen.ground)
+    if surface is None:
+        warn(f"a road of {line.length:.0f} m is left out: no point of its surface is within {NEAR:g} m of its line")
+        return None
+    height, falls = surface
     _, t = line.locate(seen.way)
     return Road(line, reference, height, falls, tuple(markings), left, right, bool(np.median(t) < 0.5))
 
@@ -309,13 +331,15 @@ def _between(line: Clothoids, left: Line, right: Line) -> F64:
     return line.places(s[both], ((left.offset.at(s) + right.offset.at(s)) / 2)[both])
 
 
-def _surface(line: Clothoids, ground: F64) -> tuple[Profile, tuple[Profile, Profile]]:
-    """The reference line's height, and the slopes to the left and to the right."""
+def _surface(line: Clothoids, ground: F64) -> tuple[Profile, tuple[Profile, Profile]] | None:
+    """The reference line's height, and the slopes to the left and to the right; None without ground beside the line."""
     knots = np.linspace(0, line.length, max(1, round(line.length / KNOT)) + 1)
     s, t = line.locate(ground)
     held = (s > -1) & (s < line.length + 1)
     s, t, z = s[held], t[held], ground[held, 2]
     near = np.abs(t) < NEAR
+    if not near.any():
+        return None
     factors = np.column_stack([np.ones(len(t)), t.clip(0, None), (-t).clip(0, None)])[near]
     height, left, right = profile.fit_sum(knots, s[near], factors, z[near], LEVEL, [BEND, FALL, FALL])
     return height, (left, right)

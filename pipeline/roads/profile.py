@@ -71,9 +71,15 @@ def fit(knots: F64, s: F64, values: F64, noise: float, bend: float) -> Profile:
 
 
 def fit_sum(knots: F64, s: F64, factors: F64, values: F64, noise: float, bends: Sequence[float]) -> list[Profile]:
-    """Several curves at once: values are their sum, each times its factor (N, C); else as `fit`."""
+    """Several curves at once: values are their sum, each times its factor (N, C); else as `fit`.
+
+    Raises:
+        ValueError: there are no values: nothing determines a curve.
+    """
     from scipy.interpolate import BSpline, PPoly
 
+    if not len(values):
+        raise ValueError("a profile needs at least one value")
     step = knots[1] - knots[0]
     padded = np.concatenate([knots[0] - step * np.arange(3, 0, -1), knots, knots[-1] + step * np.arange(1, 4)])
     basis = BSpline.design_matrix(s.clip(knots[0], knots[-1]), padded, 3).toarray()

@@ -32,7 +32,7 @@ class CollisionParams(Params):
 
     Attributes:
         triangles: at most; physics engines stay interactive up to about 50 thousand.
-        vegetation: whether plants are solid too; trunks always are.
+        vegetation: whether plants are solid too; trunks always are, and plants where nothing else is.
         seed: of the points at which the deviation is measured.
         place: the tile's (x, y), world metres, where it meets others: its borders with them stay as they are; set by
             the recipe.
@@ -54,7 +54,7 @@ def collision(inputs: Inputs, params: CollisionParams, out: Path, report: Report
     `vegetation`, if asked) share what is left of the triangles. Of open edges, those on borders with other tiles
     stay as they are, vertex for vertex; all others are thinned. Street furniture stays as it is, so that its poles and
     trunks can be told apart as cylinders (`pipeline.cylinders`); where it would take more than half the budget, it is
-    simplified as well.
+    simplified as well. Where neither ground nor building has a face, plants are solid, and a warning says so.
 
     File: `mesh`, with a class code for every face: of the ground, that of the points around it. Facts in metres:
     `ground_m`, heights between the cloud's points and the ground; `deviation_m`, from what is seen to what is touched.
@@ -73,11 +73,19 @@ def collision(inputs: Inputs, params: CollisionParams, out: Path, report: Report
     terrain = meshes.pop("terrain", _joined(frame, []))
     parted = {group: _parted(mesh, SOLID[group]) for group, mesh in meshes.items()}
     things = _joined(frame, [things for _, things in parted.values()])
-    surfaces = [surface for group, (surface, _) in parted.items() if group != "vegetation" or params.vegetation]
+    hard = [surface for group, (surface, _) in parted.items() if group != "vegetation"]
+    plants_alone = not any(map(len, (terrain, things, *hard)))
+    solid = params.vegetation or plants_alone
+    surfaces = [surface for group, (surface, _) in parted.items() if group != "vegetation" or solid]
     if len(things) > params.triangles / 2:
         surfaces, things = [*surfaces, things], _joined(frame, [])
     whole = _joined(frame, [terrain, *surfaces, things])
-    _check(whole, params)
+    if not len(whole):
+        raise DataError(
+            "collision",
+            "there is no surface to collide with (terrain, building and vegetation are empty)",
+            "Check the cloud's classes, and voxel, poisson, trim, islands where set",
+        )
     report(0.1, f"{len(whole):,} triangles")
     ground = _ground(terrain, points, params, cell)
     report(0.5, "walls")
@@ -101,21 +109,12 @@ def collision(inputs: Inputs, params: CollisionParams, out: Path, report: Report
     }
     if points is not None and len(ground):
         facts["ground_m"] = _off(ground, points.xyz)
-    over = len(small) > params.triangles
-    warnings = (
-        [f"{len(small):,} triangles where {params.triangles:,} are wanted: the borders need them"] if over else []
-    )
+    warnings = []
+    if plants_alone and not params.vegetation:
+        warnings.append("terrain and building are empty: plants are solid, as there is nothing else to collide with")
+    if len(small) > params.triangles:
+        warnings.append(f"{len(small):,} triangles where {params.triangles:,} are wanted: the borders need them")
     return Done({"mesh": out / "collision.npz"}, facts, warnings)
-
-
-def _check(whole: Mesh, params: CollisionParams) -> None:
-    if not len(whole):
-        empty = "terrain and building" + (" and vegetation" if params.vegetation else "")
-        raise DataError(
-            "collision",
-            f"there is no surface to collide with ({empty} are empty)",
-            "Check the cloud's classes, and voxel, poisson, trim, islands where set, or set collision.vegetation=true",
-        )
 
 
 def _ground_points(inputs: Inputs, seed: int) -> PointCloud | None:
@@ -185,7 +184,7 @@ def _classes(ground: Mesh, points: PointCloud | None) -> U8:
     """(F,) class codes: what most of the points nearest to a triangle's middle are."""
     from scipy.spatial import cKDTree
 
-    if points is None or points.classification is None or not len(points):
+    if points is None or points.classification is None or not len(points) or not len(ground):
         return np.full(len(ground), CODE["terrain"], np.uint8)
     k = min(VOTERS, len(points))
     _, near = cKDTree(points.xyz).query(ground.corners.mean(axis=1), k=k, workers=-1)

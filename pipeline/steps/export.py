@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Annotated
 
@@ -13,7 +14,7 @@ from scan2sim.pipeline.extras import need
 from scan2sim.pipeline.io import scenes
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.scene import PATH, ROADS, keep
-from scan2sim.pipeline.io.scenes import SceneParams, opendrive
+from scan2sim.pipeline.io.scenes import SceneParams
 from scan2sim.pipeline.ranges import Coordinate, Name
 from scan2sim.pipeline.step import Done, Inputs, Report, Step
 from scan2sim.pipeline.types import I32
@@ -58,9 +59,9 @@ def export(inputs: Inputs, params: ExportParams, out: Path, report: Report) -> D
 
     Below `world/` is what `pipeline.io.scenes` writes of each of the formats, `metadata.json`, the lists that are
     given, and `scene/`, from which other formats can be written later (`pipeline.io.scene`). Meshes are in the tile's
-    local metres; its place is in poses, nodes and the georeference alone. OpenDRIVE is written wherever lanes are told
-    (`roads_seen`, which the step `roads` made). With `views` and `choice.*` the scene tells of each face which photo
-    gives its detail.
+    local metres; its place is in poses, nodes and the georeference alone. Files of the folder `opendrive` (of the step
+    `roads`) are placed beside the formats. With `views` and `choice.*` the scene records for each face the photo
+    that gives its detail.
 
     Raises:
         DataError: no group has a face.
@@ -77,8 +78,9 @@ def export(inputs: Inputs, params: ExportParams, out: Path, report: Report) -> D
     scene = keep(
         world, params.name, surfaces, inputs["collision"], lists, params.friction, params.world_origin, views, photos
     )
-    formats = dict.fromkeys([*params.formats, *(["opendrive"] if opendrive.has_lanes(scene) else [])])
-    scenes.write(scene, list(formats), world, params, report)
+    scenes.write(scene, params.formats, world, params, report)
+    for file in inputs["opendrive"].iterdir() if "opendrive" in inputs else ():
+        shutil.copyfile(file, world / file.name)
     tile = scene.tiles[0]
     facts = {
         "triangles": {group: figures["triangles"] for group, figures in tile.groups.items()},
@@ -107,4 +109,4 @@ def can_export(params: ExportParams) -> None:
         need("export.rasters", "rasterio")
 
 
-EXPORT = Step("export", 5, export, ExportParams, check=can_export)
+EXPORT = Step("export", 6, export, ExportParams, check=can_export)

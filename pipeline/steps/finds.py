@@ -85,4 +85,4 @@ def heights(ground: F32, xyz: F32) -> F32:
     return (xyz[:, 2] - smooth[raster.at(xyz)]).astype(np.float32)
 
 
-FINDS = Step("finds", 1, finds, FindsParams)
+FINDS = Step("finds", 1, finds, FindsParams, side_product=True)

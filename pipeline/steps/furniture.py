@@ -159,4 +159,4 @@ def of_plate(plate: Plate) -> dict[str, Any]:
     return {"heading_deg": round(heading, 1), "shape": plate.shape, **size}
 
 
-FURNITURE = Step("furniture", 4, furniture, FurnitureParams)
+FURNITURE = Step("furniture", 4, furniture, FurnitureParams, side_product=True)

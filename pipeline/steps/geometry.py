@@ -137,4 +137,4 @@ def spread(mesh: Mesh, count: int, seed: int = 0) -> F32:
     return ((1 - u) * a + u * (1 - v) * b + u * v * c).astype(np.float32)
 
 
-GEOMETRY = Step("geometry", 4, geometry, GeometryParams)
+GEOMETRY = Step("geometry", 4, geometry, GeometryParams, side_product=True)

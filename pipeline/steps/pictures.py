@@ -285,4 +285,4 @@ def _compared(held: Sequence[bool], filled: Sequence[float], count: int) -> list
     return sorted(range(len(held)), key=lambda i: (not held[i], -filled[i]))[:count]
 
 
-PICTURES = Step("pictures", 4, pictures, PicturesParams, memory=(1.3, 3))
+PICTURES = Step("pictures", 4, pictures, PicturesParams, side_product=True, memory=(1.3, 3))

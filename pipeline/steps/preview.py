@@ -97,4 +97,4 @@ def _eye(pose: F64, low: F64) -> list[list[float]]:
     return [eye.round(3).tolist(), (eye + ahead * reach).round(3).tolist()]
 
 
-PREVIEW = Step("preview", 3, preview, PreviewParams)
+PREVIEW = Step("preview", 3, preview, PreviewParams, side_product=True)

@@ -11,9 +11,9 @@ from pydantic import Field
 
 from scan2sim.pipeline.cells import Cell
 from scan2sim.pipeline.classes import CODE
-from scan2sim.pipeline.ranges import Place
+from scan2sim.pipeline.ranges import Coordinate, Name, Place
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.types import F64, Bools, PointCloud, Trajectory
+from scan2sim.pipeline.types import F64, Bools, Frame, PointCloud, Trajectory
 
 DRIVEN_ON = ("road", "bridge_deck")
 UNDER = 3.0
@@ -25,12 +25,17 @@ class RoadsParams(Params):
 
     Attributes:
         when: "auto": where the tile has a scanner's path, or photos from the ground; "never".
+        name: of the tile; set by the recipe.
+        world_origin: metres in the CRS, of the OpenDRIVE file; default: the tile's own origin; set by the recipe
+            (`export.world_origin`).
         seed: the tile's (x, y), world metres, where it meets others: what is beyond its cell is theirs; set by the
             recipe.
         neighbours: names of tiles whose cells touch to their seeds, world metres; set by the recipe.
     """
 
     when: Literal["auto", "never"] = "auto"
+    name: Name = "tile"
+    world_origin: tuple[Coordinate, Coordinate, Coordinate] | None = None
     seed: Place | None = None
     neighbours: dict[str, Place] = Field(default_factory=dict)
 
@@ -39,9 +44,11 @@ def roads(inputs: Inputs, params: RoadsParams, out: Path, report: Report) -> Don
     """Tell of the roads that `path` was driven on, by the classified points of the ground (`cloud`) and its texture.
 
     Files: `geojson`, lines of the roads; `seen`, .npz of what was seen of paint, edges and heights, world metres, of
-    which OpenDRIVE is drawn, one road over all tiles of a survey.
+    which OpenDRIVE is drawn, one road over all tiles of a survey; `opendrive`, a folder with `<name>.xodr`, empty where
+    no road has lanes.
     """
     from scan2sim.pipeline import render
+    from scan2sim.pipeline.io import opendrive
     from scan2sim.pipeline.roads import driven, listed, model, observed
 
     cloud, path = PointCloud.load(inputs["cloud"]), Trajectory.load(inputs["path"])
@@ -60,12 +67,17 @@ def roads(inputs: Inputs, params: RoadsParams, out: Path, report: Report) -> Don
         one = observed.observe(way, xyz, on, renderer)
         parts = (np.column_stack([part[:, :2], np.zeros(len(part))]) for part in (one.paint, one.edge, one.ground))
         seen.append(one.kept(*(own(part + origin) for part in parts)))
-    drawn = [road for road in map(model.drawn, seen) if road]
+    warnings: list[str] = []
+    drawn = [road for one in seen if (road := model.drawn(one, warnings.append))]
     listed.write(out / "roads.geojson", cloud.frame, drawn)
     observed.save(out / "seen.npz", seen, cloud.frame)
+    (out / "opendrive").mkdir()
+    world = Frame(cloud.frame.crs, params.world_origin or cloud.frame.origin, cloud.frame.unit)
+    network = model.network([one.moved(origin) for one in seen], world.origin)
+    opendrive.write(out / "opendrive" / f"{params.name}.xodr", params.name, world, network)
     facts = {"points": int(on.sum()), "driven": len(ways), "roads": [listed.facts(road) for road in drawn]}
-    files = {"geojson": out / "roads.geojson", "seen": out / "seen.npz"}
-    return Done(files, facts | _why_none(ways, on, drawn))
+    files = {"geojson": out / "roads.geojson", "seen": out / "seen.npz", "opendrive": out / "opendrive"}
+    return Done(files, facts | _why_none(ways, on, [*drawn, *warnings]), warnings)
 
 
 def _own(params: RoadsParams) -> Callable[[F64], Bools]:
@@ -97,4 +109,4 @@ def _why_none(ways: Sequence[F64], on: Bools, drawn: Sequence[object]) -> dict[s
     return {"none": "no line of a road is seen" if ways else "the path runs on no road"}
 
 
-ROADS = Step("roads", 2, roads, RoadsParams)
+ROADS = Step("roads", 3, roads, RoadsParams, side_product=True)

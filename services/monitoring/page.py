@@ -211,8 +211,6 @@ def serve(params: PageParams, told: Callable[[str], None]) -> None:
     def listening(address: str) -> None:
         topics = f"{params.topic} and {params.events_topic}"
         told(f"{address} shows {topics} of {params.kafka_bootstrap_servers}; Ctrl-C ends it")
-        if params.is_open():
-            told("whoever reaches this machine can read it: --token FILE asks for one")
 
     sources.start()
     try:

@@ -115,11 +115,11 @@ class Lines:
 
 
 class Prometheus:
-    """The last record's figures at http://HOST:PORT/metrics."""
+    """The last record's figures at http://127.0.0.1:PORT/metrics; it needs no token, so no other machine reaches it."""
 
     dropped: Mapping[str, int] = {}
 
-    def __init__(self, port: int, host: str = "127.0.0.1") -> None:
+    def __init__(self, port: int) -> None:
         extras.need("Prometheus", "prometheus_client")
         from prometheus_client import CollectorRegistry, Gauge, start_http_server
 
@@ -137,7 +137,7 @@ class Prometheus:
             )
         }
         self._cpu = Gauge("scan2sim_cpu_percent", "Load of the machine", ("node",), registry=registry)
-        self._server, self._thread = start_http_server(port, host, registry)
+        self._server, self._thread = start_http_server(port, "127.0.0.1", registry)
 
     @property
     def port(self) -> int:

@@ -1,4 +1,4 @@
-"""A Helm chart of a service: a Deployment, its variables, and a Service before it where it listens.
+"""A Helm chart of a service: a Deployment, its variables, a Secret with its token, a Service where it listens.
 
 Templates are JSON, which is YAML that needs no quoting, around what Helm puts in when a chart is installed.
 """
@@ -6,6 +6,7 @@ Templates are JSON, which is YAML that needs no quoting, around what Helm puts i
 from __future__ import annotations
 
 import json
+from pathlib import PurePosixPath
 from typing import Any
 
 from scan2sim.services.orchestration.description import Description
@@ -14,6 +15,8 @@ from scan2sim.services.qos.requirements import Requirements
 REPLICAS = "replicaCount"
 """The value that says how many there are."""
 NAME = "{{ .Release.Name }}"
+TOKEN = "{{ dig `data` `token` (randAlphaNum 32 | b64enc) (lookup `v1` `Secret` .Release.Namespace .Release.Name) }}"
+"""A random token, base64; that of the installed release where there is one, so that an upgrade keeps it."""
 
 
 def files(service: Description, needs: Requirements, version: str) -> dict[str, str]:
@@ -37,6 +40,13 @@ def files(service: Description, needs: Requirements, version: str) -> dict[str, 
             "kind": "Service",
             "metadata": {"name": NAME, "labels": labels},
             "spec": {"selector": labels, "ports": [{"name": "http", "port": service.port, "targetPort": "http"}]},
+        }
+    if service.token:
+        made["templates/token.yaml"] = {
+            "apiVersion": "v1",
+            "kind": "Secret",
+            "metadata": {"name": NAME, "labels": labels},
+            "data": {"token": TOKEN},
         }
     return {path: _text(content) for path, content in made.items()}
 
@@ -70,10 +80,15 @@ def _deployment(service: Description, labels: dict[str, str]) -> dict[str, Any]:
     if service.port and service.ready:
         asked = {"httpGet": {"path": service.ready, "port": "http"}}
         container |= {"readinessProbe": asked, "startupProbe": asked | {"failureThreshold": 60, "periodSeconds": 5}}
+    volumes = []
+    if service.token:
+        path = PurePosixPath(service.token)
+        container["volumeMounts"] = [{"name": "token", "mountPath": str(path.parent), "readOnly": True}]
+        volumes = [{"name": "token", "secret": {"secretName": NAME, "items": [{"key": "token", "path": path.name}]}}]
     changed = {"scan2sim/variables": "{{ toJson .Values.variables | sha256sum }}"}  # starts pods anew when they change
     pod = {
         "metadata": {"labels": labels, "annotations": changed},
-        "spec": {"hostNetwork": _put(".Values.hostNetwork"), "containers": [container]},
+        "spec": {"hostNetwork": _put(".Values.hostNetwork"), "containers": [container], "volumes": volumes},
     }
     return {
         "apiVersion": "apps/v1",

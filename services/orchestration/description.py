@@ -31,6 +31,7 @@ class Description(Params):
         command: in place of the image's entry point; arguments: behind it.
         port: that it serves on; None: it only asks others.
         ready: path on that port that says whether it can be asked.
+        token: file in its container with the token that its callers need; its chart generates one, as a Secret.
         requirements: whose needs it has, as `scan2sim qos show` prints them.
         needs: its needs, where no table has them.
         machine: image of a virtual machine that runs it, as the VIM knows it.
@@ -47,6 +48,7 @@ class Description(Params):
     arguments: tuple[str, ...] = ()
     port: int | None = Field(None, ge=1, le=65535)
     ready: str | None = Field(None, pattern=r"^/[\w./-]{0,200}$")
+    token: str | None = Field(None, pattern=r"^/[\w.-]+(/[\w.-]+)+$", max_length=200)
     requirements: str | None = None
     needs: Requirements | None = None
     machine: str = Field(pattern=r"^[\w.-]{1,100}$")

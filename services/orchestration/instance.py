@@ -7,8 +7,11 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any
+from typing import Any, TypeVar
 
+from pydantic import BaseModel, Field, TypeAdapter, ValidationError
+
+from scan2sim.pipeline.errors import StepError
 from scan2sim.services.orchestration.chart import REPLICAS
 from scan2sim.services.orchestration.sol006 import ASPECT, MEMBER, Kind
 
@@ -119,6 +122,22 @@ def scale(by: int) -> dict[str, Any]:
     return {"scaleType": "SCALE_VNF", "scaleVnfData": {"scaleVnfType": kind, "scaleByStepData": step}}
 
 
+class _Chart(BaseModel):
+    """An item of a function's `additionalParamsForKdu`."""
+
+    values: dict[str, Any] | None = Field(None, alias="additionalParams")
+
+
+class _Function(BaseModel):
+    """An item of `additionalParamsForVnf`."""
+
+    charts: list[_Chart] | None = Field(None, alias="additionalParamsForKdu")
+
+
+T = TypeVar("T")
+_VALUES, _FUNCTIONS = TypeAdapter(dict[str, Any]), TypeAdapter(list[_Function])
+
+
 @dataclass(frozen=True)
 class Instance:
     """As OSM tells of it.
@@ -164,17 +183,34 @@ class Instance:
 
     @property
     def values(self) -> dict[str, Any]:
-        """What its chart was last given."""
+        """Values that its chart was last given.
+
+        Raises:
+            StepError: OSM returns parameters of that operation that can't be read.
+        """
         for one in reversed(self.operations):
             if one.get("operationState") not in DONE:
                 continue
             params = one.get("operationParams") or {}
             if one.get("lcmOperationType") == "action" and params.get("primitive") == "upgrade":
-                return dict(params.get("primitive_params") or {})
+                return self._read(params, "primitive_params", _VALUES) or {}
             if one.get("lcmOperationType") == "instantiate":
-                function = (params.get("additionalParamsForVnf") or [{}])[0]
-                return dict((function.get("additionalParamsForKdu") or [{}])[0].get("additionalParams") or {})
+                functions = self._read(params, "additionalParamsForVnf", _FUNCTIONS)
+                charts = functions[0].charts if functions else None
+                return (charts[0].values if charts else None) or {}
         return {}
+
+    def _read(self, params: Mapping[str, Any], name: str, kind: TypeAdapter[T]) -> T | None:
+        """A parameter of an operation; current releases return a string of JSON, Release 8 the object that was sent."""
+        value = params.get(name)
+        if not value:
+            return None
+        try:
+            return kind.validate_json(value) if isinstance(value, str) else kind.validate_python(value)
+        except ValidationError as error:
+            cause = f"OSM returns an operation whose {name} can't be read ({error.errors()[0]['msg']})"
+            remedy = "Remove it (scan2sim orchestrate delete) and instantiate it again"
+            raise StepError(self.name, cause, remedy) from None
 
     @property
     def machines(self) -> int:
@@ -193,6 +229,9 @@ def next_action(wanted: Wanted | None, there: Instance | None) -> Action | None:
     Args:
         wanted: None: it isn't to be.
         there: None: it isn't.
+
+    Raises:
+        StepError: as `Instance.values`.
     """
     if there is None:
         return Action.CREATE if wanted else None

@@ -12,6 +12,8 @@ from pydantic import Field
 from scan2sim.pipeline.errors import InputError, SettingError
 from scan2sim.pipeline.ranges import File
 from scan2sim.pipeline.step import Params
+from scan2sim.services.credentials import redacted
+from scan2sim.services.loopback import is_loopback
 from scan2sim.services.monitoring.joined import FollowedParams
 from scan2sim.services.served import Served
 
@@ -41,11 +43,10 @@ class Connection(Params):
         if not given:
             raise SettingError("--osm", "is missing, and so is $OSM_HOSTNAME", "Give https://HOST:9999")
         parts = urlsplit(given if "://" in given else f"https://{given}")
-        local = parts.hostname in ("localhost", "127.0.0.1", "::1")
-        if parts.scheme != "https" and not (local and parts.scheme == "http"):
-            raise SettingError("--osm", f"{given:.100} isn't reached by TLS", "Give https://HOST:9999")
-        if not parts.hostname or parts.username or parts.path not in ("", "/", "/osm", "/osm/"):
-            raise SettingError("--osm", f"{given:.100} is no address of OSM's", "Give https://HOST:9999")
+        if parts.scheme != "https" and not (is_loopback(parts.hostname or "") and parts.scheme == "http"):
+            raise SettingError("--osm", f"{redacted(given):.100} isn't reached by TLS", "Give https://HOST:9999")
+        if not parts.hostname or "@" in parts.netloc or parts.path not in ("", "/", "/osm", "/osm/"):
+            raise SettingError("--osm", f"{redacted(given):.100} is no address of OSM's", "Give https://HOST:9999")
         return f"{parts.scheme}://{parts.netloc}" + ("" if parts.port else ":9999")
 
     def login(self) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import secrets
 import subprocess
 import sys
 import tempfile
@@ -194,7 +195,10 @@ def _fitted(image: U8, size: tuple[int, int]) -> U8:
 def _serving(ends: Places, toolbox: str, folder: Path) -> Iterator[tuple[subprocess.Popen[Any], int]]:
     """A toolbox that serves, and its port."""
     local = ends.address == places.Here.address
+    token = folder / robot.TOKEN
+    token.write_text(secrets.token_hex(32))  # beyond the loopback nothing is served without one
     command = [sys.executable, "-m", "scan2sim.flows.cli", "toolbox", "serve", toolbox, "--host", ends.address]
+    command += ["--token", str(token)]
     with (folder / "toolbox.log").open("w+") as log:
         server = ends.service(*command, "--port", 0 if local else PORT, stdout=log, stderr=log, env=_environment())
         try:

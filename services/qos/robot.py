@@ -1,7 +1,7 @@
 """A robot that asks a toolbox for results: images at a rate by HTTP, and how long each takes.
 
-`python -m scan2sim.services.qos.robot ADDRESS TOOLBOX FOLDER RATE SECONDS` sends a folder's JPEGs in turn, and prints a
-line of JSON (`Answers`).
+`python -m scan2sim.services.qos.robot ADDRESS TOOLBOX FOLDER RATE SECONDS` sends a folder's JPEGs in turn, with the
+token in its file `token` if there is one, and prints a line of JSON (`Answers`).
 """
 
 from __future__ import annotations
@@ -23,6 +23,8 @@ CONNECTIONS = 8
 """Requests that are on their way at once, at most."""
 PATIENCE = 30.0
 """Seconds for an answer."""
+TOKEN = "token"
+"""File with the toolbox's token, in the folder of images."""
 
 
 @dataclass(frozen=True)
@@ -44,12 +46,14 @@ class Answers:
     seconds: float
 
 
-def ask(address: str, toolbox: str, images: list[bytes], rate: float, seconds: float) -> Answers:
-    """Send images, so many a second, for so long; one that finds all connections busy waits for one."""
+def ask(address: str, toolbox: str, images: list[bytes], rate: float, seconds: float, token: str = "") -> Answers:
+    """Send `rate` images a second for `seconds`; one that finds all connections busy waits for one."""
     line: queue.Queue[tuple[float, bytes] | None] = queue.Queue()
     states: Counter[str] = Counter()
     responses: list[float] = []
     lock = threading.Lock()
+    headers = {"Content-Type": "image/jpeg", "Source": "robot", "Host": "localhost"}
+    headers |= {"Authorization": f"Bearer {token}"} if token else {}
 
     def work() -> None:
         place = urlsplit(address)
@@ -57,7 +61,7 @@ def ask(address: str, toolbox: str, images: list[bytes], rate: float, seconds: f
         while (taken := line.get()) is not None:
             due, image = taken
             try:
-                state = _state(connection, toolbox, image)
+                state = _state(connection, toolbox, image, headers)
             except (OSError, http.client.HTTPException, ValueError) as error:
                 connection.close()
                 state = type(error).__name__
@@ -87,20 +91,19 @@ def ask(address: str, toolbox: str, images: list[bytes], rate: float, seconds: f
     )
 
 
-def _state(connection: http.client.HTTPConnection, toolbox: str, image: bytes) -> str:
+def _state(connection: http.client.HTTPConnection, toolbox: str, image: bytes, headers: dict[str, str]) -> str:
     """How a request ends; asked again where the server closed a connection that lay idle."""
     idle = connection.sock is not None
     try:
-        return _asked(connection, toolbox, image)
+        return _asked(connection, toolbox, image, headers)
     except ConnectionError:
         if not idle:
             raise
         connection.close()
-        return _asked(connection, toolbox, image)
+        return _asked(connection, toolbox, image, headers)
 
 
-def _asked(connection: http.client.HTTPConnection, toolbox: str, image: bytes) -> str:
-    headers = {"Content-Type": "image/jpeg", "Source": "robot", "Host": "localhost"}
+def _asked(connection: http.client.HTTPConnection, toolbox: str, image: bytes, headers: dict[str, str]) -> str:
     connection.request("POST", f"/v2/models/{toolbox}/infer", image, headers)
     return str(json.loads(connection.getresponse().read()).get("state", "refused"))
 
@@ -109,7 +112,8 @@ def main() -> None:
     """Ask, as the arguments say."""
     address, toolbox, folder, rate, seconds = sys.argv[1:]
     images = [path.read_bytes() for path in sorted(Path(folder).glob("*.jpg"))]
-    print(json.dumps(asdict(ask(address, toolbox, images, float(rate), float(seconds)))), flush=True)
+    token = path.read_text().strip() if (path := Path(folder) / TOKEN).exists() else ""
+    print(json.dumps(asdict(ask(address, toolbox, images, float(rate), float(seconds), token))), flush=True)
 
 
 if __name__ == "__main__":

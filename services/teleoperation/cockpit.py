@@ -1,7 +1,10 @@
 """The station's page: pictures, how old they are, and the wheel; one WebSocket each (D3.2, section 4.3).
 
-To the page: facts as JSON ten times a second, and each picture as it came (VP8: browsers decode it) behind a header.
-From it: JSON, `{"do": "take" | "leave" | "turn" | "join" | "release" | "key", ...}`.
+To the page: facts as JSON twenty times a second, and each picture as it came (VP8: browsers decode it) behind a header.
+From it: JSON, `{"do": "take" | "leave" | "turn" | "join" | "release" | "key" | "clock", ...}`.
+
+Pictures and facts carry a time of the station's monotonic clock, which the page compares with its own (`clock`): so the
+page knows the age of whatever arrives, also after it lay in a queue or in a process that was stopped.
 """
 
 from __future__ import annotations
@@ -40,8 +43,8 @@ from scan2sim.services.teleoperation.watching import Frame
 log = logging.getLogger(__name__)
 
 HEADER = struct.Struct("<BBHHd")
-"""Before a picture: camera, whether it is a key frame, width, height, its age in ms when it was sent to the page."""
-FACTS = 0.1
+"""Before a picture: camera, whether it is a key frame, width, height, time of capture (ms of the station's clock)."""
+FACTS = 0.05
 """Seconds between two tellings of facts."""
 WAITING = 24
 """Pictures that may wait for a page; one that falls behind is shown the newest key frame next."""
@@ -65,7 +68,8 @@ class _Turn(BaseModel):
     agree: bool = False
 
     def command(self) -> Command:
-        controls = Controls(self.steering, self.throttle, self.brake, self.gear, self.horn, self.lights)
+        throttle = 0.0 if self.brake else self.throttle  # any brake overrides the throttle
+        controls = Controls(self.steering, throttle, self.brake, self.gear, self.horn, self.lights)
         return Command(controls, self.stop, self.agree)
 
 
@@ -79,7 +83,13 @@ class _Key(BaseModel):
     camera: Annotated[int, Field(ge=0, le=255)]
 
 
-_Said = _Take | _Turn | _Fetch | _Key
+class _Clock(BaseModel):
+    do: Literal["clock"]
+    sent: Annotated[float, Field(allow_inf_nan=False)]
+    """Time on the page's clock, which the answer returns."""
+
+
+_Said = _Take | _Turn | _Fetch | _Key | _Clock
 _SAID: TypeAdapter[_Said] = TypeAdapter(Annotated[_Said, Field(discriminator="do")])
 
 
@@ -108,8 +118,13 @@ class Screens:
 
     def packed(self, frame: Frame) -> bytes:
         """As pages take it."""
-        age = self._age(frame)
-        return HEADER.pack(frame.camera, frame.key, frame.width, frame.height, age) + frame.data
+        captured = _now_ms() - self._age(frame)
+        return HEADER.pack(frame.camera, frame.key, frame.width, frame.height, captured) + frame.data
+
+
+def _now_ms() -> float:
+    """Milliseconds of the station's monotonic clock."""
+    return time.monotonic() * 1e3
 
 
 class _Page:
@@ -199,7 +214,7 @@ async def _pictures(web: WebSocket, page: _Page, screens: Screens) -> None:
 
 async def _facts(web: WebSocket, page: _Page, station: Station) -> None:
     while True:
-        await web.send_text(json.dumps(station.facts() | {"you": page.name}))
+        await web.send_text(json.dumps({"now_ms": _now_ms()} | station.facts() | {"you": page.name}))
         await asyncio.sleep(FACTS)
 
 
@@ -209,16 +224,16 @@ async def _obey(web: WebSocket, page: _Page, station: Station, fetch: Callable[[
             text = await web.receive_text()
         except WebSocketDisconnect:
             return
-        if (fault := _done(text, page, station, fetch)) is not None:
-            await web.send_text(json.dumps({"fault": fault}))
+        if (answer := _done(text, page, station, fetch)) is not None:
+            await web.send_text(json.dumps(answer))
 
 
-def _done(text: str, page: _Page, station: Station, fetch: Callable[[str, str], bool]) -> str | None:
-    """Do what a page wants; why it isn't done."""
+def _done(text: str, page: _Page, station: Station, fetch: Callable[[str, str], bool]) -> dict[str, Any] | None:
+    """Do what a page wants; the answer: the time, or why it isn't done."""
     try:
         said = _SAID.validate_json(text)
     except ValidationError as error:
-        return f"that can't be understood: {error.errors()[0]['msg']}"
+        return {"fault": f"that can't be understood: {error.errors()[0]['msg']}"}
     try:
         match said:
             case _Take(do="take"):
@@ -229,12 +244,14 @@ def _done(text: str, page: _Page, station: Station, fetch: Callable[[str, str], 
                 station.wheel.turn(page.name, said.command(), time.monotonic())
             case _Fetch():
                 if not fetch(said.do, said.vehicle):
-                    return "the gateway isn't reached"
+                    return {"fault": "the gateway isn't reached"}
             case _Key():
                 if (joined := station.joined()) is not None:
                     joined.want(said.camera)
+            case _Clock():
+                return {"clock": said.sent, "now_ms": _now_ms()}
     except ScanError as error:
-        return str(error)
+        return {"fault": str(error)}
     return None
 
 

@@ -54,7 +54,7 @@ class Joined:
     """A vehicle that the station is joined with: what it says, its video, its links.
 
     Attributes:
-        telemetry: the last, which came at `heard` (seconds of the monotonic clock).
+        telemetry: the last, sent at `sent` (ns of the vehicle's monotonic clock).
         streams: the vehicle's cameras; `reports`: how they came over the last second.
         malformed: messages that can't be understood, so far.
     """
@@ -63,7 +63,7 @@ class Joined:
         """`show` is handed frames, in the receiving thread."""
         self.pair, self.vehicle = pair, vehicle
         self.telemetry: Telemetry | None = None
-        self.heard = 0.0
+        self.sent = 0
         self.streams: Streams = Streams(())
         self.malformed = 0
         self.reports: tuple[Report, ...] = ()
@@ -75,6 +75,11 @@ class Joined:
     def age(self, captured: int) -> float:
         """Milliseconds since a moment of the vehicle's monotonic clock (ns)."""
         return self.bundle.clocks.age_ms(captured)
+
+    def telemetry_age_ms(self) -> float | None:
+        """Milliseconds since the vehicle sent its telemetry, also where that lay in a queue; None: unknown."""
+        age = self.age(self.sent)
+        return None if self.telemetry is None or math.isinf(age) else age
 
     def want(self, camera: int) -> None:
         """Ask for a key frame of a camera."""
@@ -98,7 +103,7 @@ class Joined:
         try:
             match message.kind:
                 case Kind.TELEMETRY:
-                    self.telemetry, self.heard = Telemetry.unpack(message.body), time.monotonic()
+                    self.telemetry, self.sent = Telemetry.unpack(message.body), message.sent
                 case Kind.KEY:
                     self.watcher.learn(Key.unpack(message.body))
                 case Kind.STREAMS:
@@ -223,7 +228,7 @@ class Station:
             "vehicle": joined.vehicle.name,
             "why": joined.hindrance(),
             "telemetry": None if joined.telemetry is None else asdict(joined.telemetry),
-            "telemetry_age": None if joined.telemetry is None else round(time.monotonic() - joined.heard, 2),
+            "telemetry_age_ms": joined.telemetry_age_ms(),
             "cameras": [asdict(one) for one in joined.streams.cameras],
             "links": [one.model_dump() for one in joined.rates.links(joined.bundle)],
             "clocks": {"uncertainty_ms": clocks.uncertainty_ms, "wall_apart_s": clocks.wall_apart_s}

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import contextlib
-import ipaddress
 import socket
 import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from scan2sim.pipeline.errors import InputError, SettingError
 from scan2sim.pipeline.ranges import File
 from scan2sim.pipeline.step import Params
+from scan2sim.services.loopback import require_protection
 from scan2sim.services.teleoperation.controls import STOP
 from scan2sim.services.teleoperation.interface import LARGEST, PERIOD_MS, PORT, Order, TranslatorEnd
 from scan2sim.services.teleoperation.messages import Malformed
@@ -46,9 +46,15 @@ def read_key(path: Path | None) -> bytes:
 
 
 class TranslateParams(Params):
-    """Of every translator."""
+    """Options of every translator.
 
-    host: Annotated[str, Field(description="Address to listen on for the car unit.")] = "127.0.0.1"
+    Raises:
+        SettingError: it would listen beyond the loopback without a key.
+    """
+
+    host: Annotated[
+        str, Field(description="Address to listen on for the car unit; any but 127.0.0.1 and ::1 needs --key.")
+    ] = "127.0.0.1"
     port: Annotated[int, Field(ge=0, le=65535, description="UDP port to listen on; 0 for any that is free.")] = PORT
     key: Annotated[
         File | None, Field(description="File with a key that car unit and translator share; a must off this machine.")
@@ -60,6 +66,11 @@ class TranslateParams(Params):
         float, Field(ge=1, le=1000, description="Milliseconds from telling the vehicle what to do to the next time.")
     ] = PERIOD_MS
 
+    @model_validator(mode="after")
+    def _is_protected(self) -> Self:
+        require_protection(self.host, protected=self.key is not None, options="--key FILE")
+        return self
+
 
 class Translating:
     """Listens to a car unit, and tells a vehicle.
@@ -69,15 +80,13 @@ class Translating:
         malformed: packets that were no orders.
 
     Raises:
-        SettingError: it can't listen there, or is to listen to other machines without a key.
+        SettingError: it can't listen there.
     """
 
     def __init__(self, vehicle: Vehicle, params: TranslateParams) -> None:
         self.end = TranslatorEnd(params.limit)
         self.malformed = 0
         self._vehicle, self._period, self._key = vehicle, params.period / 1000, read_key(params.key)
-        if not self._key and not _own(params.host):
-            raise SettingError("--key", f"is missing: others can reach {params.host}", "Give a file with a key")
         family = socket.AF_INET6 if ":" in params.host else socket.AF_INET
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         try:
@@ -141,10 +150,3 @@ class Translating:
             safety.halt(str(error))
         else:
             safety.hindrance = ""
-
-
-def _own(host: str) -> bool:
-    """Whether only this machine reaches an address."""
-    with contextlib.suppress(ValueError):
-        return ipaddress.ip_address(host).is_loopback
-    return host == "localhost"

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from scan2sim.pipeline.errors import SettingError, StepError
 from scan2sim.pipeline.io.scene import read_scene
+from scan2sim.services.credentials import redacted
 from scan2sim.services.teleoperation import cameras, video
 from scan2sim.services.teleoperation.adapting import Adapting, Bounds, Plan
 from scan2sim.services.teleoperation.bundle import Bundle, Policy
@@ -209,7 +210,7 @@ def serve(params: VehicleParams, ended: threading.Event, say: Callable[[str], No
 def _named(option: str, text: str) -> tuple[str, str]:
     name, _, rest = text.partition("=")
     if not name or not rest or len(name) > 60:
-        raise SettingError(option, f"{text:.80} is no NAME=VALUE", "`--help` says what it means")
+        raise SettingError(option, f"{redacted(text):.80} is no NAME=VALUE", "`--help` says what it means")
     return name, rest
 
 

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 from scan2sim.pipeline.errors import ScanError, UnavailableError
 from scan2sim.pipeline.types import U8
+from scan2sim.services.credentials import redacted
 from scan2sim.services.toolboxes import boxes, frames
 from scan2sim.services.toolboxes.boxes import Facts
 from scan2sim.services.toolboxes.following import Follower
@@ -232,13 +233,13 @@ class Engine:
             toolbox=self.name,
             model=self.facts.name,
             id=frame.id,
-            source=frame.source,
+            source=redacted(frame.source),
             stamp=frame.stamp,
             state=state,
             size=(work.image.shape[1], work.image.shape[0]) if work else None,
             body=body,
             times=Times(waited=work.begun - frame.received, worked=time.monotonic() - work.begun) if work else None,
-            error=error,
+            error=error and redacted(error),
         )
         try:
             frame.answer(result)

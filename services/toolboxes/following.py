@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 
 from scan2sim.pipeline.types import U8
+from scan2sim.services.credentials import redacted
 from scan2sim.services.toolboxes.boxes import Follow
 from scan2sim.services.toolboxes.frames import Frame
 from scan2sim.services.toolboxes.results import Body
@@ -26,10 +27,10 @@ class Follower:
     """Of one source."""
 
     def __init__(self, source: str, follow: Follow) -> None:
-        self._source, self._follow = source, follow
+        self._source, self._follow = redacted(source), follow
         self._line: queue.Queue[tuple[Frame, U8, Body, Outcome] | None] = queue.Queue(WAITING)
         self._last = time.monotonic()
-        self._thread = threading.Thread(target=self._run, name=f"follower of {source}", daemon=True)
+        self._thread = threading.Thread(target=self._run, name=f"follower of {self._source}", daemon=True)
         self._thread.start()
 
     def put(self, frame: Frame, image: U8, body: Body, outcome: Outcome) -> None:

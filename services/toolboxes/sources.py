@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,13 +15,17 @@ import numpy as np
 
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.types import U8
+from scan2sim.services.credentials import redacted
 from scan2sim.services.toolboxes import frames
 from scan2sim.services.toolboxes.engine import Engine
 from scan2sim.services.toolboxes.frames import Frame
 from scan2sim.services.toolboxes.results import Result
 
+log = logging.getLogger(__name__)
+
 PICTURES = (".jpg", ".jpeg", ".png", ".webp")
 """Ends of files' names that a folder is searched for."""
+REMEDY = "Give a folder of pictures, a picture or a video"
 LONGEST_PAUSE = 5.0
 """Seconds between two tries to reach a camera, at most."""
 SILENT = 5.0
@@ -84,7 +90,7 @@ def shots(path: Path) -> Iterator[Shot]:
         yield Shot(f"{number:06}", round(number / rate * 1e9), image)
         number += 1
     if number == 0:
-        raise InputError(path, "is no video that can be read", "Give a folder of pictures, a picture or a video")
+        raise InputError(redacted(str(path)), "is no video that can be read", REMEDY)
 
 
 def images(path: Path) -> Iterator[U8]:
@@ -99,7 +105,7 @@ def images(path: Path) -> Iterator[U8]:
 
 def _is_pictures(path: Path) -> bool:
     if not path.exists():
-        raise InputError(path, "is not there", "Give a folder of pictures, a picture or a video")
+        raise InputError(redacted(str(path)), "is not there", REMEDY)
     return path.is_dir() or path.suffix.lower() in PICTURES
 
 
@@ -108,7 +114,7 @@ def _pictures(path: Path) -> list[Path]:
         return [path]
     found = sorted(one for one in path.iterdir() if one.suffix.lower() in PICTURES)
     if not found:
-        raise InputError(path, f"holds no {', '.join(PICTURES)}", "Give a folder of pictures, a picture or a video")
+        raise InputError(path, f"holds no {', '.join(PICTURES)}", REMEDY)
     return found
 
 
@@ -121,8 +127,11 @@ class Cameras:
     """Reads cameras, a thread each, and keeps the last result of each; a camera that is gone is looked for again."""
 
     def __init__(self, engine: Engine, addresses: list[str]) -> None:
-        """Of an engine; addresses as OpenCV takes them: rtsp://..., http://..., a device's number, a file."""
-        self._readers = [_Camera(engine, address) for address in addresses]
+        """Of an engine; addresses as OpenCV takes them: rtsp://..., http://..., a device's number, a file.
+
+        Results, states and logs name a camera by its address without credentials.
+        """
+        self._readers = [_Camera(engine, *named) for named in zip(addresses, names(addresses), strict=True)]
 
     def start(self) -> None:
         """Read from now on."""
@@ -139,24 +148,36 @@ class Cameras:
         return any(reader.running() for reader in self._readers)
 
     def last(self, source: str | None = None) -> list[Result]:
-        """The last result of each camera, or of one."""
-        return [one.last for one in self._readers if one.last and source in (None, one.address)]
+        """The last result of each camera, or of one, by its name or its address."""
+        wanted = source and redacted(source)
+        return [one.last for one in self._readers if one.last and wanted in (None, one.name)]
 
     def states(self) -> dict[str, dict[str, Any]]:
-        """By address, whether it sends images, and how many it did."""
-        return {one.address: {"there": one.is_there(), "images": one.count} for one in self._readers}
+        """By camera's name, whether it sends images, and how many it did."""
+        return {one.name: {"there": one.is_there(), "images": one.count} for one in self._readers}
+
+
+def names(addresses: Sequence[str]) -> list[str]:
+    """Addresses without credentials; the second and further ones that look alike then are numbered."""
+    seen: Counter[str] = Counter()
+    found = []
+    for name in map(redacted, addresses):
+        seen[name] += 1
+        found.append(name if seen[name] == 1 else f"{name} ({seen[name]})")
+    return found
 
 
 class Reader:
     """Reads a camera in a thread of its own; one that is gone is looked for again.
 
     Attributes:
+        name: address without credentials, unless another is given.
         count: images that came.
     """
 
-    def __init__(self, address: str, take: Callable[[U8], None]) -> None:
+    def __init__(self, address: str, take: Callable[[U8], None], name: str = "") -> None:
         """Of an address as OpenCV takes it; `take` is given each image, (H, W, 3) RGB, in that thread."""
-        self._address, self._take = address, take
+        self._address, self._take, self.name = address, take, name or redacted(address)
         self.count, self._seen = 0, 0.0
         self._stopped, self._thread = threading.Event(), threading.Thread()
 
@@ -164,7 +185,7 @@ class Reader:
         """Read from now on."""
         if not self.running():
             self._stopped = threading.Event()
-            self._thread = threading.Thread(target=self._run, args=(self._stopped,), name=self._address, daemon=True)
+            self._thread = threading.Thread(target=self._run, args=(self._stopped,), name=self.name, daemon=True)
             self._thread.start()
 
     def stop(self) -> None:
@@ -184,8 +205,9 @@ class Reader:
     def _run(self, stopped: threading.Event) -> None:
         import cv2
 
-        pause = 0.0
+        pause, warned = 0.0, False
         while not stopped.wait(pause):
+            before = self.count
             video = cv2.VideoCapture(int(self._address) if self._address.isdecimal() else self._address)
             while not stopped.is_set() and (image := _read(video)) is not None:
                 pause = 0.0
@@ -193,15 +215,18 @@ class Reader:
                 self._seen = time.monotonic()
                 self._take(image)
             video.release()
+            if self.count == before and not warned and not stopped.is_set():
+                log.warning("%s gives no images: check its address and that it runs; it is tried again", self.name)
+            warned = self.count == before
             pause = min(LONGEST_PAUSE, 2 * pause or 0.2)
 
 
 class _Camera(Reader):
     """Whose images an engine works on."""
 
-    def __init__(self, engine: Engine, address: str) -> None:
-        super().__init__(address, self._submit)
-        self._engine, self.address = engine, address
+    def __init__(self, engine: Engine, address: str, name: str) -> None:
+        super().__init__(address, self._submit, name)
+        self._engine = engine
         self.last: Result | None = None
 
     def stop(self) -> None:
@@ -209,7 +234,7 @@ class _Camera(Reader):
         self.last = None
 
     def _submit(self, image: U8) -> None:
-        self._engine.submit(Frame(f"{self.count}", self.address, time.time_ns(), image, self._keep))
+        self._engine.submit(Frame(f"{self.count}", self.name, time.time_ns(), image, self._keep))
 
     def _keep(self, result: Result) -> None:
         if result.body is not None:

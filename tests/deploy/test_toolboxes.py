@@ -26,6 +26,7 @@ from tests.ports import free_port
 
 FILES = sorted(FOLDER.glob("*.Dockerfile"))
 BOXES = boxes.names()
+TOKEN = "0123456789abcdef"
 SCAN2SIM = "import sys; from scan2sim.flows.cli import main; sys.argv[0] = 'scan2sim'; main()"
 
 
@@ -61,12 +62,11 @@ def healthy(address: str) -> int:
     return subprocess.run(command, env={"PYTHONPATH": str(ROOT)}).returncode
 
 
-def answer(address: str, box: str) -> str:
+def answer(address: str, box: str, token: str) -> str:
     jpeg = io.BytesIO()
     Image.fromarray(np.full((96, 128, 3), 90, np.uint8)).save(jpeg, "JPEG")
-    request = urllib.request.Request(
-        f"{address}/v2/models/{box}/infer", jpeg.getvalue(), {"Content-Type": "image/jpeg"}
-    )
+    headers = {"Content-Type": "image/jpeg", "Authorization": f"Bearer {token}"}
+    request = urllib.request.Request(f"{address}/v2/models/{box}/infer", jpeg.getvalue(), headers)
     with urllib.request.urlopen(request, timeout=60) as told:
         return str(told.read().decode())
 
@@ -126,13 +126,22 @@ def test_what_an_image_installs_suffices_to_serve(box: str, models: Path, tmp_pa
     port = free_port()
     address = f"http://localhost:{port}"
     command = [part.replace("/models", str(models)) for part in entry_point(path)[1:]]
+    (token := tmp_path / "token").write_text(TOKEN)
+    (packages := tmp_path / "packages").mkdir()
     assert healthy(address) == 1
-    with running(site(path, tmp_path), *command, "--port", str(port)) as process:
+    with running(site(path, packages), *command, "--port", str(port), "--token", str(token)) as process:
         assert process.stdout is not None
         told = process.stdout.readline()
         assert f":{port}/" in told, told + process.stdout.read()
         assert healthy(address) == 0
-        assert '"state":"done"' in answer(address, box).replace(" ", "")
+        assert '"state":"done"' in answer(address, box, TOKEN).replace(" ", "")
+
+
+def test_an_image_without_a_token_refuses_to_serve(tmp_path: Path) -> None:
+    path = FOLDER / "detect.Dockerfile"
+    with running(site(path, tmp_path), *entry_point(path)[1:]) as process:
+        output, _ = process.communicate(timeout=60)
+    assert process.returncode == 2 and "--token" in output
 
 
 def test_what_images_install_suffices_for_a_node(tmp_path: Path) -> None:

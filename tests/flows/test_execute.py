@@ -11,18 +11,23 @@ import subprocess
 import sys
 import time
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Collection
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 import scan2sim
-from scan2sim.flows.engine.execution import execute
+from scan2sim.flows.engine.dispatch import dispatch
+from scan2sim.flows.engine.execution import execute, run_to_world
+from scan2sim.flows.engine.frontier import Outcome
 from scan2sim.flows.engine.lock import locked
-from scan2sim.flows.engine.planning import Reason, plan
+from scan2sim.flows.engine.node import run_node
+from scan2sim.flows.engine.planning import Planned, Reason, plan
 from scan2sim.flows.engine.versions import APART, check_version, versions
-from scan2sim.flows.recipes.graph import Node, NodeId
-from scan2sim.pipeline.errors import BusyError, DataError, StepError, UnavailableError
+from scan2sim.flows.recipes.graph import Node, NodeId, Output
+from scan2sim.pipeline.errors import BusyError, DataError, ScanError, StepError, UnavailableError
 from scan2sim.pipeline.extras import EXTRA_OF
 from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.store import Digests, Manifest, Store, _seal, digest
@@ -35,7 +40,7 @@ Run = Callable[..., dict[str, Manifest]]
 @pytest.fixture
 def source(tmp_path: Path) -> Path:
     path = tmp_path / "source.txt"
-    path.write_text("1")
+    path.write_text("1", encoding="utf-8")
     return path
 
 
@@ -59,7 +64,7 @@ def ran(tmp_path: Path) -> Callable[[], str]:
 
     def take() -> str:
         log = tmp_path / "log"
-        text = "".join(sorted(log.read_text().split())) if log.exists() else ""
+        text = "".join(sorted(log.read_text(encoding="utf-8").split())) if log.exists() else ""
         log.unlink(missing_ok=True)
         return text
 
@@ -78,7 +83,7 @@ def test_changes_rerun_what_depends_on_them_alone(run: Run, ran: Callable[[], st
     ran()
     run(c={"value": 5})
     assert ran() == "cd"
-    source.write_text("7")
+    source.write_text("7", encoding="utf-8")
     run(c={"value": 5})
     assert ran() == "abcd"
 
@@ -94,7 +99,7 @@ def test_touching_a_source_without_changing_it_reruns_nothing(run: Run, ran: Cal
 def test_what_comes_out_the_same_ends_the_need_to_redo(run: Run, ran: Callable[[], str], source: Path) -> None:
     run()
     ran()
-    source.write_text("1\n")  # other bytes, the same number
+    source.write_text("1\n", encoding="utf-8")  # other bytes, the same number
     assert run()["d"].facts == {"total": 2}
     assert ran() == "a"
     run()
@@ -109,7 +114,7 @@ def test_digests_are_remembered_until_a_file_changes(tmp_path: Path, source: Pat
     known = first(source)
     first.save()
     assert Digests(file)(source) == known == digest(source)
-    source.write_text("2")
+    source.write_text("2", encoding="utf-8")
     assert Digests(file)(source) == digest(source) != known
 
 
@@ -119,6 +124,53 @@ def test_a_failure_is_noted_and_the_rest_goes_on(tmp_path: Path, source: Path, r
     outcome = execute(plan(nodes, store), store, jobs=1, watch=lambda *_: None, to_the_end=True)
     assert set(outcome.of_tile()) == {"a", "c"} and set(outcome.failed) == {NodeId("b")}
     assert ran() == "abc"
+
+
+class Ran:
+    """A `dispatch.Future` of a node that has run in this process."""
+
+    def __init__(self, item: Planned, store: Store) -> None:
+        try:
+            self._outcome: object = run_node(item, store, item.inputs(store))
+        except ScanError as error:
+            self._outcome = error
+
+    def add_done_callback(self, fn: Callable[[object], None]) -> None:
+        fn(self)
+
+    def result(self, *, raise_on_failure: bool) -> object:
+        return self._outcome
+
+
+@pytest.mark.parametrize("how", ["processes", "dispatched"])
+def test_a_side_product_that_fails_stops_nothing_and_what_reads_it_runs_without_it(
+    tmp_path: Path, source: Path, ran: Callable[[], str], how: str
+) -> None:
+    store = Store(tmp_path / "store")
+
+    def planned(without: Collection[NodeId] = (), **changes: dict[str, object]) -> list[Planned]:
+        nodes = []
+        for node in chain(source, tmp_path / "log", **changes):
+            kept = {name: at for name, at in node.inputs.items() if not (isinstance(at, Output) and at.node in without)}
+            if node.id not in without:
+                nodes.append(replace(node, inputs=kept, step=replace(node.step, side_product=node.step.name == "b")))
+        return plan(nodes, store, force=True)
+
+    def run(planned: list[Planned], store: Store) -> Outcome:
+        if how == "dispatched":
+            return dispatch(planned, store, lambda item: Ran(item, store), 1, lambda *_: None)
+        return execute(planned, store, jobs=1, watch=lambda *_: None)
+
+    broken = partial(planned, b={"does": "bug"})
+    last, outcome = run_to_world(broken(), broken, store, run)
+    assert ran() == "abcd", "each once, though forced"
+    assert {item.node.step.name for item in last} == outcome.of_tile().keys() == {"a", "c", "d"}
+    assert outcome.of_tile()["d"].facts == {"total": 1} and not outcome.failed
+    assert "a bug" in outcome.side_failed[NodeId("b")].cause and not list((tmp_path / "store" / "b").glob("*"))
+    _, outcome = run_to_world(planned(), planned, store, run)
+    assert outcome.of_tile()["d"].facts == {"total": 2} and not outcome.side_failed, "it is retried"
+    with pytest.raises(DataError, match="to fail"):
+        run_to_world(broken(d={"does": "fail"}), partial(broken, d={"does": "fail"}), store, run)
 
 
 class CountParams(Params):
@@ -131,12 +183,12 @@ class CountParams(Params):
 def count(inputs: Inputs, params: CountParams, out: Path, report: Report, checkpoint: Path) -> Done:
     """Count from where it was killed."""
     known = checkpoint / "known.txt"
-    first = int(known.read_text()) if known.exists() else 0
+    first = int(known.read_text(encoding="utf-8")) if known.exists() else 0
     for number in range(first, params.to):
-        known.write_text(str(number + 1))
+        known.write_text(str(number + 1), encoding="utf-8")
         if number == 1 and first <= params.above:
             os.kill(os.getpid(), signal.SIGKILL)
-    (out / "number.txt").write_text(str(params.to))
+    (out / "number.txt").write_text(str(params.to), encoding="utf-8")
     return Done({"number": out / "number.txt"}, {"began": first})
 
 
@@ -156,7 +208,7 @@ def test_a_long_step_goes_on_where_it_was_killed_with_the_same_input_alone(tmp_p
     assert run().facts == {"began": 2} and not list((store.root / "count").glob(".part-*"))
     with pytest.raises(StepError, match="killed"):
         run(to=5)
-    source.write_text("another")
+    source.write_text("another", encoding="utf-8")
     with pytest.raises(StepError, match="killed"):
         run(to=5)
     parts = list((store.root / "count").glob(".part-*"))
@@ -190,9 +242,9 @@ def number(tmp_path: Path, name: str) -> Path:
 def test_a_changed_output_is_redone_and_nothing_else(run: Run, ran: Callable[[], str], tmp_path: Path) -> None:
     run()
     ran()
-    number(tmp_path, "b").write_text("7")  # as many bytes
+    number(tmp_path, "b").write_text("7", encoding="utf-8")  # as many bytes
     assert run()["d"].facts == {"total": 2}
-    assert ran() == "b" and number(tmp_path, "b").read_text() == "1"
+    assert ran() == "b" and number(tmp_path, "b").read_text(encoding="utf-8") == "1"
 
 
 def test_damage_that_leaves_no_trace_is_found_when_it_is_read(run: Run, ran: Callable[[], str], tmp_path: Path) -> None:
@@ -200,12 +252,12 @@ def test_damage_that_leaves_no_trace_is_found_when_it_is_read(run: Run, ran: Cal
     ran()
     damaged = number(tmp_path, "a")
     stat = damaged.stat()
-    damaged.write_text("7")
+    damaged.write_text("7", encoding="utf-8")
     os.utime(damaged, ns=(stat.st_atime_ns, stat.st_mtime_ns))
     run()
     assert ran() == "", "what isn't read is looked at, not into"
     assert run(c={"value": 5})["d"].facts == {"total": 7}
-    assert ran() == "acd" and number(tmp_path, "a").read_text() == "1"
+    assert ran() == "acd" and number(tmp_path, "a").read_text(encoding="utf-8") == "1"
 
 
 def test_a_store_that_was_copied_is_as_good(run: Run, ran: Callable[[], str], tmp_path: Path) -> None:
@@ -224,7 +276,7 @@ def test_a_manifest_that_is_damaged_is_none(run: Run, ran: Callable[[], str], tm
     run()
     ran()
     path = number(tmp_path, "d").with_name("manifest.json")
-    path.write_text(path.read_text().replace('"total": 2', '"total": 3'))
+    path.write_text(path.read_text(encoding="utf-8").replace('"total": 2', '"total": 3'), encoding="utf-8")
     assert run()["d"].facts == {"total": 2}
     assert ran() == "d"
 
@@ -235,14 +287,14 @@ def test_a_manifest_that_leads_elsewhere_is_refused(
 ) -> None:
     run()
     ran()
-    (tmp_path / "secret.txt").write_text("1")
+    (tmp_path / "secret.txt").write_text("1", encoding="utf-8")
     folder = number(tmp_path, "a").parent
     (folder / "link").symlink_to(tmp_path)
     (folder / "link.txt").symlink_to(tmp_path / "secret.txt")
-    body = json.loads((folder / "manifest.json").read_text())
+    body = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
     del body["seal"]
     body["files"] = {"number": name}
-    (folder / "manifest.json").write_text(json.dumps(body | {"seal": _seal(body)}))
+    (folder / "manifest.json").write_text(json.dumps(body | {"seal": _seal(body)}), encoding="utf-8")
     run(b={"value": 3})
     assert ran() == "abd"
 
@@ -342,14 +394,14 @@ def test_kill_9_leaves_nothing_half_made_and_no_process_behind(tmp_path: Path, s
     deadline = time.monotonic() + 60
     while time.monotonic() < deadline and not (tmp_path / "pid_b").exists():
         time.sleep(0.05)
-    hanging = (tmp_path / "pid_b").read_text()
+    hanging = (tmp_path / "pid_b").read_text(encoding="utf-8")
     child.send_signal(signal.SIGKILL)
     child.wait()
     store = Store(tmp_path / "store")
     kept = {p.node.full_name: p.reason for p in plan(chain(source, log), store)}
     assert kept["a"] is None and kept["b"] is not None
     assert run()["d"].facts == {"total": 2}
-    pid = (tmp_path / "pid_b").read_text()  # of the run above, which ended
+    pid = (tmp_path / "pid_b").read_text(encoding="utf-8")  # of the run above, which ended
     assert hanging != pid
     while time.monotonic() < deadline and Path(f"/proc/{hanging}").exists():
         time.sleep(0.1)
@@ -357,7 +409,7 @@ def test_kill_9_leaves_nothing_half_made_and_no_process_behind(tmp_path: Path, s
 
 
 def test_versions_are_told_of_all_that_computes(monkeypatch: pytest.MonkeyPatch) -> None:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = project["optional-dependencies"]
     lines = [*project["dependencies"], *(f'{one}; extra == "{name}"' for name in extras for one in extras[name])]
     monkeypatch.setattr(importlib.metadata, "requires", lambda name: lines)

@@ -6,15 +6,20 @@ import threading
 import urllib.error
 import urllib.request
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from scan2sim.flows.cli import app
-from scan2sim.flows.reports.film import flight
+from scan2sim.flows.reports.film import film, flight
 from scan2sim.flows.reports.view import Pages, server
 from scan2sim.pipeline.errors import SettingError
+from scan2sim.pipeline.io.scene import read_scene
+from scan2sim.pipeline.render import Image, Renderer
+from scan2sim.pipeline.step import silent
+from scan2sim.pipeline.types import F64, Camera
 from tests.browser import Page, chromium
 from tests.pipeline import made_up
 
@@ -120,6 +125,26 @@ def test_a_flight_is_a_video_of_the_world(tmp_path: Path) -> None:
     assert len(frames) == 6 and frames[0].shape == (90, 160, 3)
     assert all(frame.std() > 15 for frame in frames)
     assert np.abs(frames[0].astype(int) - frames[3]).mean() > 5
+
+
+def test_a_flight_that_fails_costs_itself_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("av", reason="PyAV isn't installed")
+    scene = made_up.scene(tmp_path)
+    view = Renderer.view
+
+    def failing(self: Renderer, camera: Camera, pose: F64, **how: Any) -> Image:
+        if len(seen_from) > 50:  # the encoder has written by then
+            raise ZeroDivisionError("a bug")
+        seen_from.append(pose)
+        return view(self, camera, pose, **how)
+
+    seen_from: list[F64] = []
+    monkeypatch.setattr(Renderer, "view", failing)
+    (tmp_path / "flight.mp4").write_text("an earlier one", encoding="utf-8")
+    with pytest.raises(ZeroDivisionError):
+        film(scene, tmp_path / "flight.mp4", 4, 64, silent)
+    assert (tmp_path / "flight.mp4").read_text(encoding="utf-8") == "an earlier one"
+    assert read_scene(tmp_path) == scene and sorted(path.suffix for path in tmp_path.glob("*flight*")) == [".mp4"]
 
 
 def test_without_a_road_the_flight_circles_around_the_world(tmp_path: Path) -> None:

@@ -249,7 +249,7 @@ def test_times_come_from_a_file_from_names_or_from_the_order(drive: Drive, tmp_p
 
     arguments = drive.arguments | {"out": tmp_path / "tile", "overwrite": True}
     notes: list[str] = []
-    (tmp_path / "times.txt").write_text("0.2\n0.4\n")
+    (tmp_path / "times.txt").write_text("0.2\n0.4\n", encoding="utf-8")
     for names, extra in (
         (["1.bin", "3.bin"], {}),  # frames' numbers
         (["0.2.bin", "0.4.bin"], {}),
@@ -271,7 +271,7 @@ def test_nothing_is_placed_within_a_gap_of_the_trajectory(drive: Drive, tmp_path
     t = drive.camera
     late = Trajectory(np.where(t.times > 0.35, t.times + 5, t.times), t.positions, t.rotations)
     trajectory_io.write(tmp_path / "gap.csv", late)
-    (tmp_path / "times.txt").write_text("0.1 0.2 0.3 3.0 5.5 5.6".replace(" ", "\n"))
+    (tmp_path / "times.txt").write_text("0.1 0.2 0.3 3.0 5.5 5.6".replace(" ", "\n"), encoding="utf-8")
     notes: list[str] = []
     arguments = drive.arguments | {
         "poses": tmp_path / "gap.csv",
@@ -328,7 +328,8 @@ def test_extrinsics_of_all_kinds_of_files(tmp_path: Path, form: str) -> None:
             "three": "\n".join(map(text, T[:3])).replace(" ", ", "),
             "velo_to_cam": f"calib_time: 15-Mar-2012 11:37:16\nR: {text(T[:3, :3])}\nT: {text(T[:3, 3])}\n",
             "odometry": f"P0: 1 2 3\nTr: {text(T[:3])}\n",
-        }[form]
+        }[form],
+        encoding="utf-8",
     )
     assert np.allclose(read_extrinsics(file), T, atol=1e-8)
 
@@ -338,8 +339,9 @@ def test_photos_of_kittis_second_camera_stand_beside_the_first(drive: Drive, tmp
     K, offset = np.array([[700.0, 0, 600], [0, 700, 180], [0, 0, 1]]), np.array([0.0613, -0.001, 0.003])
     P2 = np.column_stack([K, K @ offset])
     calib = tmp_path / "calib.txt"
-    calib.write_text("".join(f"{k}: {' '.join(f'{v:.9e}' for v in M.ravel())}\n" for k, M in
-                             (("P0", np.eye(3, 4)), ("P2", P2), ("Tr", T_CAMERA_SCANNER[:3]))))  # fmt: skip
+    matrices = {"P0": np.eye(3, 4), "P2": P2, "Tr": T_CAMERA_SCANNER[:3]}
+    lines = [f"{key}: {' '.join(f'{value:.9e}' for value in matrix.ravel())}\n" for key, matrix in matrices.items()]
+    calib.write_text("".join(lines), encoding="utf-8")
     own = tmp_path / "image_2"
     own.mkdir()
     for file in sorted((drive.folder / "photos").iterdir()):
@@ -354,7 +356,9 @@ def test_photos_of_kittis_second_camera_stand_beside_the_first(drive: Drive, tmp
         centres.append((tile.views[0].T_world_cam, tile.views[0].centre))
     moved = centres[0][0][:3, :3].T @ (centres[1][1] - centres[0][1])
     np.testing.assert_allclose(moved, -offset, atol=1e-6)
-    calib.write_text("P2: 1 2 3\nTr: " + " ".join(f"{v:.9f}" for v in T_CAMERA_SCANNER[:3].ravel()) + "\n")
+    calib.write_text(
+        "P2: 1 2 3\nTr: " + " ".join(f"{v:.9f}" for v in T_CAMERA_SCANNER[:3].ravel()) + "\n", encoding="utf-8"
+    )
     with pytest.raises(InputError, match="no sound `P2`"):
         photo_extrinsics(calib, own)
 
@@ -369,7 +373,7 @@ def test_photos_of_kittis_second_camera_stand_beside_the_first(drive: Drive, tmp
     ],
 )
 def test_bad_extrinsics_are_named(tmp_path: Path, text: str, message: str) -> None:
-    (tmp_path / "T.txt").write_text(text)
+    (tmp_path / "T.txt").write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match=message):
         read_extrinsics(tmp_path / "T.txt")
 
@@ -379,13 +383,14 @@ def test_a_camera_of_a_file_or_of_numbers(drive: Drive, tmp_path: Path) -> None:
     file.write_text(
         '[[cameras]]\nid = "a"\nmodel = "pinhole"\nsize = [100, 50]\nfocal = [80.0, 80.0]\ncentre = [49.5, 24.5]\n'
         '[[cameras]]\nid = "b"\nmodel = "opencv"\n'
-        "size = [512, 256]\nfocal = [90.0, 91.0]\ndistortion = [0.1, 0, 0, 0]\n"
+        "size = [512, 256]\nfocal = [90.0, 91.0]\ndistortion = [0.1, 0, 0, 0]\n",
+        encoding="utf-8",
     )
     camera = Camera("opencv", 512, 256, 90.0, 91.0, 0.0, 0.0, (0.1, 0.0, 0.0, 0.0))
     assert camera_of_photos(drive.folder / "photos", file=file) == read_camera(file, 512, 256) == camera
     with pytest.raises(InputError, match=r"has no camera of 64x64 \(it has 100x50, 512x256\)"):
         read_camera(file, 64, 64)
-    file.write_text('[[cameras]]\nid = "a"\nmodel = "spherical"\nsize = [100, 50]\n')
+    file.write_text('[[cameras]]\nid = "a"\nmodel = "spherical"\nsize = [100, 50]\n', encoding="utf-8")
     with pytest.raises(InputError, match=r"camera\.toml: field `cameras\.model`"):
         read_camera(file, 100, 50)
     assert camera_of_photos(drive.folder / "photos") == CAMERA
@@ -430,8 +435,8 @@ def test_bad_input_is_named_and_leaves_nothing(
     tmp_path: Path, change: Callable[[Drive], dict[str, Any]], kind: type[ScanError], message: str
 ) -> None:
     drive = make(tmp_path / "drive")
-    (drive.folder / "t7.txt").write_text("\n".join(f"{0.1 + 0.08 * i:.2f}" for i in range(7)))
-    (drive.folder / "flat.csv").write_text("time,x,y,z\n0,0,0,0\n1,1,0,0\n")
+    (drive.folder / "t7.txt").write_text("\n".join(f"{0.1 + 0.08 * i:.2f}" for i in range(7)), encoding="utf-8")
+    (drive.folder / "flat.csv").write_text("time,x,y,z\n0,0,0,0\n1,1,0,0\n", encoding="utf-8")
     with pytest.raises(kind, match=message):
         imported(**change(drive), out=tmp_path / "tile")
     assert [p.name for p in tmp_path.iterdir()] == ["drive"]
@@ -442,7 +447,7 @@ def test_a_sweeps_own_colours_are_kept_without_photos(tmp_path: Path) -> None:
     rgb = np.tile(np.array([10, 20, 30], np.uint8), (50, 1))
     las.write(tmp_path / "a.laz", PointCloud(Frame(), xyz, rgb))
     assert np.array_equal(present(read_sweep(tmp_path / "a.laz")[2]), rgb)
-    (tmp_path / "poses.tum").write_text("0 0 0 0 0 0 0 1\n")
+    (tmp_path / "poses.tum").write_text("0 0 0 0 0 0 0 1\n", encoding="utf-8")
     cloud = cloud_of(imported(sweeps=tmp_path / "a.laz", poses=tmp_path / "poses.tum", out=tmp_path / "tile"))[1]
     assert cloud.rgb is not None and (cloud.rgb == [10, 20, 30]).all()
 

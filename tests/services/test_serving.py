@@ -101,6 +101,12 @@ def test_every_error_names_place_cause_and_remedy_alone(path: str, status: int) 
     assert "secret" not in answer.text
 
 
+def test_a_machine_is_asked_by_any_of_its_names_with_the_token(token: Path) -> None:
+    client = client_of(app_of(Served(host="0.0.0.0", token=token)), "robot.example")
+    assert client.get("/number", headers={"Authorization": f"Bearer {TOKEN}"}).status_code == 200
+    assert client.get("/number").status_code == 401
+
+
 def test_without_the_token_only_health_and_files_of_pages_are_shown(token: Path) -> None:
     client = client_of(app_of(Served(token=token), public=("/",)))
     for path in ("/number", "/metrics", "/openapi.json", "/health", "/nix", "/pages/../number"):
@@ -119,7 +125,6 @@ def test_websites_whose_names_lead_here_read_nothing() -> None:
     for host in ("evil.example", "localhost.evil.example", "127.0.0.1.evil.example:8080"):
         answer = client_of(app_of(), host).get("/number")
         assert answer.status_code == 421 and set(answer.json()) == {"where", "cause", "remedy"}, host
-    assert client_of(app_of(Served(host="0.0.0.0")), "robot.example").get("/number").status_code == 200
 
 
 @pytest.mark.parametrize("text", ["", "short", "two words that are long", "ümläutümläutümläut"])
@@ -196,8 +201,19 @@ def test_what_can_not_be_served_is_told_before(certificate: tuple[Path, Path], t
     with Served(port=0).listen() as taken, pytest.raises(SettingError, match="Choose another --port"):
         Served(port=taken.getsockname()[1]).listen()
     with pytest.raises(SettingError, match="192.0.2.1"):
-        Served(host="192.0.2.1").listen()
-    assert Served(host="0.0.0.0").is_open() and not Served().is_open()
+        Served(host="192.0.2.1", token=tmp_path / "token").listen()
+
+
+@pytest.mark.parametrize(("host", "by_token"), [("0.0.0.0", False), ("0.0.0.0", True), ("127.0.0.1", False)])
+def test_tls_without_a_token_is_served_with_a_warning(
+    host: str, by_token: bool, certificate: tuple[Path, Path], token: Path,
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.setattr("uvicorn.Server.run", lambda self, sockets: None)
+    given = token if by_token else None
+    served = Served(port=0, host=host, token=given, certificate=certificate[0], key=certificate[1])
+    serving.run(app_of(served), served, lambda address: None)
+    assert ("--token FILE" in caplog.text) == (host == "0.0.0.0" and not by_token)
 
 
 @pytest.fixture

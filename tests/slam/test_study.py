@@ -33,7 +33,7 @@ def drive(corridor: Drive, tmp_path: Path) -> Path:
     trajectory_io.write(folder / "truth.csv", corridor.truth)
     fixes = np.column_stack([corridor.truth.times, corridor.truth.positions])
     rows = [",".join(map(str, fix)) for fix in fixes]
-    (folder / "gps.csv").write_text("\n".join(["time,x,y,z", *rows]))
+    (folder / "gps.csv").write_text("\n".join(["time,x,y,z", *rows]), encoding="utf-8")
     return folder
 
 
@@ -54,7 +54,7 @@ def test_cells_are_measured_kept_and_not_run_again(corridor: Drive, drive: Path,
     out = tmp_path / "out"
     options = ("--heights", "128,256", "--bitrates", "1,0.1", "--rates", "10", "--jobs", 2)
     studied(drive, out, *options)
-    rows, text = rows_of(out), (out / "table.md").read_text()
+    rows, text = rows_of(out), (out / "table.md").read_text(encoding="utf-8")
     good, poor = rows["128", "1"], rows["128", "0.1"]
     assert not good["reason"] and float(good["global_mean_m"]) < 0.3 and int(good["frames"]) == len(corridor.truth)
     assert float(good["mbit_s"]) == pytest.approx(1.0, rel=0.5) and good["width"] == "256"
@@ -68,7 +68,10 @@ def test_cells_are_measured_kept_and_not_run_again(corridor: Drive, drive: Path,
     assert len(rows) == 4 and {rows["256", b]["reason"] for b in ("1", "0.1")} == {"the source has only 128 px"}
     assert cv2.imread(str(out / "plot.png")) is not None
 
-    assert "8 of 8 results kept" in studied(drive, out, *options) and (out / "table.md").read_text() == text
+    assert (
+        "8 of 8 results kept" in studied(drive, out, *options)
+        and (out / "table.md").read_text(encoding="utf-8") == text
+    )
     next((out / "steps" / "evaluate.h128_b1_f10").rglob("manifest.json")).unlink()
     assert "7 of 8 results kept" in studied(drive, out, *options)
     assert "2 of 8 results kept" in studied(drive, out, *options, "--set", "track.count=60"), "videos are kept"

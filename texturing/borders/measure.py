@@ -78,4 +78,4 @@ def colour_step(a: Textured, b: Textured) -> tuple[float, float, float]:
     return float(step.mean()), float(np.percentile(step, 95)), border.length[0]
 
 
-BORDERS = Step("borders", 3, borders, CellParams)
+BORDERS = Step("borders", 3, borders, CellParams, side_product=True)

@@ -86,10 +86,10 @@ class _Package:
         for square, parts in sorted(self._ground.items()):
             files.append(f"{name}/{self._file(square)}.fbx")
             self._write(files[-1], parts)
-        if self._squares == 1:
-            about["source"] = f"./{files[0]}"
-        else:
+        if self._squares > 1:
             about |= {"tile_size": SQUARE, "tiles": [f"./{file}" for file in files]}
+        elif files:  # a world without ground has no map
+            about["source"] = f"./{files[0]}"
         text = json.dumps({"maps": [about] if files else [], "props": self._props}, indent=2)
         (self._folder / f"{name}.json").write_text(text + "\n", encoding="ascii")
 

@@ -13,7 +13,6 @@ from scan2sim.pipeline.io.network import drawn
 from scan2sim.pipeline.io.scene import Scene
 from scan2sim.pipeline.io.scenes import SceneParams
 from scan2sim.pipeline.roads import listed
-from scan2sim.pipeline.roads.lanes import sections
 from scan2sim.pipeline.step import Report
 
 
@@ -23,16 +22,17 @@ def write(scene: Scene, folder: Path, params: SceneParams, report: Report) -> di
     Raises:
         DataError: no lanes are told of.
     """
-    roads = drawn(scene)
-    if not opendrive.write(folder / f"{scene.name}.xodr", scene.name, scene.frame, roads):
+    if not write_roads(scene, folder):
         raise DataError(
             "opendrive", f"of {scene.name} no road's lanes are told", "See in docs/roads.md what they are told by"
         )
-    if len(scene.tiles) > 1:
-        listed.write(folder / f"{scene.name}_roads.geojson", scene.frame, roads)
     return {}
 
 
-def has_lanes(scene: Scene) -> bool:
-    """Whether there is something to write."""
-    return any(sections(road) for road in drawn(scene))
+def write_roads(scene: Scene, folder: Path) -> int:
+    """Write the network if any road has lanes; returns the number of roads that have."""
+    roads = drawn(scene)
+    count = opendrive.write(folder / f"{scene.name}.xodr", scene.name, scene.frame, roads)
+    if count and len(scene.tiles) > 1:
+        listed.write(folder / f"{scene.name}_roads.geojson", scene.frame, roads)
+    return count

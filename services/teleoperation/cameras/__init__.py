@@ -11,6 +11,7 @@ import numpy as np
 
 from scan2sim.pipeline import backends
 from scan2sim.pipeline.types import F64, U8
+from scan2sim.services.credentials import redacted
 from scan2sim.services.teleoperation import marks
 
 SILENT = 1.0
@@ -141,7 +142,7 @@ class Camera:
                 self._follow(self._open())
                 self.fault = "it gives no more pictures"
             except Exception as error:  # of any library: it is told, and looked for again
-                self.fault = str(error)
+                self.fault = redacted(str(error))
             pause = 0.1 if self.count > count else min(LONGEST_PAUSE, 2 * pause)
             self._closed.wait(pause)
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from scan2sim.pipeline.errors import InputError
+from scan2sim.services.credentials import redacted
 from scan2sim.services.teleoperation.cameras import Picture, View
 
 NEEDS, EXTRA = ("av",), "teleop"
@@ -40,7 +41,8 @@ def pictures(view: View) -> Iterator[Picture]:
                     captured = _captured(frame, came) if local else came
                     yield Picture(np.asarray(frame.to_ndarray(format="rgb24"), np.uint8), captured)
     except (av.FFmpegError, OSError, IndexError) as error:
-        raise InputError(view.where, f"gives no video ({error})", "See whether the camera is there") from None
+        cause = f"gives no video ({redacted(str(error))})"
+        raise InputError(redacted(view.where), cause, "Check its address and that it runs") from None
 
 
 def _captured(frame: Any, came: int) -> int:

@@ -11,6 +11,7 @@ import numpy as np
 
 from scan2sim.pipeline.errors import InputError
 from scan2sim.pipeline.types import U8
+from scan2sim.services.credentials import redacted
 from scan2sim.services.teleoperation.cameras import Picture, View, ticks
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
@@ -36,7 +37,8 @@ def _rounds(view: View) -> Iterator[U8]:
         if bytes_ <= KEPT:
             kept.append(image)
     if not bytes_:
-        raise InputError(view.where, "holds no pictures", f"Give a folder of {', '.join(SUFFIXES)}, or a video")
+        remedy = f"Give a folder of {', '.join(SUFFIXES)}, or a video"
+        raise InputError(redacted(view.where), "holds no pictures", remedy)
     while True:
         yield from kept if bytes_ <= KEPT else _images(view)
 

@@ -51,7 +51,9 @@ def obj(path: Path) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
             faces.setdefault(rows["usemtl"][-1][0], []).append(words)
     v, vt = np.array(rows["v"], float), np.array(rows["vt"], float)
     pictures, last = {}, ""
-    for key, *words in map(str.split, filter(None, (path.parent / rows["mtllib"][0][0]).read_text().splitlines())):
+    for key, *words in map(
+        str.split, filter(None, (path.parent / rows["mtllib"][0][0]).read_text(encoding="utf-8").splitlines())
+    ):
         last = words[0] if key == "newmtl" else last
         if key == "map_Kd":
             pictures[last] = image(path.parent / words[0])
@@ -145,7 +147,7 @@ def tiles3d(folder: Path, scene: Scene) -> Iterator[Shown]:
     import trimesh
     from pyproj import Transformer
 
-    tileset = json.loads((folder / "tileset.json").read_text())
+    tileset = json.loads((folder / "tileset.json").read_text(encoding="utf-8"))
     x, y, z, *axes = tileset["root"]["boundingVolume"]["box"]
     low, high = (np.array([x, y, z]) + sign * np.diag(np.reshape(axes, (3, 3))) for sign in (-1, 1))
     for tile in tileset["root"]["children"]:
@@ -167,9 +169,8 @@ TAGS = {"Terrain": 2, "Building": 6, "TrafficSign": 64}
 
 
 def carla(folder: Path, scene: Scene) -> Iterator[Shown]:
-    about = json.loads((folder / "carla" / f"{scene.name}.json").read_text())
-    (ground,) = about["maps"]
-    files = dict.fromkeys(ground.get("tiles", [ground.get("source")]), "")
+    about = json.loads((folder / "carla" / f"{scene.name}.json").read_text(encoding="utf-8"))
+    files = {file: "" for ground in about["maps"] for file in ground.get("tiles", [ground.get("source")])}
     for file, tag in (files | {prop["source"]: prop["tag"] for prop in about["props"]}).items():
         for name, corners, uv, picture in fbx(folder / "carla" / file):
             kind = tag or name.removeprefix(f"{scene.name}_").split("_")[0]
@@ -197,7 +198,7 @@ READERS: dict[str, Reader] = {
 
 def surveyed_off(folder: Path, scene: Scene, name: str) -> float:
     """Metres between a corner of the made-up scene's last house, as surveyed, and where a format's reader finds it."""
-    about = json.loads((folder / "metadata.json").read_text())
+    about = json.loads((folder / "metadata.json").read_text(encoding="utf-8"))
     x, y = made_up.HOUSE
     surveyed = scene.tiles[-1].frame.to_crs((x, y, 4.5))  # of the roof
     shown = np.concatenate([one.corners.reshape(-1, 3) for one in READERS[name](folder, scene)])

@@ -89,19 +89,26 @@ def make_drive(tmp_path: Path) -> Drive:
     folder = day / "2011_09_26_drive_0001_sync"
     for name in ("velodyne_points", "image_02", "oxts"):
         (folder / name / "data").mkdir(parents=True)
-    (day / "calib_imu_to_velo.txt").write_text(text(("R", T_velo_imu[:3, :3]), ("T", T_velo_imu[:3, 3])))
-    (day / "calib_velo_to_cam.txt").write_text(text(("R", T_cam_velo[:3, :3]), ("T", T_cam_velo[:3, 3])))
+    (day / "calib_imu_to_velo.txt").write_text(
+        text(("R", T_velo_imu[:3, :3]), ("T", T_velo_imu[:3, 3])), encoding="utf-8"
+    )
+    (day / "calib_velo_to_cam.txt").write_text(
+        text(("R", T_cam_velo[:3, :3]), ("T", T_cam_velo[:3, 3])), encoding="utf-8"
+    )
     (day / "calib_cam_to_cam.txt").write_text(
-        text(("R_rect_00", rectify.as_matrix()), ("S_rect_02", np.array([WIDTH, HEIGHT])), ("P_rect_02", P))
+        text(("R_rect_00", rectify.as_matrix()), ("S_rect_02", np.array([WIDTH, HEIGHT])), ("P_rect_02", P)),
+        encoding="utf-8",
     )
     for name, shift in (("timestamps_start", -PERIOD / 2), ("timestamps", 0.0), ("timestamps_end", PERIOD / 2)):
-        (folder / "velodyne_points" / f"{name}.txt").write_text("\n".join(stamp(t + shift) for t in times))
-    (folder / "oxts" / "timestamps.txt").write_text("\n".join(stamp(t + LATE) for t in times))
+        (folder / "velodyne_points" / f"{name}.txt").write_text(
+            "\n".join(stamp(t + shift) for t in times), encoding="utf-8"
+        )
+    (folder / "oxts" / "timestamps.txt").write_text("\n".join(stamp(t + LATE) for t in times), encoding="utf-8")
     pixels = np.empty((0, 2))
     for i, t in enumerate(times):
         lon, lat = place(t + LATE)
         record = f"{lat:.14f} {lon:.14f} 114.0 0 0 {YAW}" + " 0" * 24
-        (folder / "oxts" / "data" / f"{i:010d}.txt").write_text(record)
+        (folder / "oxts" / "data" / f"{i:010d}.txt").write_text(record, encoding="utf-8")
         seen = np.empty_like(world)
         for k, point in enumerate(world):
             when = t
@@ -203,17 +210,17 @@ def test_damaged_files_are_named_and_leave_nothing(drive: Drive, tmp_path: Path,
 
 
 def test_a_short_pose_file_no_drive_and_a_full_folder_are_refused(drive: Drive, tmp_path: Path) -> None:
-    (tmp_path / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n")
+    (tmp_path / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n", encoding="utf-8")
     with pytest.raises(InputError, match=r"poses\.txt: has 1 poses, but sweep 3"):
         import_kitti_raw(drive.folder, tmp_path / "tile", poses=tmp_path / "poses.txt")
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match=r"empty: holds no KITTI raw drive.*_sync"):
         import_kitti_raw(tmp_path / "empty", tmp_path / "tile")
     (tmp_path / "tile").mkdir()
-    (tmp_path / "tile" / "mine.txt").write_text("keep")
+    (tmp_path / "tile" / "mine.txt").write_text("keep", encoding="utf-8")
     with pytest.raises(SettingError, match=r"tile: exists and is not empty.*overwritten"):
         import_kitti_raw(drive.folder, tmp_path / "tile")
-    assert (tmp_path / "tile" / "mine.txt").read_text() == "keep"
+    assert (tmp_path / "tile" / "mine.txt").read_text(encoding="utf-8") == "keep"
 
 
 def test_cloud_and_photos_of_a_real_drive_agree(real_data: Path, tmp_path: Path) -> None:

@@ -67,7 +67,8 @@ def make_sequence(tmp_path: Path) -> Path:
     np.savetxt(folder / "times.txt", 0.1 * np.arange(FRAMES), "%.6e")
     rows = {"P0": P2, "P2": P2, "Tr": TR[:3]}
     (folder / "calib.txt").write_text(
-        "".join(f"{key}: {' '.join(f'{v:.12e}' for v in value.ravel())}\n" for key, value in rows.items())
+        "".join(f"{key}: {' '.join(f'{v:.12e}' for v in value.ravel())}\n" for key, value in rows.items()),
+        encoding="utf-8",
     )
     return folder
 
@@ -106,7 +107,7 @@ def test_the_command_and_poses_of_ones_own(sequence: Path, tmp_path: Path) -> No
     ],
 )
 def test_a_damaged_sequence_is_refused(sequence: Path, tmp_path: Path, file: str, body: str, cause: str) -> None:
-    (sequence / file).write_text(body)
+    (sequence / file).write_text(body, encoding="utf-8")
     with pytest.raises(InputError, match=cause):
         import_kitti_odometry(sequence, tmp_path / "tile")
     assert not (tmp_path / "tile").exists()

@@ -128,7 +128,7 @@ def opensfm(path: Path, kind: str, reference: dict[str, float] | None = None, tu
     points = {str(i): {"coordinates": [i, 2 * i, 3], "color": [i, 20, 30]} for i in range(9)}
     part = {"cameras": {"v2 lens": camera}, "shots": entries, "points": points}
     small = {"cameras": {"v2 lens": camera}, "shots": {"other.jpg": entries[name]}, "points": {}}
-    path.write_text(json.dumps([small, part | ({"reference_lla": reference} if reference else {})]))
+    path.write_text(json.dumps([small, part | ({"reference_lla": reference} if reference else {})]), encoding="utf-8")
     return path
 
 
@@ -162,7 +162,7 @@ def test_opensfm_lies_where_its_reference_says(tmp_path: Path, crs: str | None) 
     code = {None: "EPSG:32633", "odm": "EPSG:32632"}.get(crs, crs)
     if crs == "odm":
         (tmp_path / "odm_georeferencing").mkdir()
-        (tmp_path / "odm_georeferencing" / "coords.txt").write_text("WGS84 UTM 32N\n390000 5800000\n")
+        (tmp_path / "odm_georeferencing" / "coords.txt").write_text("WGS84 UTM 32N\n390000 5800000\n", encoding="utf-8")
     tile = read_tile(import_model("opensfm", tmp_path, images(), tmp_path / "t", crs=None if crs == "odm" else crs))
     assert tile.frame.crs == code
     poses = {Path(name).stem: pose for name, pose in shots()}
@@ -196,7 +196,8 @@ def metashape(path: Path, kind: str, values: dict[str, float], transform: str = 
         f'<calibration type="{kind}" class="adjusted">{resolution}{tags}</calibration></sensor></sensors>'
         f'<cameras><group id="0">{rows}</group><camera id="99" sensor_id="0" label="lost"/>'
         f'<camera id="98" sensor_id="0" label="off" enabled="false"><transform>1</transform></camera></cameras>'
-        f"{f'<reference>{reference}</reference>' if reference else ''}{transform}</chunk></document>"
+        f"{f'<reference>{reference}</reference>' if reference else ''}{transform}</chunk></document>",
+        encoding="utf-8",
     )
     return path
 
@@ -253,9 +254,9 @@ def test_of_metashapes_components_the_largest_is_taken(tmp_path: Path) -> None:
     moved = similarity(3.0, np.eye(3), np.array([1.0, 2, 3]))
     parts = f'<components><component id="0">{moved}</component><component id="1"/></components>'
     path = metashape(tmp_path / "cameras.xml", "frame", BROWN, f"{parts}{similarity(9.0, np.eye(3), np.zeros(3))}")
-    text = path.read_text()
+    text = path.read_text(encoding="utf-8")
     first = text.index('component_id="0"')
-    path.write_text(text[:first] + 'component_id="1"' + text[first + len('component_id="0"') :])
+    path.write_text(text[:first] + 'component_id="1"' + text[first + len('component_id="0"') :], encoding="utf-8")
     model = read("metashape", path, images())
     assert len(model.shots) == len(shots()) - 1 and "1 photos of 1 smaller components" in model.notes[0]
     assert np.allclose(model.centres, [3 * pose[:3, 3] + [1, 2, 3] for _, pose in shots()[1:]])
@@ -335,8 +336,10 @@ def bundler(folder: Path, f: float, k1: float, k2: float) -> Path:
         rows.append(" ".join(map(repr, (-R @ pose[:3, 3]).tolist())))
     rows += ["1.5 2.5 3.5", "255 0 9", "2 0 5 1.0 2.0 1 7 3.0 4.0", "4 5 6", "1 2 3", "0"]
     folder.mkdir(parents=True)
-    (folder / "bundle.out").write_text("\n".join(rows) + "\n")
-    (folder / "list.txt").write_text("\n".join(["lost.jpg", *(f"./{name} 0 {f}" for name, _ in shots())]) + "\n")
+    (folder / "bundle.out").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    (folder / "list.txt").write_text(
+        "\n".join(["lost.jpg", *(f"./{name} 0 {f}" for name, _ in shots())]) + "\n", encoding="utf-8"
+    )
     return folder / "bundle.out"
 
 
@@ -354,7 +357,7 @@ def nvm(path: Path, f: float, r: float, fixed: str = "") -> Path:
         x, y, z, w = Rotation.from_matrix(pose[:3, :3].T).as_quat().tolist()
         rows.append(f"{name}\t{f} {w!r} {x!r} {y!r} {z!r} {' '.join(map(repr, pose[:3, 3].tolist()))} {r} 0")
     rows += ["", "1", "1.5 2.5 3.5 255 0 9 2 0 5 1.0 2.0 1 7 3.0 4.0", "", "0"]
-    path.write_text("\n".join(rows))
+    path.write_text("\n".join(rows), encoding="utf-8")
     return path
 
 
@@ -415,7 +418,9 @@ def test_the_command_makes_a_tile(tmp_path: Path, kind: str) -> None:
 def test_opensfm_numbers_beyond_all_bounds_are_refused(tmp_path: Path) -> None:
     path = WRITERS["opensfm"](tmp_path)
     for number in ("Infinity", "1" + 400 * "0"):
-        path.write_text(re.sub(r'"width": [^,]+', f'"width": {number}', path.read_text()))
+        path.write_text(
+            re.sub(r'"width": [^,]+', f'"width": {number}', path.read_text(encoding="utf-8")), encoding="utf-8"
+        )
         with pytest.raises(InputError, match="lacks or misstates"):
             read("opensfm", path, images())
 

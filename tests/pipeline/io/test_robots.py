@@ -59,7 +59,7 @@ def test_it_starts_on_the_ground_at_the_ways_beginning_and_faces_along_it(town: 
     assert z == pytest.approx(float(made_up.height(np.array(x), np.array(y))), abs=0.06)
     roll, pitch, yaw = start.angles
     assert yaw == pytest.approx(0, abs=0.05) and abs(roll) < 0.15 and abs(pitch) < 0.15
-    told = json.loads((exported / "metadata.json").read_text())["robot"]
+    told = json.loads((exported / "metadata.json").read_text(encoding="utf-8"))["robot"]
     assert told == {"name": "robot", "position_m": [x, y, z], "angles_rad": [roll, pitch, yaw], "on": "path"}
 
 
@@ -124,7 +124,7 @@ def test_gazebos_world_has_the_systems_that_its_sensors_and_drive_need(exported:
     systems = {plugin.attrib["name"].split("::")[-1] for plugin in world.iter("plugin")}
     assert systems >= {"Physics", "Sensors", "SceneBroadcaster", "UserCommands", "Imu"}
     (include,) = (one for one in world.iter("include") if one.findtext("uri") == "model://robot")
-    told = json.loads((exported / "metadata.json").read_text())["robot"]
+    told = json.loads((exported / "metadata.json").read_text(encoding="utf-8"))["robot"]
     pose = np.array(include.findtext("pose", "").split(), float)
     np.testing.assert_allclose(pose, [*told["position_m"], *told["angles_rad"]], atol=1e-6)
     assert world.findtext(".//performer/ref") == "robot"  # levels load around it
@@ -143,7 +143,10 @@ def test_it_drives_ahead_in_mujoco(exported: Path) -> None:
     data = mujoco.MjData(model)
     data.ctrl[:] = ROBOT.turning(1.0, 0.0)
     mujoco.mj_step(model, data, nstep=int(3 / model.opt.timestep))
-    x, y, z = data.body("robot").xpos - json.loads((exported / "metadata.json").read_text())["robot"]["position_m"]
+    x, y, z = (
+        data.body("robot").xpos
+        - json.loads((exported / "metadata.json").read_text(encoding="utf-8"))["robot"]["position_m"]
+    )
     assert 2.5 < x < 3.1 and abs(y) < 0.5 and abs(z) < 0.5
     assert data.camera("camera").xmat.reshape(3, 3)[0, 2] < -0.9  # it looks along x
 
@@ -154,7 +157,7 @@ def test_it_drives_and_turns_in_pybullet(exported: Path) -> None:
     try:
         bullet.setGravity(0, 0, -9.8)
         bullet.loadURDF(str(exported / "town.urdf"), useFixedBase=True)
-        start = json.loads((exported / "metadata.json").read_text())["robot"]
+        start = json.loads((exported / "metadata.json").read_text(encoding="utf-8"))["robot"]
         turned = bullet.getQuaternionFromEuler(start["angles_rad"])
         robot = bullet.loadURDF(str(exported / "robot.urdf"), start["position_m"], turned)
         joints = {bullet.getJointInfo(robot, i)[1].decode(): i for i in range(bullet.getNumJoints(robot))}

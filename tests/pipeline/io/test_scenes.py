@@ -96,14 +96,26 @@ def test_a_scene_without_a_crs_has_no_georeference(tmp_path: Path, name: str) ->
     scene = made_up.scene(tmp_path, Frame(), tiles=1)
     written(scene, name, tmp_path / "out")
     assert faces(list(READERS[name](tmp_path / "out", scene))).shape == faces(expected(scene)).shape
-    assert json.loads((tmp_path / "out" / "metadata.json").read_text())["wgs84"] is None
+    assert json.loads((tmp_path / "out" / "metadata.json").read_text(encoding="utf-8"))["wgs84"] is None
+
+
+@each
+def test_a_scene_without_ground_shows_all_else(tmp_path: Path, name: str) -> None:
+    scene = made_up.scene(tmp_path, tiles=1)
+    (tile,) = scene.tiles
+    solid = tile.solid()
+    assert solid.classification is not None
+    solid.keep(solid.classification != CODE["terrain"]).save(tile.folder / "collision.npz")
+    bare = replace(scene, tiles=(replace(tile, groups={"building": tile.groups["building"]}),))
+    folder = written(bare, name, tmp_path / "out")
+    assert faces(list(READERS[name](folder, bare))).shape == faces(expected(bare)).shape
 
 
 @each
 def test_surveyed_points_are_where_they_were_surveyed_5_km_away(tmp_path: Path, name: str) -> None:
     scene = made_up.scene(tmp_path, tiles=2, apart=5000.0)
     folder = written(scene, name, tmp_path / "out")
-    assert json.loads((folder / "metadata.json").read_text())["crs"] == "EPSG:32632"
+    assert json.loads((folder / "metadata.json").read_text(encoding="utf-8"))["crs"] == "EPSG:32632"
     assert surveyed_off(folder, scene, name) < 0.01
 
 
@@ -119,13 +131,13 @@ def test_worlds_that_keep_no_scene_are_told_of(tmp_path: Path) -> None:
         read_scene(tmp_path)
     world = made_up.world(tmp_path).files["world"]
     about = world / "scene" / "scene.json"
-    about.write_text(about.read_text().replace('"version": 1', '"version": 9'))
+    about.write_text(about.read_text(encoding="utf-8").replace('"version": 1', '"version": 9'), encoding="utf-8")
     with pytest.raises(InputError, match=r"version 9.*run.*again"):
         read_scene(world)
     about.unlink()
     with pytest.raises(InputError, match=r"earlier version.*run.*again"):
         read_scene(world)
-    about.write_text("{")
+    about.write_text("{", encoding="utf-8")
     with pytest.raises(InputError, match=r"can't be read.*run.*again"):
         read_scene(world)
 
@@ -136,7 +148,7 @@ def test_boxes_of_levels_hold_what_they_show_and_finer_ones(tmp_path: Path) -> N
     town = made_up.scene(tmp_path)
     fine = tuple(Level(tile) for tile in town.tiles)
     written(replace(town, coarse=Level(town.tiles[0], 1, 0.5, 0.1, fine)), "tiles3d", tmp_path / "out")
-    root = json.loads((tmp_path / "out" / "tileset.json").read_text())["root"]
+    root = json.loads((tmp_path / "out" / "tileset.json").read_text(encoding="utf-8"))["root"]
     assert root["geometricError"] == 1.6 and root["extras"] == {"error_m": 0.5, "texel_m": 0.1}  # 16 texels
 
     def check(node: dict[str, Any]) -> np.ndarray:
@@ -165,7 +177,7 @@ def test_carla_tells_road_from_terrain_and_all_else_by_its_tag(tmp_path: Path) -
     meshes = {name: corners for name, corners, *_ in fbx(tmp_path / "out" / "carla" / "town" / "town.fbx")}
     assert meshes.keys() == {"town_Road_Road_tile0_1", "town_Terrain_tile0_0"}  # a page for each half
     assert meshes["town_Road_Road_tile0_1"][..., 0].min() > -1e-6
-    about = json.loads((tmp_path / "out" / "carla" / "town.json").read_text())
+    about = json.loads((tmp_path / "out" / "carla" / "town.json").read_text(encoding="utf-8"))
     assert {prop["name"]: prop["tag"] for prop in about["props"]} == {
         "town_tile0_building": "Building", "town_tile0_building_road_sign": "TrafficSign",
     }  # fmt: skip
@@ -174,7 +186,7 @@ def test_carla_tells_road_from_terrain_and_all_else_by_its_tag(tmp_path: Path) -
 def test_ground_too_long_for_a_carla_map_comes_in_squares_from_the_north_west(tmp_path: Path) -> None:
     town = made_up.scene(tmp_path, apart=3000.0)
     written(town, "carla", tmp_path / "out")
-    (about,) = json.loads((tmp_path / "out" / "carla" / "town.json").read_text())["maps"]
+    (about,) = json.loads((tmp_path / "out" / "carla" / "town.json").read_text(encoding="utf-8"))["maps"]
     assert about["tiles"] == ["./town/town_Tile_0_0.fbx", "./town/town_Tile_1_0.fbx"]
     (name, corners, _, picture), *_ = fbx(tmp_path / "out" / "carla" / "town" / "town_Tile_1_0.fbx")
     assert name.startswith("town_Terrain_tile1") and corners[..., 0].min() == pytest.approx(2990, abs=0.01)

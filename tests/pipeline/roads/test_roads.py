@@ -16,7 +16,8 @@ from scan2sim.pipeline.errors import DataError
 from scan2sim.pipeline.io import opendrive, scenes
 from scan2sim.pipeline.io.scene import ROADS as SEEN
 from scan2sim.pipeline.io.scenes import SceneParams
-from scan2sim.pipeline.roads import listed, model, observed
+from scan2sim.pipeline.io.scenes import opendrive as opendrive_of_scenes
+from scan2sim.pipeline.roads import listed, model, observed, profile
 from scan2sim.pipeline.roads.course import course
 from scan2sim.pipeline.roads.lanes import sections
 from scan2sim.pipeline.roads.model import Road
@@ -47,7 +48,7 @@ def drawn(done: Done, frame: Frame = STREET.frame) -> list[Road]:
 
 
 def features(done: Done) -> list[dict[str, Any]]:
-    return list(json.loads(done.files["geojson"].read_text())["features"])
+    return list(json.loads(done.files["geojson"].read_text(encoding="utf-8"))["features"])
 
 
 def test_lines_lie_where_the_road_has_them(done: Done) -> None:
@@ -102,7 +103,7 @@ def test_opendrive_is_whole(done: Done, tmp_path: Path) -> None:
 def test_carla_drives_in_the_true_lanes(done: Done, tmp_path: Path) -> None:
     carla = pytest.importorskip("carla", reason="CARLA's library isn't here (pip install carla==0.9.16)")
     opendrive.write(tmp_path / "road.xodr", "road", STREET.frame, drawn(done))
-    points = carla.Map("road", (tmp_path / "road.xodr").read_text()).generate_waypoints(1.0)
+    points = carla.Map("road", (tmp_path / "road.xodr").read_text(encoding="utf-8")).generate_waypoints(1.0)
     places = np.array([(p.transform.location.x, -p.transform.location.y, p.transform.location.z) for p in points])
     s, t = STREET.locate(places[:, :2])
     lane = np.array([p.lane_id for p in points])
@@ -191,6 +192,35 @@ def test_bad_input_says_why_there_is_no_road(tmp_path: Path) -> None:
     assert not (tmp_path / "x.xodr").exists()
 
 
+def test_a_road_without_points_of_its_surface_is_left_out_with_a_warning(tmp_path: Path) -> None:
+    cloud = STREET.cloud()
+    _, t = STREET.locate(cloud.xyz[:, :2])
+    done = run(tmp_path, STREET.inputs(tmp_path, cloud=cloud.take(np.abs(t) > model.NEAR + 0.2)))
+    (warning,) = done.warnings
+    assert warning.endswith("is left out: no point of its surface is within 3 m of its line")
+    assert features(done) == [] and done.facts["roads"] == [] and "none" not in done.facts
+    assert not list(done.files["opendrive"].iterdir())
+    scene = worlds.scene(tmp_path / "town", STREET.frame, tiles=1)
+    (scene.tiles[0].folder / SEEN).write_bytes(done.files["seen"].read_bytes())
+    assert opendrive_of_scenes.write_roads(scene, tmp_path) == 0
+
+
+def test_a_profile_through_no_points_is_refused() -> None:
+    with pytest.raises(ValueError, match="at least one value"):
+        profile.fit(np.linspace(0, 10, 2), np.zeros(0), np.zeros(0), 0.02, 0.05)
+    flat = profile.fit(np.linspace(0, 10, 2), np.array([5.0]), np.array([1.5]), 0.02, 0.05)
+    assert float(flat.at(5.0)) == pytest.approx(1.5, abs=1e-3)
+
+
+def test_a_tiles_opendrive_is_that_of_its_world(done: Done, tmp_path: Path) -> None:
+    (file,) = done.files["opendrive"].iterdir()
+    scene = worlds.scene(tmp_path, STREET.frame, tiles=1)
+    (scene.tiles[0].folder / SEEN).write_bytes(done.files["seen"].read_bytes())
+    assert file.name == "tile.xodr" and opendrive_of_scenes.write_roads(scene, tmp_path) == 1
+    own, whole = (ET.parse(path).getroot().findall("road") for path in (file, tmp_path / "town.xodr"))
+    assert [road.attrib for road in own] == [road.attrib for road in whole]
+
+
 def test_a_road_over_two_tiles_is_one(tmp_path: Path) -> None:
     inputs = STREET.inputs(tmp_path)
     x, y, _ = STREET.frame.origin
@@ -207,7 +237,7 @@ def test_a_road_over_two_tiles_is_one(tmp_path: Path) -> None:
     root = ET.parse(tmp_path / "export" / "town.xodr").getroot()
     (road,) = root.findall("road")
     assert float(road.attrib["length"]) == pytest.approx(STREET.length, abs=3)
-    lines = json.loads((tmp_path / "export" / "town_roads.geojson").read_text())["features"]
+    lines = json.loads((tmp_path / "export" / "town_roads.geojson").read_text(encoding="utf-8"))["features"]
     assert {f["properties"]["road"] for f in lines} == {1} and len(lines) == 6
     for line in lines:
         _, t = STREET.locate(STREET.frame.to_local(line["geometry"]["coordinates"])[:, :2])

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from scan2sim.pipeline.classes import CODE
 from scan2sim.pipeline.errors import DataError
 from scan2sim.pipeline.step import Done, silent
 from scan2sim.pipeline.steps.collision import COLLISION, CollisionParams
-from scan2sim.pipeline.types import Mesh
+from scan2sim.pipeline.types import Mesh, PointCloud
 from tests.pipeline import made_up
+
+NONE = Mesh(made_up.UTM, np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
 
 
 def _run(folder: Path, meshes: dict[str, Mesh], **params: object) -> tuple[Mesh, Done]:
@@ -55,10 +57,25 @@ def test_plants_are_solid_only_when_asked(tmp_path: Path) -> None:
     assert _run(tmp_path, meshes, vegetation=True)[0].vertices[:, 2].max() > 4
 
 
+def test_plants_are_solid_where_nothing_else_is(tmp_path: Path) -> None:
+    mesh, done = _run(tmp_path, {"terrain": NONE, "building": NONE, "vegetation": made_up.house()})
+    assert mesh.vertices[:, 2].max() > 4 and "plants are solid" in done.warnings[0]
+    assert mesh.classification is not None and set(mesh.classification.tolist()) == {CODE["high_vegetation"]}
+
+
 def test_nothing_solid_is_refused(tmp_path: Path) -> None:
-    none = replace(made_up.house(), faces=np.zeros((0, 3), np.int32), uv=None, page=None)
-    with pytest.raises(DataError, match=r"terrain and building are empty.*vegetation=true"):
-        _run(tmp_path, {"terrain": none, "vegetation": made_up.house()})
+    with pytest.raises(DataError, match="terrain, building and vegetation are empty"):
+        _run(tmp_path, {"terrain": NONE, "vegetation": NONE})
+
+
+def test_points_of_the_ground_that_make_no_surface_do_no_harm(tmp_path: Path) -> None:
+    few = made_up.ground(3).vertices
+    PointCloud(made_up.UTM, few, classification=np.full(len(few), CODE["road"], np.uint8)).save(tmp_path / "cloud.npz")
+    inputs = {"terrain": tmp_path / "terrain.npz", "building": tmp_path / "building.npz"}
+    NONE.save(inputs["terrain"])
+    made_up.house().save(inputs["building"])
+    done = COLLISION.run({**inputs, "cloud": tmp_path / "cloud.npz"}, CollisionParams(), tmp_path, silent)
+    assert done.facts["ground_triangles"] == 0 and done.facts["ground_m2"] == {} and done.facts["triangles"] > 0
 
 
 def _in_house(xyz: np.ndarray) -> np.ndarray:

@@ -71,7 +71,7 @@ def test_model_names_files_that_exist(tmp_path: Path) -> None:
 
 def test_a_large_group_is_split_and_nothing_is_lost(tmp_path: Path) -> None:
     world = made_up.world(tmp_path, max_visual_triangles=1000).files["world"]
-    counts = json.loads((world / "metadata.json").read_text())["triangles_by_file"]
+    counts = json.loads((world / "metadata.json").read_text(encoding="utf-8"))["triangles_by_file"]
     for suffix in (".obj", ".dae"):
         parts = [n for file, n in counts.items() if "terrain_part" in file and file.endswith(suffix)]
         assert len(parts) == 4 and max(parts) <= 1000 and sum(parts) == 3200
@@ -83,7 +83,7 @@ def test_a_large_group_is_split_and_nothing_is_lost(tmp_path: Path) -> None:
 
 def test_metadata_puts_the_tile_on_the_map(tmp_path: Path) -> None:
     world = made_up.world(tmp_path).files["world"]
-    metadata = json.loads((world / "metadata.json").read_text())
+    metadata = json.loads((world / "metadata.json").read_text(encoding="utf-8"))
     assert metadata["crs"] == "EPSG:32632" and metadata["unit_m"] == 1.0
     assert metadata["origin_m"] == list(made_up.UTM.origin)
     assert metadata["wgs84"]["latitude_deg"] == pytest.approx(48.13986, abs=1e-5)
@@ -108,15 +108,15 @@ def test_tiles_share_a_georeference_through_the_pose_alone(tmp_path: Path) -> No
 
 def test_a_local_tile_has_no_georeference(tmp_path: Path) -> None:
     world = made_up.world(tmp_path, frame=Frame()).files["world"]
-    assert "spherical_coordinates" not in (world / "street.sdf").read_text()
-    metadata = json.loads((world / "metadata.json").read_text())
+    assert "spherical_coordinates" not in (world / "street.sdf").read_text(encoding="utf-8")
+    metadata = json.loads((world / "metadata.json").read_text(encoding="utf-8"))
     assert metadata["crs"] == "local" and metadata["wgs84"] is None
 
 
 def test_formats_are_chosen(tmp_path: Path) -> None:
     world = made_up.world(tmp_path, formats=("gazebo",), meshes=("collada",)).files["world"]
     assert not list(world.rglob("*.glb")) and all(p.name.startswith("collision_") for p in world.rglob("*.obj"))
-    assert "terrain.dae" in (world / "models/street/model.sdf").read_text()
+    assert "terrain.dae" in (world / "models/street/model.sdf").read_text(encoding="utf-8")
     with pytest.raises(SettingError, match=r"export.meshes: has nothing that Gazebo shows"):
         EXPORT.run({}, ExportParams(meshes=()), tmp_path, silent)
 
@@ -136,10 +136,10 @@ def test_lists_of_plants_are_put_beside_the_world(tmp_path: Path) -> None:
     inputs = _inputs(tmp_path, building=made_up.house())
     for key, file in {"plants": "a.geojson", "plants_csv": "b.csv"}.items():
         inputs[key] = tmp_path / file
-        inputs[key].write_text(key)
+        inputs[key].write_text(key, encoding="utf-8")
     world = EXPORT.run(inputs, ExportParams(), tmp_path / "out", silent).files["world"]
-    assert (world / "plants.geojson").read_text() == "plants"
-    assert (world / "plants.csv").read_text() == "plants_csv"
+    assert (world / "plants.geojson").read_text(encoding="utf-8") == "plants"
+    assert (world / "plants.csv").read_text(encoding="utf-8") == "plants_csv"
 
 
 def test_what_does_not_fit_together_is_refused(tmp_path: Path) -> None:
@@ -174,10 +174,9 @@ def test_pages_as_jpeg(tmp_path: Path) -> None:
     world = made_up.world(tmp_path, pages="jpeg").files["world"]
     meshes = world / "models/street/meshes"
     assert not list(meshes.glob("*.png"))
-    assert (
-        "terrain_0.jpg" in (meshes / "terrain.mtl").read_text()
-        and "terrain_0.jpg" in (meshes / "terrain.dae").read_text()
-    )
+    assert "terrain_0.jpg" in (meshes / "terrain.mtl").read_text(encoding="utf-8") and "terrain_0.jpg" in (
+        meshes / "terrain.dae"
+    ).read_text(encoding="utf-8")
     with Image.open(meshes / "terrain_0.jpg") as copy, Image.open(tmp_path / "terrain/page_0.png") as page:
         assert copy.format == "JPEG" and copy.size == page.size
 
@@ -189,4 +188,4 @@ def test_normals_and_uv_have_no_nan(tmp_path: Path) -> None:
         house, faces=faces, uv=np.concatenate([uv, uv[:1]]), page=np.append(present(house.page), np.int16(0))
     )
     EXPORT.run(_inputs(tmp_path, building=flat), ExportParams(), tmp_path / "out", silent)
-    assert not [p for p in (tmp_path / "out").rglob("*.obj") if "nan" in p.read_text()]
+    assert not [p for p in (tmp_path / "out").rglob("*.obj") if "nan" in p.read_text(encoding="utf-8")]

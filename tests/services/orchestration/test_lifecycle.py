@@ -272,9 +272,17 @@ def test_secrets_are_never_told(
 
 
 def test_addresses_without_tls_are_refused() -> None:
-    for address in ("http://osm.example.org", "https://user:pw@osm.example.org", "ftp://x", "https://x/other"):
-        with pytest.raises(SettingError):
+    for address in (
+        "http://osm.example.org",
+        "http://user:hunter2@osm.example.org",
+        "https://user:hunter2@osm.example.org",
+        "https://:hunter2@osm.example.org",
+        "ftp://x",
+        "https://x/other",
+    ):
+        with pytest.raises(SettingError) as caught:
             Connection(osm=address).northbound()
+        assert "hunter2" not in str(caught.value)
     assert Connection(osm="osm.example.org").northbound() == "https://osm.example.org:9999"
     with Osm(Connection(osm="http://127.0.0.1:9")) as osm, pytest.raises(UnavailableError, match="can't be reached"):
         osm.instances()

@@ -106,10 +106,28 @@ def test_a_charts_templates_are_what_kubernetes_takes_once_values_are_in(which: 
         filled = re.sub(r"\{\{ toJson \.Values\.(\w+) \}\}", put, text)
         made[path] = json.loads(re.sub(r"\{\{ .*? \}\}", "x", filled))
     spec = made["templates/deployment.yaml"]["spec"]
-    container = spec["template"]["spec"]["containers"][0]
+    pod = spec["template"]["spec"]
+    container = pod["containers"][0]
     assert spec["replicas"] == 1 and spec["selector"]["matchLabels"] == spec["template"]["metadata"]["labels"]
     assert made["templates/variables.yaml"]["data"] == service.variables
+    assert bool(service.token) == ("volumeMounts" in container) == bool(pod["volumes"])
+    if service.token:
+        (mounted,), (volume,) = container["volumeMounts"], pod["volumes"]
+        (item,) = volume["secret"]["items"]
+        assert made["templates/token.yaml"]["data"].keys() == {item["key"]} and mounted["name"] == volume["name"]
+        assert f"{mounted['mountPath']}/{item['path']}" == service.token
     assert container["ports"][0]["name"] == made["templates/service.yaml"]["spec"]["ports"][0]["targetPort"]
+
+
+@pytest.mark.parametrize("which", description.names())
+def test_what_listens_in_a_cluster_has_a_token(which: str) -> None:
+    """Pods are reached by others, and the services of this project refuse to listen there without a token."""
+    service = description.read(which)
+    words = (*service.command, *service.arguments)
+    if words[:1] == ("prefect",):  # a worker, which serves its health alone
+        assert service.token is None
+    else:
+        assert service.token and words[words.index("--token") + 1] == service.token
 
 
 def test_a_package_is_known_by_what_it_holds_not_by_its_name(tmp_path: Path) -> None:

@@ -1,7 +1,9 @@
-"""A street whose desk has its page, for tests that look at it."""
+"""A street whose desk has its page, for tests that look at it; and the desk as a process of its own."""
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,7 +14,8 @@ from typing import Any
 from scan2sim.services import serving
 from scan2sim.services.served import Served
 from scan2sim.services.teleoperation.cockpit import Screens, application
-from tests.services.teleoperation.street import Desk, Street, until
+from tests.ports import free_port
+from tests.services.teleoperation.street import HERE, Desk, Street, until
 
 
 @dataclass
@@ -51,3 +54,18 @@ def page_of(street: Street, params: Served) -> Cockpit:
     desk.show = screens.show
     app = application(params, desk.station, screens, lambda what, vehicle: True)
     return Cockpit(street, desk, app, screens)
+
+
+@contextmanager
+def station_process(street: Street) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """The command `teleop station` for the street's desk, and the address of its page."""
+    words = [street.parties / "station-desk", f"{HERE}:{street.gateway.port}"]
+    words += ["--listening", f"{HERE}:{free_port()}", "--port", free_port()]
+    command = [sys.executable, "-m", "scan2sim.flows.cli", "teleop", "station", *map(str, words)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            page = next((line for line in process.stdout if "the driver's page is" in line), "")
+            yield process, page.split()[-1]
+        finally:
+            process.kill()

@@ -15,7 +15,9 @@ from scan2sim.pipeline.errors import InputError, SettingError
 from scan2sim.pipeline.types import U8
 from scan2sim.services.teleoperation import cameras, marks
 from scan2sim.services.teleoperation.cameras import Mount, View, pattern, world
+from scan2sim.services.teleoperation.settings import VehicleParams
 from tests.pipeline import made_up
+from tests.ports import free_port
 from tests.services.teleoperation.videos import psnr, scenery
 
 take = itertools.islice
@@ -114,6 +116,44 @@ def test_a_camera_in_the_network_is_read_and_found_again_with_another_size() -> 
     server.server.shutdown()
     server.server.server_close()
     assert seen == {(120, 160, 3), (240, 320, 3)}
+
+
+@pytest.mark.parametrize("kind", ["device", "replay"])
+@pytest.mark.parametrize("scheme", ["rtsp", "http"])
+def test_an_unreachable_camera_is_reported_without_its_credentials(kind: str, scheme: str) -> None:
+    """To the driver, whose page shows the fault, as to who starts the vehicle."""
+    address = f"{scheme}://admin:hunter2@127.0.0.1:{free_port()}/live?token=s3cret"
+    expected = address.replace("admin:hunter2", "***").replace("s3cret", "***")
+    with pytest.raises(InputError) as caught:
+        next(cameras.pictures(kind, View(address)))
+    camera = cameras.Camera("front", lambda: cameras.pictures(kind, View(address)))
+    end = time.monotonic() + 30
+    while not camera.fault and time.monotonic() < end:
+        time.sleep(0.02)
+    camera.close()
+    for text in (str(caught.value), repr(caught.value), camera.fault):
+        assert expected in text and "hunter2" not in text and "s3cret" not in text
+
+
+def test_an_address_without_a_name_is_refused_without_its_credentials(tmp_path: Path) -> None:
+    pytest.importorskip("OpenSSL", reason="the extra teleop isn't installed")
+    from scan2sim.services.teleoperation import vehicle
+
+    camera = "rtsp://admin:hunter2@192.0.2.1/live"
+    with pytest.raises(SettingError, match=r"--camera: rtsp://\*\*\*@192\.0\.2\.1/live is no NAME=VALUE"):
+        vehicle._cameras(VehicleParams(certificates=tmp_path, gateway="gate.example", camera=(camera,)))
+
+
+def test_an_error_of_a_library_is_reported_without_the_cameras_credentials() -> None:
+    def broken() -> Iterator[cameras.Picture]:
+        raise OSError("no route to rtsp://admin:hunter2@192.0.2.1/live")
+
+    camera = cameras.Camera("front", broken)
+    end = time.monotonic() + 30
+    while not camera.fault and time.monotonic() < end:
+        time.sleep(0.02)
+    camera.close()
+    assert camera.fault == "no route to rtsp://***@192.0.2.1/live"
 
 
 def test_a_simulated_camera_sees_the_world_from_where_its_vehicle_is(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from PIL import Image
 pytest.importorskip("cyclonedds", reason="the extra bus isn't installed")
 
 from scan2sim.services.toolboxes.settings import IMAGE
+from tests.ports import free_port
 from tests.services.conftest import Start
 from tests.services.toolboxes import hearing, shaky
 from tests.services.toolboxes.test_sources import film
@@ -81,6 +83,20 @@ def test_a_cameras_images_become_results(start: Start, folder: Path) -> None:
         level = int(one["body"]["classes"][0]["label"])
         assert one["source"] == "/front" and min(abs(level - known) for known in LEVELS) <= 2
         assert abs(one["stamp"] * 1e-9 - began) < 60
+
+
+def test_records_and_logs_of_an_unreachable_camera_hold_no_credentials(start: Start) -> None:
+    address = f"rtsp://admin:hunter2@127.0.0.1:{free_port()}/live?token=s3cret"
+    camera = start("cyclone", *COMMAND, "camera", address, "/front", "--console", "--period", "0.2")
+    (limit := threading.Timer(60, camera.kill)).start()
+    assert camera.stderr
+    said = ""
+    while "gives no images" not in said or said.count('"record id"') < 3:
+        line = camera.stderr.readline()
+        assert line, said
+        said += line
+    limit.cancel()
+    assert "rtsp://***@127.0.0.1" in said and "hunter2" not in said and "s3cret" not in said
 
 
 def test_a_folder_that_isnt_there_is_refused_at_once(start: Start, tmp_path: Path) -> None:

@@ -1,0 +1,99 @@
+"""A street in seconds: few points, two photos, coarse settings, and steps that fail where a test wants them to."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+import xml.etree.ElementTree as ET
+from collections.abc import Collection
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import replace
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from scan2sim.flows import cli
+from scan2sim.flows.recipes import tile as tile_recipe
+from scan2sim.pipeline.io.clouds import las
+from scan2sim.pipeline.io.scene import Scene, read_scene
+from scan2sim.pipeline.io.tile import read_tile
+from scan2sim.pipeline.step import Done, Inputs, Params, Report
+from scan2sim.pipeline.types import Bools, PointCloud
+from tests.gazebo.checker import built, check_world
+
+COARSE: dict[str, dict[str, Any]] = {
+    "voxel": {"size": 0.3},
+    "unwrap": {"texel": 0.2},
+    "pictures": {"width": 160, "compared": 1},
+    "split": {"vegetation": "locations"},
+    "export": {"rasters": 0.5},
+}
+
+
+def tiny(street: Path, out: Path, every: int = 10, photos: int = 2) -> Path:
+    """Write a copy of a generated street with every Nth of its points and its first photos."""
+    shutil.copytree(street, out)
+    text = (out / "tile.toml").read_text(encoding="utf-8").split("[[photos]]")
+    (out / "tile.toml").write_text("[[photos]]".join(text[: photos + 1]), encoding="utf-8")
+    keep_points(out, np.arange(len(points(out))) % every == 0)
+    return out
+
+
+def points(tile: Path) -> PointCloud:
+    """The cloud of a tile."""
+    about = read_tile(tile)
+    return las.read(about.clouds[0], about.frame)
+
+
+def keep_points(tile: Path, kept: Bools) -> None:
+    """Remove all other points (N,) from a tile's cloud."""
+    las.write(tile / "cloud.laz", points(tile).take(np.flatnonzero(kept)))
+
+
+def broken(inputs: Inputs, params: Params, out: Path, report: Report) -> Done:
+    """A step with a programming error that shows once half of its result is written."""
+    (out / "half.txt").write_text("half", encoding="utf-8")
+    raise ZeroDivisionError("a bug")
+
+
+def fail(patch: pytest.MonkeyPatch, steps: Collection[str]) -> None:
+    """Let steps of tiles fail, by their names."""
+    for name in steps:
+        step = getattr(tile_recipe, name.upper())
+        patch.setattr(tile_recipe, name.upper(), replace(step, run=broken))
+
+
+def scan2sim(*arguments: object, failing: Collection[str] = (), settings: object = COARSE) -> tuple[int, str]:
+    """Run the command in this process with coarse settings; returns its exit code and what it printed, as one line.
+
+    Args:
+        arguments: of the command.
+        failing: steps that fail.
+        settings: by step.
+    """
+    assert isinstance(settings, dict)
+    sets = [f"--set={step}.{name}={json.dumps(value)}" for step in settings for name, value in settings[step].items()]
+    printed = StringIO()
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(printed), redirect_stderr(printed):
+        patch.setenv("PYTHONSAFEPATH", "1")
+        patch.setattr(sys, "argv", ["scan2sim", *map(str, arguments), *sets])
+        fail(patch, failing)
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+    return int(ended.value.code or 0), " ".join(printed.getvalue().split())
+
+
+def loaded(out: Path) -> Scene:
+    """The finished world of a run or a survey, each of its meshes read; by Gazebo, too, where that is installed."""
+    scene = read_scene(out)
+    assert all(len(shape) for tile in scene.tiles for shape in tile.textured().values())
+    assert all(len(tile.solid()) for tile in scene.tiles)
+    world = out / "world" / f"{scene.name}.sdf"
+    assert ET.parse(world).getroot().find("world") is not None
+    if not built():
+        check_world(world)
+    return scene

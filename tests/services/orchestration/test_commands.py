@@ -1,0 +1,130 @@
+"""The commands by hand against a current OSM, which returns parameters of operations as JSON, and an earlier one."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from bench.osm_fake import Fake, State
+from scan2sim.flows.commands.orchestrate import app
+from scan2sim.pipeline.errors import StepError
+from scan2sim.services.orchestration import description, operations
+from scan2sim.services.orchestration.lifecycle import Patience
+from scan2sim.services.orchestration.osm import Osm
+from scan2sim.services.orchestration.package import build
+from scan2sim.services.orchestration.settings import Connection
+from scan2sim.services.qos.requirements import Environment
+
+Command = Callable[..., str]
+
+
+@pytest.fixture(params=[True, False], ids=["current OSM", "OSM 8"])
+def fake(request: pytest.FixtureRequest) -> Iterator[Fake]:
+    with Fake(State(seconds=0.02, as_json=request.param)) as made:
+        yield made
+
+
+@pytest.fixture
+def detect(osm: Osm) -> str:
+    """Id of the network service of an onboarded detector."""
+    made = build(description.read("detect"), Environment.EDGE, "container")
+    operations.onboard(osm, [made.function, made.service])
+    return made.service.descriptor.id
+
+
+@pytest.fixture
+def command(fake: Fake) -> Command:
+    """Runs `scan2sim orchestrate` and returns its output."""
+
+    def run(*words: object) -> str:
+        done = CliRunner().invoke(app, [*map(str, words), "--osm", fake.address], catch_exceptions=False)
+        assert done.exit_code == 0, done.output
+        return done.output
+
+    return run
+
+
+@pytest.fixture
+def start(command: Command, detect: str) -> Callable[[], str]:
+    """Instantiates the detector as `one`, with two replicas and a value."""
+    words = ("instantiate", "one", detect, "--cluster", "edge-cluster", "--replicas", 2, "--value", "level=info")
+    return lambda: command(*words, "--wait")
+
+
+def sent(fake: Fake) -> list[tuple[str, Any]]:
+    """Kind and chart values of each operation, as this project sent them."""
+    found = []
+    for one in fake.state.operations.values():
+        params = one["operationParams"]
+        charts = [chart for vnf in params.get("additionalParamsForVnf", ()) for chart in vnf["additionalParamsForKdu"]]
+        found.append((one["lcmOperationType"], params.get("primitive_params") or charts[0]["additionalParams"]))
+    return found
+
+
+VALUES = {"level": "info", "replicaCount": 2}
+
+
+def test_instantiate_waits_until_it_runs(fake: Fake, start: Callable[[], str]) -> None:
+    assert "one runs" in start()
+    assert sent(fake) == [("instantiate", VALUES)]
+
+
+def test_a_second_instantiate_changes_nothing(fake: Fake, start: Callable[[], str]) -> None:
+    start()
+    assert "one runs" in start()
+    assert sent(fake) == [("instantiate", VALUES)]
+
+
+def test_a_second_instantiate_with_other_values_upgrades_the_chart(
+    fake: Fake, start: Callable[[], str], command: Command, detect: str
+) -> None:
+    start()
+    command("instantiate", "one", detect, "--cluster", "edge-cluster", "--value", "level=debug", "--wait")
+    assert sent(fake)[1:] == [("action", {"level": "debug", "replicaCount": 1})]
+
+
+def test_scale_keeps_the_other_values(fake: Fake, start: Callable[[], str], command: Command) -> None:
+    start()
+    for count in (5, 5, 3):
+        command("scale", "one", count, "--wait")
+    assert sent(fake)[1:] == [("action", VALUES | {"replicaCount": 5}), ("action", VALUES | {"replicaCount": 3})]
+
+
+def test_heal_applies_the_last_values_again(fake: Fake, start: Callable[[], str], command: Command) -> None:
+    start()
+    command("heal", "one", "--wait")
+    command("scale", "one", 4, "--wait")
+    command("heal", "one", "--wait")
+    assert [values["replicaCount"] for _, values in sent(fake)] == [2, 2, 4, 4]
+
+
+@pytest.mark.parametrize("returned", ["{", "no JSON", "[1]", "[{}, 2]", '"text"', "3", 3, [3], {"replicaCount": 1}])
+def test_unreadable_parameters_are_an_error_and_can_be_removed(
+    fake: Fake, start: Callable[[], str], command: Command, monkeypatch: pytest.MonkeyPatch, returned: object
+) -> None:
+    start()
+    operation = next(iter(fake.state.operations.values()))
+    broken = operation | {"operationParams": {"additionalParamsForVnf": returned, "secret": "hush"}}
+    monkeypatch.setattr(fake.state, "returned_operations", lambda: {operation["_id"]: broken})
+    with Osm(Connection(osm=fake.address)) as osm:
+        for act in (operations.heal, lambda *given: operations.resize(given[0], given[1], 3, *given[2:])):
+            with pytest.raises(StepError, match=r"one: .*additionalParamsForVnf.* can't be read") as caught:
+                act(osm, "one", Patience(10), lambda _: None)
+            assert "scan2sim orchestrate delete" in caught.value.remedy and "hush" not in str(caught.value)
+    monkeypatch.undo()
+    monkeypatch.setenv("OSM_PASSWORD", "admin")
+    command("delete", "one")
+    assert not fake.state.instances
+
+
+def test_the_fake_returns_parameters_as_each_release_does(fake: Fake, start: Callable[[], str]) -> None:
+    start()
+    with Osm(Connection(osm=fake.address)) as osm:
+        (operation,) = osm.operations(str(osm.instances()[0]["_id"]))
+    returned: Any = operation["operationParams"]["additionalParamsForVnf"]
+    (function,) = json.loads(returned) if fake.state.as_json else returned
+    assert function["additionalParamsForKdu"] == [{"kdu_name": "detect", "additionalParams": VALUES}]

@@ -1,0 +1,131 @@
+"""Whatever listens where other machines reach it has a token, a key or a certificate, or refuses to start."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from scan2sim.pipeline.errors import SettingError
+from scan2sim.services.loopback import is_loopback, require_protection
+from scan2sim.services.monitoring.shown import PageParams as MonitorPage
+from scan2sim.services.orchestration.settings import PageParams as OrchestrationPage
+from scan2sim.services.served import Served
+from scan2sim.services.teleoperation.settings import GatewayParams, StationParams
+from scan2sim.services.teleoperation.translating import TranslateParams
+from scan2sim.services.toolboxes.settings import ServeParams
+from tests.conftest import ROOT
+
+LOOPBACK = ("127.0.0.1", "127.1.2.3", "::1", "[::1]", "localhost", "LOCALHOST")
+BEYOND = ("0.0.0.0", "::", "", "192.0.2.1", "10.0.0.1", "::ffff:192.0.2.1", "robot.example", "127.robot.example")
+
+
+@pytest.mark.parametrize("host", LOOPBACK)
+def test_the_loopback_needs_no_protection(host: str) -> None:
+    assert is_loopback(host)
+    require_protection(host, protected=False, options="--token FILE")
+    assert Served(host=host).is_local() and TranslateParams(host=host).key is None
+
+
+@pytest.mark.parametrize("host", BEYOND)
+def test_other_addresses_need_protection(host: str) -> None:
+    assert not is_loopback(host)
+    require_protection(host, protected=True, options="--token FILE")
+    with pytest.raises(SettingError, match=r"--host: .* other machines.*Give --token FILE, or .*127\.0\.0\.1"):
+        require_protection(host, protected=False, options="--token FILE")
+
+
+FILE = Path("file")
+LISTENERS: list[tuple[type[Any], dict[str, object]]] = [
+    (Served, {}),
+    (MonitorPage, {}),
+    (OrchestrationPage, {"packages": FILE}),
+    (ServeParams, {}),
+    (GatewayParams, {"certificates": FILE}),
+    (StationParams, {"certificates": FILE, "gateway": "gate.example"}),
+    (TranslateParams, {}),
+]
+"""Parameters of everything that listens where its user says, and what each must be given."""
+
+
+@pytest.mark.parametrize(("kind", "given"), LISTENERS, ids=lambda value: getattr(value, "__name__", ""))
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.0.2.1"])
+def test_no_listener_is_open(kind: type[Any], given: dict[str, object], host: str) -> None:
+    kind(**given, host="127.0.0.1")
+    with pytest.raises(SettingError, match="--key"):
+        kind(**given, host=host)
+    for protection in ({"key": FILE},) if kind is TranslateParams else ({"token": FILE}, {"certificate": FILE}):
+        assert kind(**given, host=host, **protection).host == host
+    if kind is not TranslateParams:
+        with pytest.raises(SettingError, match="--token FILE, or --certificate and --key"):
+            kind(**given, host=host, key=FILE)  # of TLS, without its certificate
+
+
+def command(*words: object, **environment: str) -> subprocess.CompletedProcess[str]:
+    program = [sys.executable, "-m", "scan2sim.flows.cli", *map(str, words)]
+    return subprocess.run(program, cwd=ROOT, env=os.environ | environment, capture_output=True, text=True, timeout=120)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("monitor", "page"),
+        ("toolbox", "serve", "detect"),
+        ("orchestrate", "page", "packages", "--cluster", "edge"),
+        ("teleop", "gateway", "certificates"),
+        ("teleop", "station", "certificates", "gate.example"),
+        ("teleop", "translate", "ros"),
+    ],
+    ids=lambda words: " ".join(words[:2]),
+)
+def test_commands_refuse_before_they_start_anything(words: tuple[str, ...]) -> None:
+    done = command(*words, "--host", "0.0.0.0")
+    assert done.returncode == 2, done.stderr
+    assert "0.0.0.0 is reached by other machines" in done.stderr
+    assert ("Give --key FILE" if "translate" in words else "Give --token FILE") in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("words", [("gateway",), ("station", "gate.example")], ids=lambda words: words[0])
+def test_vehicles_and_stations_are_listened_to_with_a_certificate_only(words: tuple[str, ...], tmp_path: Path) -> None:
+    """`--listening` defaults to all addresses, by TLS and DTLS that demand a certificate of both ends."""
+    pytest.importorskip("OpenSSL", reason="the extra teleop isn't installed")
+    role, *rest = words
+    done = command("teleop", role, tmp_path / "none", *rest, "--port", "0")
+    assert done.returncode == 3 and "certificate.pem" in done.stderr and "Traceback" not in done.stderr
+
+
+def test_figures_for_prometheus_stay_on_this_machine() -> None:
+    pytest.importorskip("prometheus_client", reason="the extra bus isn't installed")
+    from scan2sim.services.monitoring.sinks import Prometheus
+
+    shown = Prometheus(0)
+    try:
+        assert is_loopback(str(shown._server.server_address[0]))
+    finally:
+        shown.close()
+
+
+LISTENING = """
+import psutil
+from scan2sim.flows.engine import workers
+
+if __name__ == "__main__":
+    with workers._dask(1, None):
+        own = psutil.Process()
+        for process in (own, *own.children(recursive=True)):
+            print(*(one.laddr.ip for one in process.net_connections("tcp") if one.status == psutil.CONN_LISTEN))
+"""
+
+
+def test_dasks_temporary_scheduler_and_workers_stay_on_this_machine(tmp_path: Path) -> None:
+    pytest.importorskip("distributed", reason="distributed isn't installed")
+    (script := tmp_path / "listening.py").write_text(LISTENING)
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, script], env=environment, capture_output=True, text=True, timeout=120)
+    addresses = done.stdout.split()
+    assert len(addresses) >= 2 and all(map(is_loopback, addresses)), done.stdout + done.stderr
