@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import io
 import os
 import re
 import sys
@@ -106,9 +107,17 @@ def _through_prefect(*arguments: Any) -> None:
         raise IncompleteError(report.parent / "world", state.message or "")
 
 
+def replace_what_cannot_be_encoded() -> None:
+    """Print `?` for characters that the terminal's encoding doesn't have (Latin-1, say), rather than fail."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
+
+
 def main() -> None:
     """Run the command; errors become one message and an exit code (`pipeline.errors.EXIT_CODES`)."""
     os.environ.setdefault("PYTHONSAFEPATH", "1")  # a random.py in the current folder is not our processes' own
+    replace_what_cannot_be_encoded()
     try:
         app()
     except SystemExit as ended:

@@ -179,6 +179,15 @@ def edit(tile: Path, old: str, new: str, count: int = 1) -> None:
     (tile / "tile.toml").write_text(text.replace(old, new, count), encoding="utf-8")
 
 
+def test_a_terminal_that_is_not_utf8_gets_question_marks(tmp_path: Path) -> None:
+    tile = tmp_path / "straße\u2026"
+    shutil.copytree(ROOT / "data_samples" / "tile", tile)
+    command = [sys.executable, "-m", "scan2sim.flows.cli", "inspect", str(tile)]
+    run = subprocess.run(command, env=os.environ | {"PYTHONIOENCODING": "latin-1"}, cwd=ROOT, capture_output=True)
+    assert run.returncode == 0, run.stderr
+    assert "straße?" in run.stdout.decode("latin-1").replace("\n", "") and b"Traceback" not in run.stderr
+
+
 def test_version_and_help() -> None:
     assert good(scan2sim("--version")).startswith("scan2sim 0.")
     text = good(scan2sim("--help"))

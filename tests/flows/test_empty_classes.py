@@ -85,8 +85,9 @@ def test_a_survey_is_made_though_a_tile_has_none_of_a_class(
     kept = thinned(how, cloud.classification, name)
     keep_points(last, kept)
     code, printed = scan2sim("survey", tmp_path / "survey", "--out", tmp_path / "out", settings=EVERYTHING)
-    if how == "alone" and name in ("vehicle", "furniture"):
-        assert code == 5 and "1 of 2 tiles failed" in printed and len(loaded(tmp_path / "out").tiles) == 1
+    if how == "alone" and name == "furniture":  # of vehicles alone the neighbour's points at the border make a world
+        assert code == 5 and "1 of 2 tiles failed" in printed and "points in all" in printed
+        assert len(loaded(tmp_path / "out").tiles) == 1
     else:
         assert code == 0, printed
         assert len(loaded(tmp_path / "out").tiles) == 2

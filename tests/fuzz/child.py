@@ -21,7 +21,10 @@ def main() -> None:
     os.dup2(nowhere, 1)
     os.dup2(nowhere, 2)
     resource.setrlimit(resource.RLIMIT_DATA, (MOST, MOST))
+    from scan2sim.flows.cli import replace_what_cannot_be_encoded
     from tests.fuzz.kinds import KINDS
+
+    replace_what_cannot_be_encoded()
 
     for line in sys.stdin:
         case = json.loads(line)

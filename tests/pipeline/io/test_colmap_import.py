@@ -61,7 +61,7 @@ def make_model(folder: Path, kinds: list[str], n: int = 40) -> tuple[Any, dict[s
     for form in ("bin", "txt"):
         (folder / form).mkdir()
     model.write_binary(folder / "bin")
-    model.write_text(folder / "txt", encoding="utf-8")
+    model.write_text(folder / "txt")
     return model, pixels
 
 
