@@ -88,7 +88,7 @@ def measured(box: str, port: int) -> tuple[float, list[str]]:
         network = copied_models(path, folder)
         models = sum(file.stat().st_size for file in network) / 1e6
         lacking = sorted(needed(environment)[1].keys() - ALWAYS - NEVER_LOADED.keys())
-        (token := folder / "token").write_text(secrets.token_hex(32))
+        (token := folder / "token").write_text(secrets.token_hex(32), encoding="utf-8")
         command = [*entry_point(path), "--port", str(port), "--token", str(token)]
         command = [part.replace("/models/", f"{folder}/") for part in command]
         command[0] = str(environment / "bin" / command[0])

@@ -48,7 +48,7 @@ def run_node(item: Planned, store: Store, inputs: dict[str, Path], report: Repor
 
 def _forget_peak() -> None:
     try:
-        Path("/proc/self/clear_refs").write_text("5")
+        Path("/proc/self/clear_refs").write_text("5", encoding="utf-8")
     except OSError:
         pass  # not Linux: the peak is then that of the process so far
 
@@ -57,7 +57,7 @@ def _peak_mb() -> float:
     """Peak resident memory of this process and of its largest child, MB."""
     own = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     try:
-        status = Path("/proc/self/status").read_text()
+        status = Path("/proc/self/status").read_text(encoding="utf-8")
         own = int(status.split("VmHWM:")[1].split()[0])
     except (OSError, IndexError):
         pass

@@ -95,7 +95,7 @@ def _current(source: Path, place: Path, key: str) -> bool:
 def _is_of(place: Path, key: str) -> bool:
     """Whether a folder was published of this result."""
     stamp = place / STAMP
-    return stamp.is_file() and stamp.read_text(errors="replace") == key
+    return stamp.is_file() and stamp.read_text(errors="replace", encoding="utf-8") == key
 
 
 def edited(source: Path, place: Path) -> list[Path]:
@@ -111,5 +111,5 @@ def _publish(source: Path, place: Path, key: str) -> None:
     shutil.copytree(source, fresh, copy_function=link)
     for file in edited(source, place) if _is_of(place, key) else ():
         shutil.copy2(file, fresh / file.relative_to(place))
-    (fresh / STAMP).write_text(key)
+    (fresh / STAMP).write_text(key, encoding="utf-8")
     swap(fresh, place)

@@ -94,7 +94,7 @@ def assemble(
         try:
             shutil.rmtree(fresh, ignore_errors=True)
             _write(fresh, name, tiles, buffer, performer)
-            (fresh / STAMP).write_text(stamp)
+            (fresh / STAMP).write_text(stamp, encoding="utf-8")
             swap(fresh, world)
         except OSError as error:
             raise from_os_error(error, out) from None
@@ -200,7 +200,7 @@ def _stamp(name: str, tiles: Sequence[TileWorld], files: dict[str, list[Path]], 
 def _is_current(world: Path, stamp: str, tiles: Sequence[TileWorld], files: dict[str, list[Path]]) -> bool:
     """Whether the world was made of these tiles, and its meshes and textures are theirs."""
     try:
-        same = (world / STAMP).read_text(errors="replace") == stamp
+        same = (world / STAMP).read_text(errors="replace", encoding="utf-8") == stamp
     except OSError:
         return False
     pairs = [(tile.world / file, world / file) for tile in tiles for file in files[tile.name]]

@@ -196,7 +196,7 @@ def _serving(ends: Places, toolbox: str, folder: Path) -> Iterator[tuple[subproc
     """A toolbox that serves, and its port."""
     local = ends.address == places.Here.address
     token = folder / robot.TOKEN
-    token.write_text(secrets.token_hex(32))  # beyond the loopback nothing is served without one
+    token.write_text(secrets.token_hex(32), encoding="utf-8")  # beyond the loopback nothing is served without one
     command = [sys.executable, "-m", "scan2sim.flows.cli", "toolbox", "serve", toolbox, "--host", ends.address]
     command += ["--token", str(token)]
     with (folder / "toolbox.log").open("w+") as log:
@@ -212,7 +212,7 @@ def _port(server: subprocess.Popen[Any], log: Path) -> int:
     """Where it says that it listens, once it does."""
     limit = time.monotonic() + STARTS_WITHIN
     while server.poll() is None and time.monotonic() < limit:
-        for word in log.read_text().split():
+        for word in log.read_text(encoding="utf-8").split():
             if word.startswith("http://") and word.count(":") >= 2:
                 return int(word.split(":")[2].partition("/")[0])
         time.sleep(0.1)

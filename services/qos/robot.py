@@ -112,7 +112,7 @@ def main() -> None:
     """Ask, as the arguments say."""
     address, toolbox, folder, rate, seconds = sys.argv[1:]
     images = [path.read_bytes() for path in sorted(Path(folder).glob("*.jpg"))]
-    token = path.read_text().strip() if (path := Path(folder) / TOKEN).exists() else ""
+    token = path.read_text(encoding="utf-8").strip() if (path := Path(folder) / TOKEN).exists() else ""
     print(json.dumps(asdict(ask(address, toolbox, images, float(rate), float(seconds), token))), flush=True)
 
 

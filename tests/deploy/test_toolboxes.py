@@ -31,7 +31,7 @@ SCAN2SIM = "import sys; from scan2sim.flows.cli import main; sys.argv[0] = 'scan
 
 
 def lines(path: Path) -> list[str]:
-    return [line for line in path.read_text().splitlines() if not line.startswith(("#", "--"))]
+    return [line for line in path.read_text(encoding="utf-8").splitlines() if not line.startswith(("#", "--"))]
 
 
 def site(path: Path, folder: Path) -> Path:
@@ -77,7 +77,9 @@ def test_each_toolbox_has_its_file() -> None:
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
 def test_what_files_copy_and_install_is_there(path: Path) -> None:
-    sent = [line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!")]
+    sent = [
+        line[1:] for line in (ROOT / ".dockerignore").read_text(encoding="utf-8").splitlines() if line.startswith("!")
+    ]
     for stage in stages(path):
         copied: set[str] = set()
         for rest in stage.said("COPY"):
@@ -126,7 +128,7 @@ def test_what_an_image_installs_suffices_to_serve(box: str, models: Path, tmp_pa
     port = free_port()
     address = f"http://localhost:{port}"
     command = [part.replace("/models", str(models)) for part in entry_point(path)[1:]]
-    (token := tmp_path / "token").write_text(TOKEN)
+    (token := tmp_path / "token").write_text(TOKEN, encoding="utf-8")
     (packages := tmp_path / "packages").mkdir()
     assert healthy(address) == 1
     with running(site(path, packages), *command, "--port", str(port), "--token", str(token)) as process:

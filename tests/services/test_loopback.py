@@ -124,7 +124,7 @@ if __name__ == "__main__":
 
 def test_dasks_temporary_scheduler_and_workers_stay_on_this_machine(tmp_path: Path) -> None:
     pytest.importorskip("distributed", reason="distributed isn't installed")
-    (script := tmp_path / "listening.py").write_text(LISTENING)
+    (script := tmp_path / "listening.py").write_text(LISTENING, encoding="utf-8")
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     done = subprocess.run([sys.executable, script], env=environment, capture_output=True, text=True, timeout=120)
     addresses = done.stdout.split()

@@ -39,7 +39,7 @@ class Worker:
 @pytest.fixture
 def token(tmp_path: Path) -> Path:
     path = tmp_path / "token"
-    path.write_text(f"{TOKEN}\n")
+    path.write_text(f"{TOKEN}\n", encoding="utf-8")
     return path
 
 
@@ -129,7 +129,7 @@ def test_websites_whose_names_lead_here_read_nothing() -> None:
 
 @pytest.mark.parametrize("text", ["", "short", "two words that are long", "ümläutümläutümläut"])
 def test_a_token_that_is_none_is_refused(text: str, token: Path) -> None:
-    token.write_text(text)
+    token.write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match="openssl rand"):
         Served(token=token).secret()
     with pytest.raises(InputError, match="can't be read"):
@@ -195,7 +195,7 @@ def test_it_is_served_by_tls(served: str, certificate: tuple[Path, Path]) -> Non
 def test_what_can_not_be_served_is_told_before(certificate: tuple[Path, Path], tmp_path: Path) -> None:
     with pytest.raises(SettingError, match="--key"):
         Served(certificate=certificate[0]).check_tls()
-    (tmp_path / "other.pem").write_text("no key")
+    (tmp_path / "other.pem").write_text("no key", encoding="utf-8")
     with pytest.raises(InputError, match=r"other\.pem"):
         Served(certificate=certificate[0], key=tmp_path / "other.pem").check_tls()
     with Served(port=0).listen() as taken, pytest.raises(SettingError, match="Choose another --port"):

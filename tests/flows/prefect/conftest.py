@@ -97,7 +97,7 @@ class Server:
 
     def start(self) -> None:
         """Start it, or start it again."""
-        with open(self.home / "server.log", "a") as log:
+        with open(self.home / "server.log", "a", encoding="utf-8") as log:
             command = [sys.executable, "-m", "prefect", "server", "start", "--port", str(self.port)]
             self._process = subprocess.Popen(
                 command, env=self.env, cwd=self.home, stdout=log, stderr=log, start_new_session=True
@@ -106,7 +106,7 @@ class Server:
             wait_for("server", self._healthy, 120)
         except TimeoutError:
             self.kill()
-            raise RuntimeError((self.home / "server.log").read_text()[-3000:]) from None
+            raise RuntimeError((self.home / "server.log").read_text(encoding="utf-8")[-3000:]) from None
 
     def kill(self) -> None:
         """As a power cut does."""
@@ -159,7 +159,7 @@ class Server:
 
     def spawn(self, *args: str, log: Path, **env: str) -> subprocess.Popen[Any]:
         """Start `python ARGS` in the repository, in a session of its own."""
-        with open(log, "w") as file:
+        with open(log, "w", encoding="utf-8") as file:
             return subprocess.Popen(
                 [sys.executable, *args], env=self.env | env, cwd=ROOT, stdout=file, stderr=file, start_new_session=True
             )
@@ -231,7 +231,7 @@ def postgres() -> Iterator[str]:
             check=True, stdout=subprocess.DEVNULL, cwd=data,
         )  # fmt: skip
         port = free_port()
-        with open(data.with_suffix(".log"), "w") as log:
+        with open(data.with_suffix(".log"), "w", encoding="utf-8") as log:
             process = subprocess.Popen(
                 [*drop, serve, "-D", data / "db", "-k", data, "-h", "127.0.0.1", "-p", str(port), "-F"],
                 stdout=log, stderr=log, cwd=data, start_new_session=True,
@@ -276,5 +276,5 @@ def on(*databases: str | ParameterSet) -> pytest.MarkDecorator:
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """For a toy survey."""
-    (tmp_path / "source.txt").write_text("1")
+    (tmp_path / "source.txt").write_text("1", encoding="utf-8")
     return tmp_path

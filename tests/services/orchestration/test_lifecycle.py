@@ -86,13 +86,13 @@ def test_a_file_is_brought_about_once_changed_and_undone(fake: Fake, town: Path)
     assert bring_about(fake, town) == Applied()
     assert before == len([1 for _, method, path in fake.state.asked if method != "GET" and "tokens" not in path])
 
-    town.write_text(TOWN.replace("replicas = 2", "replicas = 3").replace('"detect"', '"classify"'))
+    town.write_text(TOWN.replace("replicas = 2", "replicas = 3").replace('"detect"', '"classify"'), encoding="utf-8")
     told = {(one.name, one.what) for one in planned(fake, town)}
     assert ("detect-north", "make anew") in told and ("segment-south", "scale out") in told
     assert not bring_about(fake, town).failed and planned(fake, town) == []
     assert len(fake.state.functions) == 2  # the detector's is gone
 
-    town.write_text('deployment = "town"')
+    town.write_text('deployment = "town"', encoding="utf-8")
     assert not bring_about(fake, town).failed
     assert (fake.state.instances, fake.state.services, fake.state.functions) == ({}, {}, {})
     assert not fake.state.resources
@@ -104,10 +104,10 @@ def test_what_isnt_the_deployments_stays(fake: Fake, osm: Osm, town: Path) -> No
     hand = Patience(10)
     operations.instantiate(osm, "by-hand", made.service.descriptor.id, osm.vim("edge-site"), patience=hand, say=QUIET)
     bring_about(fake, town)
-    town.write_text('deployment = "town"')
+    town.write_text('deployment = "town"', encoding="utf-8")
     bring_about(fake, town)
     assert states(fake) == {"by-hand": "READY"} and len(fake.state.functions) == 1
-    town.write_text(TOWN.replace("detect-north", "by-hand"))
+    town.write_text(TOWN.replace("detect-north", "by-hand"), encoding="utf-8")
     applied = bring_about(fake, town)
     assert "isn't this deployment's" in applied.failed["by-hand"].cause and states(fake)["segment-south"] == "READY"
 
@@ -249,12 +249,12 @@ def test_sites_keys_and_names_that_arent_there_are_refused_before_anything_is_se
         ('name = "detect-north"', 'name = "Nord Süd"', "name"),
         ('cluster = "edge-cluster"', "", "give `vim` or `cluster`"),
     ):
-        town.write_text(TOWN.replace(old, new))
+        town.write_text(TOWN.replace(old, new), encoding="utf-8")
         with pytest.raises(ScanError, match=said.replace(".", r"\.")):
             bring_about(fake, town)
     assert not fake.state.functions and not fake.state.instances
-    (town.parent / "id").write_text("-----BEGIN OPENSSH PRIVATE KEY-----")
-    town.write_text(TOWN.replace('vim = "edge-site"', 'vim = "edge-site"\nssh_keys = ["id"]'))
+    (town.parent / "id").write_text("-----BEGIN OPENSSH PRIVATE KEY-----", encoding="utf-8")
+    town.write_text(TOWN.replace('vim = "edge-site"', 'vim = "edge-site"\nssh_keys = ["id"]'), encoding="utf-8")
     with pytest.raises(InputError, match="private key"):
         bring_about(fake, town)
 

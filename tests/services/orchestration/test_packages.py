@@ -210,7 +210,7 @@ def test_unicode_is_kept() -> None:
 
 def test_descriptions_are_checked(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
-    path.write_text('name = "My Service"\ntitle = "x"\nimage = "a"\nmachine = "b"')
+    path.write_text('name = "My Service"\ntitle = "x"\nimage = "a"\nmachine = "b"', encoding="utf-8")
     with pytest.raises(InputError, match="name"):
         description.read(path)
     with pytest.raises(InputError, match="one of: classify"):

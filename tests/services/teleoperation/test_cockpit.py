@@ -173,7 +173,7 @@ def test_a_page_that_is_closed_lets_go(cockpit: Cockpit, tmp_path: Path) -> None
 
 
 def test_pages_need_the_token_and_other_sites_are_kept_out(tmp_path: Path) -> None:
-    (tmp_path / "token").write_text(TOKEN)
+    (tmp_path / "token").write_text(TOKEN, encoding="utf-8")
     with served(tmp_path, Served(port=0, token=tmp_path / "token")) as cockpit:
         with pytest.raises(urllib.error.HTTPError, match="401"):
             urllib.request.urlopen(f"{cockpit.url}api/station", timeout=20)

@@ -165,7 +165,7 @@ def test_a_results_file_holds_no_credentials(engine: Engine, tmp_path: Path, mon
     cv2.imwrite(str(folder / "1.png"), shaky.image(10))
     monkeypatch.chdir(tmp_path)
     offline.work_through(engine, folder.relative_to(tmp_path), tmp_path / "out", silent)
-    (line,) = (tmp_path / "out" / offline.RESULTS).read_text().splitlines()
+    (line,) = (tmp_path / "out" / offline.RESULTS).read_text(encoding="utf-8").splitlines()
     assert json.loads(line)["source"] == "http:/***@camera"
 
 
