@@ -145,7 +145,7 @@ def test_a_package_that_is_missing_ends_all_commands_alike(
         (tmp_path / name).touch()
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, package, None)
-    words = command.replace("TILE", str(TILE)).replace("FRAMES", "frames").split()
+    words = [{"TILE": str(TILE), "FRAMES": "frames"}.get(word, word) for word in command.split()]
     out = "weights.onnx" if "train" in words else "plot.png" if "evaluate" in words else "out"
     monkeypatch.setenv("SCAN2SIM_TRANSPORT", "cyclone")
     error = CliRunner().invoke(app, [*words, *([] if words[0] in ("monitor", "teleop") else ["--out", out])]).exception
