@@ -22,10 +22,11 @@ from typing import Any
 
 import numpy as np
 
-from scan2sim.pipeline import backends, decimation
-from scan2sim.pipeline.borders.curve import curve
+from scan2sim.pipeline import decimation
+from scan2sim.pipeline.core import plugins
+from scan2sim.pipeline.core.types import Mesh
 from scan2sim.pipeline.steps.collision import deviation
-from scan2sim.pipeline.types import Mesh
+from scan2sim.pipeline.tiling.borders.boundary_curve import curve
 
 
 def read(out: Path, group: str) -> Mesh:
@@ -56,7 +57,7 @@ def turned(small: Mesh, whole: Mesh) -> float:
 
 def figures(whole: Mesh, name: str, target: int) -> dict[str, Any]:
     """Of one library."""
-    keeps = backends.module(decimation.__name__, name).KEEPS_BORDER
+    keeps = plugins.module(decimation.__name__, name).KEEPS_BORDER
     took = []
     for _ in range(2):
         start = time.perf_counter()
@@ -78,7 +79,7 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--classes", nargs="*", default=["terrain", "building"])
     parser.add_argument("--shares", type=float, nargs="*", default=[0.5, 0.15])
-    parser.add_argument("--only", nargs="*", default=backends.names(decimation.__name__))
+    parser.add_argument("--only", nargs="*", default=plugins.names(decimation.__name__))
     given = parser.parse_args()
     result: dict[str, Any] = {}
     for group in given.classes:
@@ -86,7 +87,7 @@ def main() -> None:
         for share in given.shares:
             print(f"{group}, {len(whole):,} triangles to {share:.0%}")
             for name in given.only:
-                lacking = backends.missing(decimation.__name__, name)
+                lacking = plugins.missing(decimation.__name__, name)
                 if lacking:
                     print(f"  {name:20s} needs {lacking}")
                     continue

@@ -19,9 +19,9 @@ import numpy as np
 import open3d as o3d
 from scipy.spatial import cKDTree
 
+from scan2sim.pipeline.core.types import F32, F64, Mesh, PointCloud
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.steps.geometry import distances, spread, truth_error
-from scan2sim.pipeline.types import F32, F64, Mesh, PointCloud
 
 FOLD = float(np.cos(np.radians(30.0)))
 BUILDING = 6

@@ -23,19 +23,19 @@ from typing import Any
 
 import numpy as np
 
+from bench.paths import ROOT
 from scan2sim.data_samples import SMALL
 from scan2sim.data_samples.layout import FRAME, lay_out
-from scan2sim.pipeline.classes import CODE
+from scan2sim.pipeline.camera.renderer import Renderer, textured
+from scan2sim.pipeline.core.classes import CODE
+from scan2sim.pipeline.core.step import silent
+from scan2sim.pipeline.core.types import F32, Mesh
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.pipeline.render import Renderer, textured
-from scan2sim.pipeline.step import silent
 from scan2sim.pipeline.steps.finds import FINDS, FindsParams
 from scan2sim.pipeline.steps.furniture import FURNITURE, FurnitureParams
 from scan2sim.pipeline.steps.geometry import distances, spread
-from scan2sim.pipeline.types import F32, Mesh
 
-ROOT = Path(__file__).resolve().parent.parent
 PLACE, CLOSE = 0.2, 0.3
 """Metres within which a thing is found, and told of rightly."""
 BLUER, BRIGHTER = 30.0, 20.0

@@ -16,12 +16,12 @@ import time
 from pathlib import Path
 from typing import Any
 
-from bench.gate_worlds import ROOT
-from scan2sim.pipeline.errors import UnavailableError
-from scan2sim.pipeline.io import scenes
-from scan2sim.pipeline.io.scene import Scene, read_scene
-from scan2sim.pipeline.io.scenes import SceneParams
-from scan2sim.pipeline.step import silent
+from bench.paths import ROOT
+from scan2sim.pipeline.core.errors import UnavailableError
+from scan2sim.pipeline.core.step import silent
+from scan2sim.pipeline.io import world_formats
+from scan2sim.pipeline.io.world_formats import SceneParams
+from scan2sim.pipeline.io.worlds.scene import Scene, read_scene
 
 WAYS: dict[str, dict[str, Any]] = {
     "default": {},
@@ -39,7 +39,7 @@ def measure(scene: Scene, params: dict[str, Any]) -> dict[str, float]:
     """Megabytes of a world's GLBs, and of what is in them; seconds that writing takes."""
     with tempfile.TemporaryDirectory() as place:
         begun = time.perf_counter()
-        scenes.write(scene, ["glb"], Path(place), SceneParams(**params), silent)
+        world_formats.write(scene, ["glb"], Path(place), SceneParams(**params), silent)
         seconds = time.perf_counter() - begun
         files = sorted(Path(place).glob("*.glb"))
         whole, textures = sum(file.stat().st_size for file in files), sum(map(_textures, files))

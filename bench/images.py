@@ -34,11 +34,12 @@ import numpy.typing as npt
 import OpenImageIO as oiio
 from PIL import Image, ImageCms
 
-from scan2sim.pipeline.io.decoders import openimageio
-from scan2sim.pipeline.types import F64, U8
+from bench.paths import ROOT
+from scan2sim.pipeline.core.types import F64, U8
+from scan2sim.pipeline.io.images.decoders import openimageio
 
 Pixels = npt.NDArray[Any]
-PHOTO = Path(__file__).resolve().parent.parent / "data_samples" / "tile" / "photos" / "0000_front.jpg"
+PHOTO = ROOT / "data_samples" / "tile" / "photos" / "0000_front.jpg"
 REGION, REDUCED, TILE = 2048, 8, 256
 LIBRARIES = ("opencv", "openimageio")
 SRGB, P3, ADOBE = (

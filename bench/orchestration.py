@@ -1,7 +1,7 @@
 """Services through OSM: whole lifecycles, faults, kills, and a hundred at once.
 
 `python -m bench.orchestration [--parts lifecycles faults kills hundred] [--kills 50]`, against OSM's stand-in
-(`bench/osm_fake.py`), which answers as OSM's own interface was seen to; nothing runs behind it.
+(`tests/fakes/osm.py`), which answers as OSM's own interface was seen to; nothing runs behind it.
 
 - lifecycles: the four toolboxes and a worker of surveys are brought up, scaled and removed by `scan2sim orchestrate`.
 - faults: every refusal that SOL005 names, a token that is taken back, connections cut, operations that fail or never
@@ -31,12 +31,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from bench.osm_fake import CUT_AFTER, CUT_BEFORE, Fake, Fault, State
-from scan2sim.pipeline.errors import ScanError
+from scan2sim.pipeline.core.errors import ScanError
 from scan2sim.services.orchestration import apply, deployment
 from scan2sim.services.orchestration.apply import Applied
 from scan2sim.services.orchestration.osm import FAULTS, Osm
 from scan2sim.services.orchestration.settings import ApplyParams
+from tests.fakes.osm import CUT_AFTER, CUT_BEFORE, Fake, Fault, State
 
 TOWN = ("classify", "detect", "movement", "segment", "worker")
 HUNDRED = 100

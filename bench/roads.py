@@ -27,11 +27,11 @@ from typing import Any
 
 import numpy as np
 
+from bench.paths import ROOT
 from scan2sim.data_samples.layout import FRAME, Layout, lay_out
-from scan2sim.pipeline.render import Renderer, textured
-from scan2sim.pipeline.types import F64, Bools
+from scan2sim.pipeline.camera.renderer import Renderer, textured
+from scan2sim.pipeline.core.types import F64, Bools
 
-ROOT = Path(__file__).resolve().parent.parent
 FROM_EDGE = 0.21
 """Metres from the carriageway's edge to the middle of the line along it (`data_samples/materials.py`)."""
 PIXEL = 0.04

@@ -22,12 +22,12 @@ from typing import Any
 import numpy as np
 
 from bench.measure import measure
+from bench.paths import ROOT
 from scan2sim.data_samples.photos import Effects
 from scan2sim.data_samples.street import generate
-from scan2sim.pipeline.corridor import CutParams, cut_survey
 from scan2sim.pipeline.io.tile import read_tile
+from scan2sim.pipeline.tiling.cut_corridor import CutParams, cut_survey
 
-ROOT = Path(__file__).resolve().parent.parent
 PARTS = ("plain", "one", "two", "ray", "rerun", "photo", "tile")
 MIDDLE = "street_0004"
 LENGTH, POINTS, PHOTOS, WIDTH, SEED = 1000.0, 1.0e7, 200, 800, 3

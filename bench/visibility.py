@@ -26,24 +26,24 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.tile import ROOT
+from bench.paths import ROOT
 from scan2sim.data_samples.layout import FRAME, lay_out
 from scan2sim.data_samples.scanner import plan_drive
 from scan2sim.data_samples.scene import Scene
 from scan2sim.data_samples.street import generate
 from scan2sim.flows.engine.execution import execute
 from scan2sim.flows.engine.planning import plan
-from scan2sim.flows.recipes.graph import NodeId, needed
-from scan2sim.flows.recipes.settings import Settings
-from scan2sim.flows.recipes.tile import recipe
-from scan2sim.pipeline import visibility
-from scan2sim.pipeline.classes import CLASSES, GROUPS
+from scan2sim.flows.pipelines.graph import NodeId, needed
+from scan2sim.flows.pipelines.settings import Settings
+from scan2sim.flows.pipelines.tile import recipe
+from scan2sim.pipeline.camera import depth_map
+from scan2sim.pipeline.camera.depth_map import DepthMap
+from scan2sim.pipeline.camera.projection import pixels
+from scan2sim.pipeline.core.cache import Store
+from scan2sim.pipeline.core.classes import CLASSES, GROUPS
+from scan2sim.pipeline.core.types import F32, F64, I64, U8, Bools, Frame, Mesh, PointCloud, Tile, View
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.pipeline.projection import pixels
 from scan2sim.pipeline.steps.visibility import VisibilityParams
-from scan2sim.pipeline.store import Store
-from scan2sim.pipeline.types import F32, F64, I64, U8, Bools, Frame, Mesh, PointCloud, Tile, View
-from scan2sim.pipeline.visibility import DepthMap
 
 OURS = "mesh + discs (ours)"
 SPLAT = 8
@@ -122,7 +122,7 @@ def main() -> None:
             depth = method(view)
             seconds[name].append(time.perf_counter() - began)
             for group, s in samples.items():
-                seen = visibility.visible(depth, s.points, s.normals)
+                seen = depth_map.visible(depth, s.points, s.normals)
                 counts[name][group] += [tally(seen[k], s.hidden[k]) for k in (s.clear, slice(None))]
                 if name == OURS:
                     of = s.hidden & s.clear
@@ -222,14 +222,14 @@ def methods_of(made: Made) -> dict[str, Method]:
     """Name to a function that draws the depth map of a view."""
     p, meshes = VisibilityParams.model_validate({}), list(made.meshes.values())
 
-    def of(hides: visibility.Scene) -> Method:
-        return lambda view: visibility.depth_map(view.camera, view.T_world_cam, hides, time=view.time, pixels=p.pixels)
+    def of(hides: depth_map.Scene) -> Method:
+        return lambda view: depth_map.depth_map(view.camera, view.T_world_cam, hides, time=view.time, pixels=p.pixels)
 
     return {
         f"boxes of points, {SPLAT} px": lambda view: boxes(made.cloud, view),
-        "discs of points": of(visibility.scene([], made.cloud, radius=p.radius)),
-        "mesh": of(visibility.scene(meshes)),
-        OURS: of(visibility.scene(meshes, made.cloud, radius=p.radius, lacking=p.lacking)),
+        "discs of points": of(depth_map.scene([], made.cloud, radius=p.radius)),
+        "mesh": of(depth_map.scene(meshes)),
+        OURS: of(depth_map.scene(meshes, made.cloud, radius=p.radius, lacking=p.lacking)),
     }
 
 

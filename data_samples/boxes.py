@@ -26,7 +26,7 @@ from scan2sim.data_samples.fleet import CLASSES, any_user
 from scan2sim.data_samples.layout import HALF_WIDTH, Layout
 from scan2sim.data_samples.stage import Actor, Backdrop, Body, Frame, Light, Piece, Stage
 from scan2sim.data_samples.training import FIRST_SEED, any_street, any_style
-from scan2sim.pipeline.types import F64, Camera
+from scan2sim.pipeline.core.types import F64, Camera
 
 CAMERAS = 6
 """A place is seen by so many, each with so many pictures of other things in it."""

@@ -26,8 +26,8 @@ from scan2sim.data_samples.layout import Style
 from scan2sim.data_samples.objects import lamp
 from scan2sim.data_samples.shapes import join
 from scan2sim.data_samples.stage import Backdrop, Frame, Light, Stage, middle, wider
-from scan2sim.pipeline.step import Report, silent
-from scan2sim.pipeline.types import F64, U8, Camera
+from scan2sim.pipeline.core.step import Report, silent
+from scan2sim.pipeline.core.types import F64, U8, Camera
 
 FPS = 25.0
 SIZE = (640, 360)

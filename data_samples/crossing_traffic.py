@@ -15,7 +15,7 @@ from scan2sim.data_samples.fleet import any_user
 from scan2sim.data_samples.junction import FAR, LANE, RAIL, Junction
 from scan2sim.data_samples.stage import Actor, Body, Piece
 from scan2sim.data_samples.trains import GAP, any_train
-from scan2sim.pipeline.types import F64, Bools
+from scan2sim.pipeline.core.types import F64, Bools
 
 Rng = np.random.Generator
 

@@ -18,10 +18,10 @@ from scan2sim.data_samples import gps, hills, paths
 from scan2sim.data_samples.panorama import Panorama, light_of, shown
 from scan2sim.data_samples.town import build
 from scan2sim.data_samples.traffic import Traffic
-from scan2sim.pipeline.errors import SettingError
-from scan2sim.pipeline.io.video import Encoder
-from scan2sim.pipeline.step import Report, silent
-from scan2sim.pipeline.types import F64, U8, Trajectory
+from scan2sim.pipeline.core.errors import SettingError
+from scan2sim.pipeline.core.step import Report, silent
+from scan2sim.pipeline.core.types import F64, U8, Trajectory
+from scan2sim.pipeline.io.images.video import Encoder
 
 MOMENTS = 6
 """Of an exposure that are seen, and added up."""

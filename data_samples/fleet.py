@@ -12,7 +12,7 @@ from scan2sim.data_samples.paints import RGB
 from scan2sim.data_samples.shapes import Part, smooth_normals
 from scan2sim.data_samples.traffic import coach
 from scan2sim.data_samples.variety import colour, grey
-from scan2sim.pipeline.types import F64
+from scan2sim.pipeline.core.types import F64
 
 Rng = np.random.Generator
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from scan2sim.pipeline.types import F64, Trajectory
+from scan2sim.pipeline.core.types import F64, Trajectory
 
 ORIGIN = (49.2, 16.6, 230.0)  # latitude, longitude (degrees, WGS 84), altitude of the world's origin
 WANDER = (1.5, 1.5, 2.5)  # metres, standard deviation of the correlated error: east, north, up

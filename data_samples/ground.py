@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from scan2sim.data_samples.hills import FLAT
 from scan2sim.data_samples.paths import chainage, extended, heading, smooth
-from scan2sim.pipeline.types import F32, F64, I32
+from scan2sim.pipeline.core.types import F32, F64, I32
 
 LANE = 1.7  # metres from the centre line to the driven path
 HALF = 5.2  # half the carriageway, parking included

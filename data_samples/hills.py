@@ -11,7 +11,7 @@ import numpy.typing as npt
 from numba import njit
 
 from scan2sim.data_samples.paths import chainage, smooth
-from scan2sim.pipeline.types import F64, Trajectory
+from scan2sim.pipeline.core.types import F64, Trajectory
 
 FLAT: F64 = np.zeros((0, 4))
 LENGTHS = (110.0, 150.0, 190.0, 240.0)

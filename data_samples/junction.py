@@ -12,7 +12,7 @@ from scan2sim.data_samples.paints import Material, Paint, linear
 from scan2sim.data_samples.plants import leafy_tree
 from scan2sim.data_samples.shapes import Part, box, join, quads, sheet
 from scan2sim.data_samples.variety import grey
-from scan2sim.pipeline.types import F64
+from scan2sim.pipeline.core.types import F64
 
 Rng = np.random.Generator
 

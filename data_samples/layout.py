@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from scan2sim.data_samples.paints import RGB, Paint, linear
 from scan2sim.data_samples.shapes import Field, Part, waves
-from scan2sim.pipeline.types import F64, Frame
+from scan2sim.pipeline.core.types import F64, Frame
 
 Span = tuple[float, float]
 Side = Literal[1, -1]

@@ -1,4 +1,4 @@
-"""Make the low-poly plants of `pipeline/planting.py` again: `python -m scan2sim.data_samples.make_plants [FILE]`.
+"""Generate the low-poly plants of `pipeline.terrain`: `python -m scan2sim.data_samples.make_plants [FILE]`.
 
 Crowns of the generator's own trees and bushes, of few triangles: 1 high and of radius 1 around the trunk, which is no
 part of them. Arrays of the k-th: `vertices<k>` (V, 3), `faces<k>` (F, 3), `light<k>` (V,) openness to the sky.
@@ -16,15 +16,15 @@ from scan2sim.data_samples.layout import Tree
 from scan2sim.data_samples.paints import Material
 from scan2sim.data_samples.plants import leafy_tree, shrub
 from scan2sim.data_samples.shapes import Part
-from scan2sim.pipeline import planting
+from scan2sim.pipeline.terrain import low_poly_plants
 
 GREEN = (0.2, 0.4, 0.1)
 
 
-def make(out: Path = planting.MODELS) -> Path:
+def make(out: Path = low_poly_plants.MODELS) -> Path:
     """Write the models."""
-    trees = [leafy_tree(Tree(0, 0, 8.0, 2.5, GREEN, seed), rounds=0) for seed in range(planting.TREES)]
-    bushes = [shrub(1.0, GREEN, seed, rounds=1) for seed in range(planting.BUSHES)]
+    trees = [leafy_tree(Tree(0, 0, 8.0, 2.5, GREEN, seed), rounds=0) for seed in range(low_poly_plants.TREES)]
+    bushes = [shrub(1.0, GREEN, seed, rounds=1) for seed in range(low_poly_plants.BUSHES)]
     arrays: dict[str, Any] = {}
     for k, plant in enumerate([*trees, *bushes]):
         vertices, faces, light = _crown(plant)
@@ -45,4 +45,4 @@ def _crown(plant: Part) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 if __name__ == "__main__":
-    print(make(Path(sys.argv[1]) if len(sys.argv) > 1 else planting.MODELS))
+    print(make(Path(sys.argv[1]) if len(sys.argv) > 1 else low_poly_plants.MODELS))

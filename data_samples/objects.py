@@ -8,7 +8,7 @@ from scan2sim.data_samples import paints, signs
 from scan2sim.data_samples.layout import Boundary, House, Tree
 from scan2sim.data_samples.paints import RGB, Material, Paint, linear
 from scan2sim.data_samples.shapes import Opening, Part, blob, box, join, leaves, part, quads, sheet, tube, wall, waves
-from scan2sim.pipeline.types import F64
+from scan2sim.pipeline.core.types import F64
 
 GROUND_STOREY, STOREY = 3.35, 2.95
 FOOT = 1.2  # how far walls reach below the ground at their origin

@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import NamedTuple
 
-from scan2sim.pipeline.classes import CODE
+from scan2sim.pipeline.core.classes import CODE
 
 RGB = tuple[float, float, float]
 

@@ -21,7 +21,7 @@ from scan2sim.data_samples.scene import srgb
 from scan2sim.data_samples.shapes import Part
 from scan2sim.data_samples.town import Town
 from scan2sim.data_samples.traffic import Traffic
-from scan2sim.pipeline.types import F32, F64, U8
+from scan2sim.pipeline.core.types import F32, F64, U8
 
 RADIUS = 220.0  # metres around the camera in which things have triangles
 STEP = 0.25  # of the radius, driven before they are gathered anew

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from scan2sim.pipeline.errors import DataError
-from scan2sim.pipeline.types import F64, Trajectory
+from scan2sim.pipeline.core.errors import DataError
+from scan2sim.pipeline.core.types import F64, Trajectory
 
 STEP = 0.25  # metres between the points of a smoothed path
 SIDEWAYS = 2.5  # m/s2 that a driver bears in a bend

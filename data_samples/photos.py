@@ -11,7 +11,7 @@ import numpy.typing as npt
 from scan2sim.data_samples.layout import Layout
 from scan2sim.data_samples.scanner import Drive
 from scan2sim.data_samples.scene import Scene, srgb
-from scan2sim.pipeline.types import F32, F64, U8, Bools, Camera
+from scan2sim.pipeline.core.types import F32, F64, U8, Bools, Camera
 
 CAMERAS = ("front", "pano", "left", "right")
 STATION = 5.0  # metres of road between stations, at most (where there are photos enough)

@@ -14,7 +14,7 @@ from scan2sim.data_samples.layout import Boundary, House, Style, Tree
 from scan2sim.data_samples.paints import RGB
 from scan2sim.data_samples.plants import hedge, leafy_tree, shrub
 from scan2sim.data_samples.shapes import Part
-from scan2sim.pipeline.types import F64, U8
+from scan2sim.pipeline.core.types import F64, U8
 
 PLOT = HALF + WALK  # metres from the centre line to the plots
 

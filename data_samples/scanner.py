@@ -11,9 +11,9 @@ import numpy.typing as npt
 from scan2sim.data_samples.layout import FRAME, Layout
 from scan2sim.data_samples.paints import Material
 from scan2sim.data_samples.scene import FINE, CarPoses, Scene, srgb
-from scan2sim.pipeline.errors import DataError
-from scan2sim.pipeline.step import Report, silent
-from scan2sim.pipeline.types import F32, F64, I32, Bools, PointCloud, Trajectory
+from scan2sim.pipeline.core.errors import DataError
+from scan2sim.pipeline.core.step import Report, silent
+from scan2sim.pipeline.core.types import F32, F64, I32, Bools, PointCloud, Trajectory
 
 START = 412_300.0  # GPS time of week, seconds
 SPEED = 10.0

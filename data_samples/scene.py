@@ -12,7 +12,7 @@ from scan2sim.data_samples import objects, paints, signs
 from scan2sim.data_samples.layout import FRAME, HALF_WIDTH, Layout
 from scan2sim.data_samples.paints import Material, Paint, linear
 from scan2sim.data_samples.shapes import Part, join, sheet
-from scan2sim.pipeline.types import F32, F64, I32, U8, Bools, Mesh
+from scan2sim.pipeline.core.types import F32, F64, I32, U8, Bools, Mesh
 
 CAR_SPEED = 8.0
 SUN_COLOUR = np.array([1.06, 1.0, 0.88], np.float32)

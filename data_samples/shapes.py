@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scan2sim.data_samples.paints import Material, Paint
-from scan2sim.pipeline.types import F32, F64, I32, U8
+from scan2sim.pipeline.core.types import F32, F64, I32, U8
 
 Field = Callable[[F64], F64]
 

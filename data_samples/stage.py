@@ -20,7 +20,7 @@ from scan2sim.data_samples.photos import directions
 from scan2sim.data_samples.scene import Hits, caster, illuminated, occluded, srgb, struck
 from scan2sim.data_samples.shapes import Part
 from scan2sim.data_samples.town import lit
-from scan2sim.pipeline.types import F32, F64, I32, U8, Bools, Camera
+from scan2sim.pipeline.core.types import F32, F64, I32, U8, Bools, Camera
 
 LENS = 0.55
 """Pixels, standard deviation of a lens's blur."""

@@ -10,10 +10,10 @@ from scan2sim.data_samples.layout import FRAME, Layout, Style, lay_out
 from scan2sim.data_samples.photos import Effects, Shot, cameras, develop, plan_shots, render
 from scan2sim.data_samples.scanner import Drive, plan_drive, scan
 from scan2sim.data_samples.scene import FINE, Scene, srgb
-from scan2sim.pipeline.classes import CODE
-from scan2sim.pipeline.errors import SettingError
-from scan2sim.pipeline.step import Report, silent
-from scan2sim.pipeline.types import F64, Mesh, PointCloud, Trajectory
+from scan2sim.pipeline.core.classes import CODE
+from scan2sim.pipeline.core.errors import SettingError
+from scan2sim.pipeline.core.step import Report, silent
+from scan2sim.pipeline.core.types import F64, Mesh, PointCloud, Trajectory
 
 SHORTEST = 8.0
 

@@ -17,7 +17,7 @@ from scan2sim.data_samples.paints import Material, Paint
 from scan2sim.data_samples.paths import chainage
 from scan2sim.data_samples.planner import Planner, Thing
 from scan2sim.data_samples.shapes import Part, box, join
-from scan2sim.pipeline.types import F64
+from scan2sim.pipeline.core.types import F64
 
 LOW, LOOKS = np.radians(9.0), 60.0
 """Elevation of a low sun; metres ahead of the path's start that it stands over."""

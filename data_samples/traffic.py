@@ -15,7 +15,7 @@ from scan2sim.data_samples.paints import RGB, Material, Paint, linear
 from scan2sim.data_samples.paths import chainage, extended, heading, smooth
 from scan2sim.data_samples.shapes import Part, box, join, part, quads
 from scan2sim.data_samples.town import lit
-from scan2sim.pipeline.types import F32, F64, Trajectory
+from scan2sim.pipeline.core.types import F32, F64, Trajectory
 
 ONCOMING = 2 * LANE  # metres to the left of the path
 SIGHT = 160.0  # metres of path within which other cars are there at all

@@ -2,8 +2,8 @@
 
 `python -m scan2sim.data_samples.training OUT [--images 1200] [--seed 1000]`: OUT/images/*.jpg, OUT/labels/*.png (LAS
 class codes a pixel, 0 sky, 255 not to be learnt) and OUT/channels/*.png (what a perfect scan would tell, as
-`pipeline.channels` codes it, at a quarter of the size). Streets, light, weather, camera and place are drawn anew,
-far beyond what the streets of tests and benchmarks look like; seeds from 1000 on are kept for training, below for
+`segmentation.lidar_channels` codes it, at a quarter of the size). Streets, light, weather, camera and place are drawn
+anew, far beyond what the streets of tests and benchmarks look like; seeds from 1000 on are kept for training, below for
 everything else.
 """
 
@@ -25,8 +25,8 @@ from scan2sim.data_samples.photos import Effects, Rendering, develop, directions
 from scan2sim.data_samples.scanner import Drive, plan_drive
 from scan2sim.data_samples.scene import Scene
 from scan2sim.data_samples.variety import varied
-from scan2sim.pipeline.channels import FRACTION, Level, coded, level
-from scan2sim.pipeline.types import F64, U8, Camera
+from scan2sim.pipeline.core.types import F64, U8, Camera
+from scan2sim.segmentation.lidar_channels import FRACTION, Level, coded, level
 
 PER_STREET = 20
 LENGTH = 80.0

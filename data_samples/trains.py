@@ -11,7 +11,7 @@ from scan2sim.data_samples import paints, signs
 from scan2sim.data_samples.paints import RGB, Material, Paint, linear
 from scan2sim.data_samples.shapes import Part, blob, box, join, part, quads, tube
 from scan2sim.data_samples.traffic import end_panel, glass, panel
-from scan2sim.pipeline.types import F64
+from scan2sim.pipeline.core.types import F64
 
 Rng = np.random.Generator
 

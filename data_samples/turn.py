@@ -14,9 +14,9 @@ from scan2sim.data_samples import paths
 from scan2sim.data_samples.panorama import Panorama
 from scan2sim.data_samples.town import build
 from scan2sim.data_samples.traffic import Traffic
-from scan2sim.pipeline.cameras import pixel_rays, project
-from scan2sim.pipeline.step import Report, silent
-from scan2sim.pipeline.types import Camera, Trajectory
+from scan2sim.pipeline.camera.models import pixel_rays, project
+from scan2sim.pipeline.core.step import Report, silent
+from scan2sim.pipeline.core.types import Camera, Trajectory
 
 WAY, TOWARDS, LONG = 600.0, 74.0, 52.0
 """Metres: of the town's path, from its start to the film's, and of the film; in it, the path turns by 98 degrees."""

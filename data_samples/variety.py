@@ -16,7 +16,7 @@ from scan2sim.data_samples.layout import HALF_WIDTH, Boundary, House, Layout, Pa
 from scan2sim.data_samples.paints import RGB, Material, Paint
 from scan2sim.data_samples.shapes import Part
 from scan2sim.data_samples.traffic import coach
-from scan2sim.pipeline.types import F64
+from scan2sim.pipeline.core.types import F64
 
 Rng = np.random.Generator
 PAVINGS = (

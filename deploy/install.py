@@ -31,20 +31,20 @@ def check_python() -> None:
 
 def lacking() -> "dict[str, str]":
     """What the system lacks, and Debian's packages that hold it."""
-    from scan2sim.pipeline import libraries
+    from scan2sim.pipeline.core import system_libs
 
     venv = f"python{sys.version_info[0]}.{sys.version_info[1]}-venv"
-    return libraries.missing() | ({} if importlib.util.find_spec("ensurepip") else {"Python's venv": venv})
+    return system_libs.missing() | ({} if importlib.util.find_spec("ensurepip") else {"Python's venv": venv})
 
 
 def install_system_packages(wanted: "dict[str, str]") -> None:
     """Install what the system lacks, or stop and say what would."""
-    from scan2sim.pipeline import libraries
+    from scan2sim.pipeline.core import system_libs
 
     print("This system lacks", ", ".join(f"{what} (package {package})" for what, package in wanted.items()), flush=True)
     root = may_be_root()
     if root is None or not shutil.which("apt-get"):
-        stop("Run this, then make again:", f"  {libraries.command(wanted)}")
+        stop("Run this, then make again:", f"  {system_libs.command(wanted)}")
     print("Installing these packages now, by apt-get as root ...", flush=True)
     apt = [*root, "env", "DEBIAN_FRONTEND=noninteractive", "apt-get", "-qq", "-o", "Dpkg::Use-Pty=0"]
     subprocess.run([*apt, "update"], check=False)  # a list that is old may do
@@ -53,7 +53,7 @@ def install_system_packages(wanted: "dict[str, str]") -> None:
     )
     if done.returncode or lacking():
         stop(f"That didn't bring {', '.join(lacking() or wanted)}. Run this, then make again:",
-             f"  {libraries.command(wanted)}")  # fmt: skip
+             f"  {system_libs.command(wanted)}")  # fmt: skip
 
 
 def may_be_root() -> "list[str] | None":

@@ -14,14 +14,14 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from scan2sim import __version__
-from scan2sim.pipeline.errors import INTERRUPTED, IncompleteError, ScanError, exit_code, from_os_error
+from scan2sim.pipeline.core.errors import INTERRUPTED, IncompleteError, ScanError, exit_code, from_os_error
 
 PAGES = Path(__file__).parents[1] / "docs"
 """Where the pages are that help and errors name as docs/NAME.md: they come with a wheel, too."""
 COMMANDS = {
     "run": ("run", "Make a world of a tile; what an earlier run has finished is kept."),
     "plan": ("plan", "Show what `run` would run, and why; of a drive.toml, what `survey` would run before its tiles."),
-    "tile": ("cut", "Cut a long corridor into tiles that overlap: a survey."),
+    "tile": ("tile", "Cut a long corridor into tiles that overlap: a survey."),
     "survey": ("survey", "Make the worlds of all tiles of a survey, which meet, and one of them all."),
     "export": ("export", "Write a finished world in other formats, for other simulators."),
     "view": ("view", "Open a finished world in the browser, or render a flight through it."),
@@ -115,7 +115,7 @@ def replace_what_cannot_be_encoded() -> None:
 
 
 def main() -> None:
-    """Run the command; errors become one message and an exit code (`pipeline.errors.EXIT_CODES`)."""
+    """Run the command; errors become one message and an exit code (`pipeline.core.errors.EXIT_CODES`)."""
     os.environ.setdefault("PYTHONSAFEPATH", "1")  # a random.py in the current folder is not our processes' own
     replace_what_cannot_be_encoded()
     try:

@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from scan2sim.pipeline.classes import CODE
-from scan2sim.pipeline.step import Report, silent
-from scan2sim.pipeline.types import F32, F64, I32, I64, U8, Bools, PointCloud
+from scan2sim.pipeline.core.classes import CODE
+from scan2sim.pipeline.core.step import Report, silent
+from scan2sim.pipeline.core.types import F32, F64, I32, I64, U8, Bools, PointCloud
 
 NEIGHBOURS = 20
 FEW = 30  # points, fewer have no shape

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from scan2sim.pipeline.classes import CODE, SHOWN
-from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.types import U8
+from scan2sim.pipeline.core.classes import CODE, SHOWN
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.types import U8
 
 CLASSES = SHOWN
 GROUND = ("road", "sidewalk", "terrain")

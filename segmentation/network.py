@@ -11,13 +11,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from scan2sim.pipeline.channels import COUNT
+from scan2sim.segmentation.lidar_channels import COUNT
 
 PIXELS_A_RADIAN = 500.0
 """Angular resolution at which photos are looked at."""
 MEAN, SPREAD = (0.42, 0.43, 0.42), (0.25, 0.25, 0.26)
 CODE_MEAN, CODE_SPREAD = 0.55, 0.15
-"""Of the codes of `pipeline.channels`, 1 for 255."""
+"""Of the codes of `segmentation.lidar_channels`, 1 for 255."""
 
 
 class Convolution(nn.Sequential):
@@ -102,7 +102,7 @@ class Pyramid(nn.Module):
 
 
 class StreetNet(Pyramid):
-    """(B, 3 + 4, H, W) colours and `pipeline.channels` in [0, 1] to (B, classes, H / 4, W / 4) logits.
+    """(B, 3 + 4, H, W) colours and `segmentation.lidar_channels` in [0, 1] to (B, classes, H / 4, W / 4) logits.
 
     Once trained it predicts twice, the second time the picture mirrored, and gives the mean.
 

@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 
-from scan2sim.pipeline.channels import COUNT
-from scan2sim.pipeline.types import F32, U8, Camera
+from scan2sim.pipeline.core.types import F32, U8, Camera
 from scan2sim.segmentation.backends import Network
 from scan2sim.segmentation.labels import CLASSES, IGNORED, mapped
+from scan2sim.segmentation.lidar_channels import COUNT
 
 TILE = 1536
 """Pixels of the largest tile's side that a network is given at once."""
@@ -50,7 +50,7 @@ class Classifier:
         Args:
             rgb: (H, W, 3) of the whole photo.
             camera: its intrinsics.
-            channels: (h, w, 4) of the same photo, as `pipeline.channels`; None where there is no scan.
+            channels: (h, w, 4) of the same photo, as `segmentation.lidar_channels`; None where there is no scan.
         """
         import cv2
 

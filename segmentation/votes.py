@@ -1,6 +1,7 @@
 """Votes: what the photos' probabilities say of each point that they see. Import late: loads numba.
 
-A photo's word counts by how near and how squarely it sees the point; who sees it, `pipeline.visibility` decides, as for
+A photo's word counts by how near and how squarely it sees the point; who sees it, `pipeline.camera.depth_map` decides,
+as for
 texturing. A vote for the sky on a point that is there proves a projection wrong: it is dropped, and its share reported.
 """
 
@@ -13,13 +14,13 @@ from pathlib import Path
 import numpy as np
 from numba import njit, prange
 
-from scan2sim.pipeline.cameras import EQUIRECTANGULAR
-from scan2sim.pipeline.io import image
-from scan2sim.pipeline.projection import Eye, Ranges, eye, incidence, is_visible, pixel_of, to_camera, turned
-from scan2sim.pipeline.sampling import allows, mixed, rescaled, taps
-from scan2sim.pipeline.step import Report, silent
-from scan2sim.pipeline.types import F32, U8, PointCloud, View
-from scan2sim.pipeline.visibility import depth_map, scene
+from scan2sim.pipeline.camera.depth_map import depth_map, scene
+from scan2sim.pipeline.camera.image_sampling import allows, mixed, rescaled, taps
+from scan2sim.pipeline.camera.models import EQUIRECTANGULAR
+from scan2sim.pipeline.camera.projection import Eye, Ranges, eye, incidence, is_visible, pixel_of, to_camera, turned
+from scan2sim.pipeline.core.step import Report, silent
+from scan2sim.pipeline.core.types import F32, U8, PointCloud, View
+from scan2sim.pipeline.io.images import image
 from scan2sim.segmentation.labels import CLASSES, SKY
 
 BIAS = 0.12

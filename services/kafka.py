@@ -9,8 +9,8 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from scan2sim.pipeline import extras
-from scan2sim.services.records import Kept, Once
+from scan2sim.pipeline.core import optional_deps
+from scan2sim.services.outbox import Kept, Once
 
 log = logging.getLogger(__name__)
 
@@ -43,7 +43,7 @@ class Topic:
 
     def __init__(self, servers: str, topic: str) -> None:
         """`servers` as "host:port,host:port"; they need not be there yet."""
-        extras.need("Kafka", "confluent_kafka")
+        optional_deps.need("Kafka", "confluent_kafka")
         from confluent_kafka import KafkaError, KafkaException, Producer
 
         self._servers, self._topic = servers, topic_name(topic)
@@ -150,7 +150,7 @@ def read(
         dropped: is called with the ids of doubles.
         wait: seconds.
     """
-    extras.need("Kafka", "confluent_kafka")
+    optional_deps.need("Kafka", "confluent_kafka")
     from confluent_kafka import Consumer, KafkaError, KafkaException
 
     cause, found = "", False

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from scan2sim.pipeline.types import F64, I32, I64, Bools
+from scan2sim.pipeline.core.types import F64, I32, I64, Bools
 
 
 def exp_so3(w: npt.ArrayLike) -> F64:

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.extras import need
-from scan2sim.pipeline.io.image import SUFFIXES, read_levels
-from scan2sim.pipeline.types import F64, U8
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.optional_deps import need
+from scan2sim.pipeline.core.types import F64, U8
+from scan2sim.pipeline.io.images.image import SUFFIXES, read_levels
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from bench.bus_broker import Broker
+from tests.fakes.broker import Broker
 from tests.skips import pytest_sessionfinish, pytest_terminal_summary  # noqa: F401  # hooks
 
 ROOT = Path(__file__).resolve().parent.parent

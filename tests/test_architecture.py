@@ -121,11 +121,11 @@ def test_the_help_says_of_commands_what_they_say_themselves() -> None:
 
 
 def test_the_recipe_is_planned_without_anything_heavy() -> None:
-    assert loaded_by("import scan2sim.flows.recipes.tile") <= {"numpy"}
+    assert loaded_by("import scan2sim.flows.pipelines.tile") <= {"numpy"}
 
 
 def test_every_setting_is_documented() -> None:
-    from scan2sim.flows.recipes.steps import STEPS
+    from scan2sim.flows.pipelines.steps import STEPS
 
     text = (ROOT / "docs" / "settings.md").read_text(encoding="utf-8")
     for step in STEPS:
@@ -134,7 +134,7 @@ def test_every_setting_is_documented() -> None:
 
 
 def test_every_exit_code_is_documented() -> None:
-    from scan2sim.pipeline.errors import EXIT_CODES
+    from scan2sim.pipeline.core.errors import EXIT_CODES
 
     text = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
     for code, _, meaning in EXIT_CODES.values():

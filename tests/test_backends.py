@@ -16,18 +16,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scan2sim.pipeline import backends, decimation
-from scan2sim.pipeline.errors import SettingError, UnavailableError
-from scan2sim.pipeline.extras import EXTRA_OF
-from scan2sim.pipeline.io import clouds, decoders, gps, meshes, models, robots, scenes
-from scan2sim.pipeline.io.gltf import geometry, textures
-from scan2sim.pipeline.types import Camera
+from scan2sim.pipeline import decimation
+from scan2sim.pipeline.core import plugins
+from scan2sim.pipeline.core.errors import SettingError, UnavailableError
+from scan2sim.pipeline.core.optional_deps import EXTRA_OF
+from scan2sim.pipeline.core.types import Camera
+from scan2sim.pipeline.io import clouds, gps, mesh_formats, photogrammetry, robot_formats, world_formats
+from scan2sim.pipeline.io.images import decoders
+from scan2sim.pipeline.io.worlds.gltf import geometry, textures
 from scan2sim.segmentation import backends as networks
 from scan2sim.services.qos import links
-from scan2sim.services.teleoperation import cameras, translators, video
+from scan2sim.services.teleoperation import cameras, encoders
+from scan2sim.services.teleoperation.vehicle import adapters
 from scan2sim.slam import features, matchers, solvers, trackers
 from tests.conftest import ROOT
-from tests.pipeline import made_up
+from tests.pipeline import synthetic
 
 PROTOCOLS: dict[ModuleType, tuple[type, ...]] = {
     networks: (networks.Backend,),
@@ -36,22 +39,22 @@ PROTOCOLS: dict[ModuleType, tuple[type, ...]] = {
     trackers: (trackers.Backend,),
     solvers: (solvers.Solver,),
     clouds: (clouds.Format,),
-    models: (models.Program,),
+    photogrammetry: (photogrammetry.Program,),
     gps: (gps.Format,),
     decoders: (decoders.Decoder,),
-    meshes: (meshes.ModelFormat,),
-    scenes: (scenes.Format,),
-    robots: (robots.Format,),
+    mesh_formats: (mesh_formats.ModelFormat,),
+    world_formats: (world_formats.Format,),
+    robot_formats: (robot_formats.Format,),
     textures: (textures.Texture,),
     geometry: (geometry.Codec,),
     decimation: (decimation.Backend,),
     links: (links.Backend,),
-    video: (video.Backend,),
+    encoders: (encoders.Backend,),
     cameras: (cameras.Backend,),
-    translators: (translators.Translator,),
+    adapters: (adapters.Translator,),
 }
 """Packages of backends, and what their modules are: one of these."""
-ALL = [(package, name) for package in PROTOCOLS for name in backends.names(package.__name__)]
+ALL = [(package, name) for package in PROTOCOLS for name in plugins.names(package.__name__)]
 each = pytest.mark.parametrize(("package", "name"), ALL, ids=[f"{p.__name__.split('.', 1)[1]}-{n}" for p, n in ALL])
 
 
@@ -70,23 +73,23 @@ def keeps(module: Any, protocol: type) -> bool:
 
 @each
 def test_it_has_what_its_protocol_asks(package: ModuleType, name: str) -> None:
-    module = backends.module(package.__name__, name)
+    module = plugins.module(package.__name__, name)
     assert sum(keeps(module, protocol) for protocol in PROTOCOLS[package]) == 1
 
 
 @each
 def test_it_says_what_it_needs(package: ModuleType, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    backend = backends.module(package.__name__, name)
-    needs, meant = backends.needs(backend), getattr(backend, "EXTRA", "")
+    backend = plugins.module(package.__name__, name)
+    needs, meant = plugins.needs(backend), getattr(backend, "EXTRA", "")
     core = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["dependencies"]
     extras = {EXTRA_OF[package] for package in needs if package in EXTRA_OF}
     assert extras or set(needs) <= {re.split(r"[^\w.-]", line)[0] for line in core}
     real = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda n, *more: None if n in needs else real(n, *more))
-    assert backends.missing(package.__name__, name) == (", ".join(needs) or None)
+    assert plugins.missing(package.__name__, name) == (", ".join(needs) or None)
     if needs:
         with pytest.raises(UnavailableError) as caught:
-            backends.find(package.__name__, name, "a.setting")
+            plugins.find(package.__name__, name, "a.setting")
         assert caught.value.where == f"a.setting {name}" and all(n in caught.value.cause for n in needs)
         assert not extras or caught.value.remedy == f"pip install 'scan2sim[{meant or ','.join(sorted(extras))}]'"
 
@@ -94,14 +97,14 @@ def test_it_says_what_it_needs(package: ModuleType, name: str, monkeypatch: pyte
 @pytest.mark.parametrize("package", PROTOCOLS, ids=lambda p: p.__name__)
 def test_an_unknown_name_tells_the_known_ones(package: ModuleType) -> None:
     with pytest.raises(SettingError, match=r"a\.setting: there is no 'surf'") as caught:
-        backends.find(package.__name__, "surf", "a.setting")
-    assert all(name in caught.value.remedy for name in backends.names(package.__name__))
+        plugins.find(package.__name__, "surf", "a.setting")
+    assert all(name in caught.value.remedy for name in plugins.names(package.__name__))
 
 
 @pytest.mark.parametrize("package", [clouds, decoders, gps])
 def test_no_two_formats_read_the_same_files(package: ModuleType) -> None:
-    each = [backends.module(package.__name__, name).SUFFIXES for name in backends.names(package.__name__)]
-    assert sum(map(len, each)) == len(backends.by_suffix(package.__name__))
+    each = [plugins.module(package.__name__, name).SUFFIXES for name in plugins.names(package.__name__)]
+    assert sum(map(len, each)) == len(plugins.by_suffix(package.__name__))
 
 
 @pytest.fixture
@@ -127,8 +130,8 @@ Add = Callable[[ModuleType, str, str], None]
 
 
 def test_a_network_is_one_file(add: Add) -> None:
-    from scan2sim.segmentation.label import LABEL
     from scan2sim.segmentation.photos import Classifier, class_map
+    from scan2sim.segmentation.steps.label import LABEL
 
     add(networks, "allroad", """
 import numpy as np
@@ -184,7 +187,7 @@ def load(weights, count, upsample, device):
 
 
 def test_an_export_format_is_one_file(add: Add, tmp_path: Path) -> None:
-    add(meshes, "off", """
+    add(mesh_formats, "off", """
 SUFFIX = ".off"
 
 def write(path, surface, names):
@@ -193,7 +196,7 @@ def write(path, surface, names):
 """)  # fmt: skip
     import trimesh
 
-    world = made_up.world(tmp_path, meshes=("obj", "off")).files["world"]
+    world = synthetic.world(tmp_path, meshes=("obj", "off")).files["world"]
     folder = world / "models" / "street" / "meshes"
-    assert len(trimesh.load_mesh(folder / "terrain.off", process=False).faces) == len(made_up.ground())
+    assert len(trimesh.load_mesh(folder / "terrain.off", process=False).faces) == len(synthetic.ground())
     assert (folder / "terrain.obj").is_file() and not (folder / "terrain.dae").exists()

@@ -17,13 +17,13 @@ import typer
 from pydantic import BaseModel, ValidationError
 
 from scan2sim.flows.cli import COMMANDS, app, loaded
-from scan2sim.flows.recipes.drive import Drive
-from scan2sim.flows.recipes.steps import STEPS
-from scan2sim.pipeline.classes import SURFACES
+from scan2sim.flows.pipelines.drive import Drive
+from scan2sim.flows.pipelines.steps import STEPS
+from scan2sim.pipeline.core.classes import SURFACES
+from scan2sim.pipeline.core.step import Params
 from scan2sim.pipeline.io.survey import SurveyFile
 from scan2sim.pipeline.io.tile import TileFile
-from scan2sim.pipeline.step import Params
-from scan2sim.services.monitoring.rules import Rule
+from scan2sim.services.monitoring.events.rules import Rule
 from scan2sim.services.orchestration.deployment import Deployment
 from tests.conftest import ROOT
 
@@ -64,7 +64,8 @@ ALL = set().union(*OPTIONS.values())
 def source(module: str) -> str:
     """Of `python -m MODULE`."""
     path = ROOT / module.removeprefix("scan2sim.").replace(".", "/")
-    return (path / "__main__.py" if path.is_dir() else path.with_suffix(".py")).read_text(encoding="utf-8")
+    files = path.glob("*.py") if path.is_dir() else [path.with_suffix(".py")]
+    return "".join(file.read_text(encoding="utf-8") for file in files)
 
 
 def lines(text: str) -> Iterator[str]:

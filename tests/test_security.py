@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.io import xml
 from tests.conftest import ROOT
 
@@ -16,7 +16,7 @@ RUNS = re.compile(
     r"\bpickle\.load|allow_pickle=True|weights_only=False|yaml\.(unsafe_)?load\(|(?<![\w.])(eval|exec)\(|extractall\(|"
     r"shell=True|os\.system|\bmarshal\b|\bshelve\b|import_module\(.*input"
 )
-BETWEEN_PROCESSES = {"pipeline/isolate.py"}
+BETWEEN_PROCESSES = {"pipeline/core/sandbox.py"}
 """Pickles between a run and its own children."""
 
 

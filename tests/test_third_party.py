@@ -6,7 +6,7 @@ import re
 
 from packaging.utils import canonicalize_name
 
-from bench.third_party import closure, page, project
+from bench.packaging.third_party import closure, page, project
 from tests.conftest import ROOT
 
 
@@ -17,7 +17,9 @@ def test_the_page_names_every_pinned_package_of_the_core() -> None:
     page = (ROOT / "docs" / "third-party.md").read_text(encoding="utf-8").split("## Core")[1].split("\n## ")[0]
     assert len(core) > 20
     for name in core:
-        assert f"| {name} | {pins[name]} |" in page, f"{name}: python -m bench.third_party > docs/third-party.md"
+        assert f"| {name} | {pins[name]} |" in page, (
+            f"{name}: python -m bench.packaging.third_party > docs/third-party.md"
+        )
 
 
 def test_every_library_that_wheels_bring_has_a_licence_there() -> None:

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from scan2sim.flows.reports.tile import PAGES
-from scan2sim.pipeline.types import F64, Camera
+from scan2sim.pipeline.core.types import F64, Camera
 from tests import browser
 from tests.browser import Page
 

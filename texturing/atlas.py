@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from scan2sim.pipeline.types import F32, I32
+from scan2sim.pipeline.core.types import F32, I32
 
 Backend = Literal["uvatlas", "xatlas"]
 SMALLEST = 16

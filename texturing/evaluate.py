@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.io import image
-from scan2sim.pipeline.types import F32, F64, U8, Bools, View
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.types import F32, F64, U8, Bools, View
+from scan2sim.pipeline.io.images import image
 
 if TYPE_CHECKING:
-    from scan2sim.pipeline.render import Image, Renderer
+    from scan2sim.pipeline.camera.renderer import Image, Renderer
 
 
 SAMPLES = 3

@@ -17,14 +17,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydantic import Field
 
+from scan2sim.pipeline.core.parameters import FileName, Reach, Stops
+from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.types import F64, I64, U8, View
 from scan2sim.pipeline.io import views as views_io
-from scan2sim.pipeline.ranges import FileName, Reach, Stops
-from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.types import F64, I64, U8, View
 
 if TYPE_CHECKING:
-    from scan2sim.pipeline.visibility import DepthMap
-    from scan2sim.texturing.photos import Exposures
+    from scan2sim.pipeline.camera.depth_map import DepthMap
+    from scan2sim.texturing.photo_cache import Exposures
 
 
 class ExposureParams(Params):
@@ -68,9 +68,9 @@ def exposure(inputs: Inputs, params: ExposureParams, out: Path, report: Report) 
     """Solve the exposures of all photos that are not held out.
 
     Inputs: `views`, `depth` (folder of depth maps), `prior` (an earlier tile's exposures) or none.
-    File: `exposures`, JSON of `texturing.photos.Exposures`.
+    File: `exposures`, JSON of `texturing.photo_cache.Exposures`.
     """
-    from scan2sim.texturing.photos import Exposures, camera_of
+    from scan2sim.texturing.photo_cache import Exposures, camera_of
 
     views = views_io.load(inputs["views"])
     held = views_io.load_held_out(inputs["views"])
@@ -115,9 +115,9 @@ def observe(
     report: Report,
 ) -> Observed:
     """Sample random places of every photo in all photos that see them; read photo by photo."""
-    from scan2sim.pipeline.visibility import load_depth_map
-    from scan2sim.texturing.photos import Photos
-    from scan2sim.texturing.predict import surface
+    from scan2sim.pipeline.camera.depth_map import load_depth_map
+    from scan2sim.texturing.photo_cache import Photos
+    from scan2sim.texturing.photo_prediction import surface
 
     rng = np.random.default_rng(0)
     points, normals = [], []
@@ -158,10 +158,10 @@ def _observe(
     """Indices of the places (P, 3) that a photo sees well, their log values (N, 3), and q (N,)."""
     import cv2
 
-    from scan2sim.pipeline.projection import pixels
-    from scan2sim.pipeline.visibility import DepthMap as Map
-    from scan2sim.pipeline.visibility import visible
-    from scan2sim.texturing.photos import OFFSET
+    from scan2sim.pipeline.camera.depth_map import DepthMap as Map
+    from scan2sim.pipeline.camera.depth_map import visible
+    from scan2sim.pipeline.camera.projection import pixels
+    from scan2sim.texturing.photo_cache import OFFSET
 
     camera = view.camera
     to = view.centre - place
@@ -178,7 +178,8 @@ def _observe(
     x = np.clip((uv[:, 0] + 0.5) * low.shape[1] / camera.width - 0.5, 0, low.shape[1] - 1).astype(np.float32)
     y = np.clip((uv[:, 1] + 0.5) * low.shape[0] / camera.height - 0.5, 0, low.shape[0] - 1).astype(np.float32)
     rgb = np.zeros((len(at), 3))
-    # whole levels, by cv2.remap: `pipeline.sampling`'s fractions would bring other exposures, at four times the time
+    # whole levels, by cv2.remap: `pipeline.camera.image_sampling`'s fractions would bring other exposures, at four
+    # times the time
     for first in range(0, len(at), 30_000):  # it knows no more rows than 32767
         part = slice(first, first + 30_000)
         rgb[part] = cv2.remap(low, x[part, None], y[part, None], cv2.INTER_LINEAR)[:, 0]
@@ -199,7 +200,7 @@ def solve(
     A camera's vignetting is kept only where it explains much: surfaces that look brighter against the sun, which
     are in a photo's middle when far away, look like a little of it.
     """
-    from scan2sim.texturing.photos import camera_of
+    from scan2sim.texturing.photo_cache import camera_of
 
     if len(seen.photo) == 0:
         return prior, (0.0, 0.0)
@@ -217,7 +218,7 @@ def _least_squares(
     """Solve gains, and the vignetting of the cameras named `lenses`."""
     import scipy.sparse as sp
 
-    from scan2sim.texturing.photos import GAMMA, Exposures, camera_of
+    from scan2sim.texturing.photo_cache import GAMMA, Exposures, camera_of
 
     photos = np.unique(seen.photo)
     n, m, places = len(photos), len(lenses), len(np.unique(seen.place))
@@ -269,7 +270,7 @@ def _prior(
     params: ExposureParams,
 ) -> tuple[F64, F64]:
     """Centre (U,) and precision (U, U) of the unknowns, in units of an observation's own precision."""
-    from scan2sim.texturing.photos import GAMMA
+    from scan2sim.texturing.photo_cache import GAMMA
 
     stop = np.log(2) / GAMMA  # a stop, in logarithms of encoded values
     n, m = len(photos), len(lenses)

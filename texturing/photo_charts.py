@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from scan2sim.pipeline.types import F32, F64, I32, I64, Bools, Mesh
+from scan2sim.pipeline.core.types import F32, F64, I32, I64, Bools, Mesh
 
 TILT = 0.2
 """How far a chart's plane is turned from its faces' mean normal towards the camera."""
@@ -133,7 +133,7 @@ def pack(size: I64, side: int, gutter: int) -> tuple[I64, I64, list[tuple[int, i
 
 def overlapping(flat: F32, page: I64, pages: list[tuple[int, int]]) -> Bools:
     """(N,) faces of which others cover too much; `flat` (N, 3, 2) texels of their page."""
-    from scan2sim.texturing.texels import owners
+    from scan2sim.texturing.bake.texel_map import owners
 
     area = np.abs(_signed_area(flat))
     covered = np.zeros(len(flat), bool)
@@ -150,7 +150,7 @@ def _components(mesh: Mesh, view: I32, cell: float) -> I64:
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    from scan2sim.texturing.mrf import adjacent
+    from scan2sim.texturing.view_selection.mrf import adjacent
 
     pairs, _ = adjacent(mesh.faces)
     place = np.floor(mesh.corners.mean(axis=1) / cell).astype(np.int64)

@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import Field
 
-from scan2sim.pipeline.classes import SURFACES
+from scan2sim.pipeline.core.classes import SURFACES
+from scan2sim.pipeline.core.parameters import Reach
+from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.types import F32, I64, Bools, View
 from scan2sim.pipeline.io import views as views_io
-from scan2sim.pipeline.ranges import Reach
-from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.steps.pictures import Album
-from scan2sim.pipeline.types import F32, I64, Bools, View
 
 if TYPE_CHECKING:
-    from scan2sim.pipeline.render import Renderer
+    from scan2sim.pipeline.camera.renderer import Renderer
 
 FIGURES = ("psnr_db", "psnr_gain_db", "ssim", "sharpness")
 CLEARANCE = 1.0
@@ -53,10 +53,11 @@ def score(inputs: Inputs, params: ScoreParams, out: Path, report: Report) -> Don
     0 where no other photo saw anything of what it shows; `by_class` and `by_distance`, the same but sharpness of all
     their pixels; `truth_psnr_db` and `truth_psnr_near_db` for generated tiles; `cameras`: how many there are
     (`count`), and metres to the nearest surface for those that are within `CLEARANCE` of one (`near_m`). Where `things`
-    are listed, `remains_m2`: surface left of each vehicle that was taken out (`pipeline.remains`).
+    are listed, `remains_m2`: surface left of each vehicle that was taken out
+    (`pipeline.dynamic_objects.vehicle_residue`).
     """
-    from scan2sim.pipeline.remains import left_of_vehicles
-    from scan2sim.pipeline.render import Renderer, textured
+    from scan2sim.pipeline.camera.renderer import Renderer, textured
+    from scan2sim.pipeline.dynamic_objects.vehicle_residue import left_of_vehicles
     from scan2sim.texturing import evaluate
 
     groups = [g for g in SURFACES if g in inputs]
@@ -163,7 +164,7 @@ def _truth(inputs: Inputs, world: Renderer, params: ScoreParams) -> dict[str, fl
 
 def _seen_from_near(inputs: Inputs, places: F32, normals: F32, near: float) -> Bools:
     """(N,) which places (N, 3) on the meshes a photo that was not held out sees from `near` metres or nearer."""
-    from scan2sim.pipeline.visibility import load_depth_map, visible
+    from scan2sim.pipeline.camera.depth_map import load_depth_map, visible
 
     seen = np.zeros(len(places), bool)
     for i, (view, held) in enumerate(

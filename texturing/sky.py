@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from scan2sim.pipeline.types import F32, U8, Bools
+from scan2sim.pipeline.core.types import F32, U8, Bools
 
 SMOOTH = 4.0
 """Grey levels, standard deviation within 5 x 5 pixels: sky varies by no more ..."""

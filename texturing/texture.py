@@ -18,19 +18,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import Field
 
-from scan2sim.pipeline.extras import need
-from scan2sim.pipeline.io import image
+from scan2sim.pipeline.core.optional_deps import need
+from scan2sim.pipeline.core.parameters import Cosine, Depth, Device
+from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.types import F32, I64, U8, Bools, Mesh, PointCloud
 from scan2sim.pipeline.io import views as views_io
-from scan2sim.pipeline.ranges import Cosine, Depth, Device
-from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.types import F32, I64, U8, Bools, Mesh, PointCloud
-from scan2sim.texturing.agreement import Agreement
-from scan2sim.texturing.choose import Choice
+from scan2sim.pipeline.io.images import image
+from scan2sim.texturing.photo_consistency import Agreement
+from scan2sim.texturing.view_selection.step import Choice
 
 if TYPE_CHECKING:
-    from scan2sim.texturing.baker import Baker
-    from scan2sim.texturing.fill import Colours, Page
-    from scan2sim.texturing.plan import Plan
+    from scan2sim.texturing.bake.bands import Baker
+    from scan2sim.texturing.inpainting.ground import Plan
+    from scan2sim.texturing.inpainting.hole_filling import Colours, Page
 
 NEIGHBOUR_STEP = 8
 """Where points have no colour, every so many seen texels (each way) lend theirs to the unseen ones."""
@@ -75,9 +75,9 @@ def texture(inputs: Inputs, params: TextureParams, out: Path, report: Report) ->
     File: `textured`, a folder with `mesh.npz`, `page_<i>.png` and `page_<i>_seen.png` (255 seen by a photo,
     128 coloured from points, 64 filled from neighbours or by class, 0 no surface).
     """
-    from scan2sim.texturing import fill
-    from scan2sim.texturing.lent import colours_of, made_colours
-    from scan2sim.texturing.writer import Writer
+    from scan2sim.texturing.bake.page_writer import Writer
+    from scan2sim.texturing.inpainting import hole_filling
+    from scan2sim.texturing.inpainting.point_colours import colours_of, made_colours
 
     folder = out / "textured"
     folder.mkdir()
@@ -105,7 +105,7 @@ def texture(inputs: Inputs, params: TextureParams, out: Path, report: Report) ->
             plan.add(page)
         waits = plan is not None and bool(counts[faces, 3].any())
         if not waits:
-            fill.pad(page.rgb, page.seen, params.padding)
+            hole_filling.pad(page.rgb, page.seen, params.padding)
         writer.write(folder / f"page_{k}", page, compression=0 if waits else 2)
         del page
     writer.finish()
@@ -119,9 +119,9 @@ def texture(inputs: Inputs, params: TextureParams, out: Path, report: Report) ->
 
 def _baker(mesh: Mesh, inputs: Inputs, params: TextureParams) -> Baker:
     """What bakes the mesh's pages, with what the steps before have found."""
-    from scan2sim.texturing.baker import Baker, best_device
-    from scan2sim.texturing.blend import Weighing
-    from scan2sim.texturing.photos import Exposures
+    from scan2sim.texturing.bake.bands import Baker, best_device
+    from scan2sim.texturing.bake.blend_numba import Weighing
+    from scan2sim.texturing.photo_cache import Exposures
 
     return Baker(
         mesh,
@@ -138,9 +138,9 @@ def _baker(mesh: Mesh, inputs: Inputs, params: TextureParams) -> Baker:
 
 def _plan(mesh: Mesh, sizes: Sequence[dict[str, int]], inputs: Inputs) -> Plan:
     """The picture from above of an unwrapped mesh, with the classes of the ground's points."""
-    from scan2sim.pipeline.remains import outlines
-    from scan2sim.texturing.lent import classes_of
-    from scan2sim.texturing.plan import Plan
+    from scan2sim.pipeline.dynamic_objects.vehicle_residue import outlines
+    from scan2sim.texturing.inpainting.ground import Plan
+    from scan2sim.texturing.inpainting.point_colours import classes_of
 
     cloud = PointCloud.load(inputs["cloud.terrain"])
     stood = outlines(inputs["things"], mesh.frame) if "things" in inputs else []
@@ -158,8 +158,9 @@ def _texel(mesh: Mesh, sizes: Sequence[dict[str, int]]) -> float:
 
 def _go_on(plan: Plan, folder: Path, mesh: Mesh, wanting: Bools, params: TextureParams) -> None:
     """Paint the pages of the faces that are `wanting` (F,), where the ground goes on, and pad their charts."""
-    from scan2sim.texturing import fill, texels
-    from scan2sim.texturing.writer import Writer
+    from scan2sim.texturing.bake import texel_map as texels
+    from scan2sim.texturing.bake.page_writer import Writer
+    from scan2sim.texturing.inpainting import hole_filling
 
     ground = plan.go_on()
     assert mesh.page is not None and mesh.uv is not None
@@ -171,10 +172,12 @@ def _go_on(plan: Plan, folder: Path, mesh: Mesh, wanting: Bools, params: Texture
             image.read_levels(path.with_name(f"{path.name}_seen.png")),
         )
         flat = texels.corners(mesh.uv[faces], seen.shape[1], seen.shape[0])
-        page = fill.Page(rgb, seen, texels.owners(flat, seen.shape[1], seen.shape[0]), flat, mesh.corners[faces])
+        page = hole_filling.Page(
+            rgb, seen, texels.owners(flat, seen.shape[1], seen.shape[0]), flat, mesh.corners[faces]
+        )
         if ground is not None:
             ground.fill(page)
-        fill.pad(page.rgb, page.seen, params.padding)
+        hole_filling.pad(page.rgb, page.seen, params.padding)
         writer.write(path, page)
     writer.finish()
 
@@ -190,20 +193,21 @@ def _filled(
 
     Where points have no colours of their own, texels that photos saw stand in, but for what was made up (`made`).
     """
-    from scan2sim.texturing import fill, texels
+    from scan2sim.texturing.bake import texel_map as texels
+    from scan2sim.texturing.inpainting import hole_filling
 
     area = float(mesh.face_area[faces].sum())
     texel = (area / max(1, int((page.owner >= 0).sum()))) ** 0.5
     if made is not None:  # neighbours that a photo saw are nearer the truth than a class's colour
-        places, rgb = fill.seen_points(page, NEIGHBOUR_STEP)
+        places, rgb = hole_filling.seen_points(page, NEIGHBOUR_STEP)
         if len(places):
             xyz, colour = np.concatenate([places, made[0]]), np.concatenate([rgb, made[1]])
-            colours = fill.Colours(xyz, colour, fill.FILLED)
+            colours = hole_filling.Colours(xyz, colour, hole_filling.FILLED)
     if colours is not None:
-        fill.fill(page, colours, max(texel, 1e-6))
+        hole_filling.fill(page, colours, max(texel, 1e-6))
     else:
-        page.seen[(page.owner >= 0) & (page.seen == 0)] = fill.FILLED
-        page.rgb[page.seen == fill.FILLED] = 128
+        page.seen[(page.owner >= 0) & (page.seen == 0)] = hole_filling.FILLED
+        page.rgb[page.seen == hole_filling.FILLED] = 128
     return np.asarray(texels.count(page.owner, page.seen, page.flat))
 
 

@@ -18,13 +18,13 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
-from scan2sim.pipeline.classes import CODE
-from scan2sim.pipeline.errors import SettingError, StepError
+from scan2sim.pipeline.core.classes import CODE
+from scan2sim.pipeline.core.errors import SettingError, StepError
+from scan2sim.pipeline.core.parameters import Seconds, Texel
+from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.types import F32, F64, I32, I64, Mesh, View
 from scan2sim.pipeline.io import views as views_io
-from scan2sim.pipeline.ranges import Seconds, Texel
-from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.types import F32, F64, I32, I64, Mesh, View
-from scan2sim.texturing.choose import Choice
+from scan2sim.texturing.view_selection.step import Choice
 
 if TYPE_CHECKING:
     from scan2sim.texturing.atlas import Backend, Unwrapped
@@ -155,7 +155,7 @@ def _photos(inputs: Inputs) -> tuple[I32, F64, F64]:
 
 def _eye(view: View) -> F64:
     """(3,) where a view's rays meet: its centre; those of an orthographic camera nearly do so far above its middle."""
-    from scan2sim.pipeline.cameras import ray_origins
+    from scan2sim.pipeline.camera.models import ray_origins
 
     if view.camera.model != "orthographic":
         return view.centre
@@ -271,7 +271,7 @@ CHILD = "child process: "
 
 def _in_child(mesh: Mesh, blocks: list[Index], backend: Backend, params: UnwrapParams) -> list[Unwrapped | str]:
     """Unwrap blocks in one child process; a reason for each that failed."""
-    from scan2sim.pipeline import isolate
+    from scan2sim.pipeline.core import sandbox
 
     parts = []
     for block in blocks:
@@ -279,7 +279,7 @@ def _in_child(mesh: Mesh, blocks: list[Index], backend: Backend, params: UnwrapP
         parts.append((mesh.vertices[used], faces.reshape(-1, 3).astype(np.int32)))
     timeout = params.timeout * sum(max(1.0, len(block) / 10_000) for block in blocks)
     try:
-        return isolate.call(
+        return sandbox.call(
             "scan2sim.texturing.atlas:unwrap_blocks",
             backend,
             parts,

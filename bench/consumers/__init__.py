@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
-from bench.gate_places import Places
+from bench.gate.places import Places
 
 
 class Fault(Exception):

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from bench import blender
-from bench.gate_places import Places
+from bench.consumers import blender
+from bench.gate.places import Places
 
 FORMAT = "gazebo"
 PROGRAM = ("blender", "--background", "--factory-startup", "--python-exit-code", "1", "--python")

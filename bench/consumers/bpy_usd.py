@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from bench import blender
-from bench.gate_places import Places
+from bench.consumers import blender
+from bench.gate.places import Places
 
 FORMAT = "usd"
 

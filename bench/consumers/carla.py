@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from bench.consumers import Fault
-from bench.gate_places import Places
+from bench.gate.places import Places
 
 FORMAT = "opendrive"
 EVERY = 2

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from bench import gate_pictures
 from bench.consumers import Fault
-from bench.gate_places import Places
-from scan2sim.pipeline.io import crs
-from scan2sim.pipeline.types import F64, Frame
+from bench.gate import renderings
+from bench.gate.places import Places
+from scan2sim.pipeline.core.types import F64, Frame
+from scan2sim.pipeline.io.geodata import crs
 from tests import cesium
 
 FORMAT = "tiles3d"
@@ -42,7 +42,7 @@ def check(export: Path, places: Places) -> dict[str, Any]:
     if about["crs"] == crs.LOCAL:
         raise Fault("a world without a CRS is nowhere on Cesium's earth")
     frame = Frame(about["crs"], tuple(about["world_origin_m"]), about["unit_m"])
-    seen = gate_pictures.photo(places)
+    seen = renderings.photo(places)
     focal, centre = seen.camera.fx, (seen.camera.cx, seen.camera.cy)
     size = seen.camera.width, seen.camera.height
     with tempfile.TemporaryDirectory() as work, cesium.viewer(export, Path(work), size) as view:
@@ -55,7 +55,7 @@ def check(export: Path, places: Places) -> dict[str, Any]:
         raise Fault(f"the finest level isn't shown near by, but {near}")
     if far != [tileset["root"]["content"]["uri"]]:
         raise Fault(f"the coarsest level isn't shown from afar, but {far}")
-    likeness = gate_pictures.compare(export, "cesium", seen, picture, (picture != cesium.SKY).any(axis=2))
+    likeness = renderings.compare(export, "cesium", seen, picture, (picture != cesium.SKY).any(axis=2))
     differ = round(float(np.abs(picture.astype(float) - finest).mean()), 2)
     return {"shown_near": len(near), "shown_far": len(far), "levels_differ": differ, **likeness}
 

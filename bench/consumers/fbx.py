@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from bench.consumers import Fault
-from bench.gate_places import Places
-from scan2sim.pipeline.render import Body, Renderer
-from scan2sim.pipeline.types import F64, Frame, Mesh
+from bench.gate.places import Places
+from scan2sim.pipeline.camera.renderer import Body, Renderer
+from scan2sim.pipeline.core.types import F64, Frame, Mesh
 from tests.pipeline.io import scene_readers
 
 FORMAT = "carla"

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bench import gate_drive, gate_drops
 from bench.consumers import Fault
-from bench.gate_drive import Pose
-from bench.gate_places import Places
-from scan2sim.pipeline.robot import ROBOT
-from scan2sim.pipeline.types import F64
+from bench.gate import drive, drops
+from bench.gate.drive import Pose
+from bench.gate.places import Places
+from scan2sim.pipeline.core.types import F64
+from scan2sim.pipeline.simulation.robot import ROBOT
 from tests.gazebo import checker
 
 FORMAT = "gazebo"
@@ -35,17 +35,17 @@ def check(export: Path, places: Places) -> dict[str, Any]:
     """Load the world, and drop bodies; see the package."""
     (world,) = export.glob("*.sdf")
     first, *others = _apart(places.road)
-    bodies: list[checker.Body] = [("ball", (x, y, z)) for x, y, z in gate_drops.starts(places).tolist()]
+    bodies: list[checker.Body] = [("ball", (x, y, z)) for x, y, z in drops.starts(places).tolist()]
     seen = _checked(world, [*bodies, *(("car", _over(place, places)) for place in first)])
     cars = seen["bodies"][len(bodies) :]
     for group in others:
         cars += _checked(world, [("car", _over(place, places)) for place in group])["bodies"]
-    balls = gate_drops.gaps(np.array([body["rest"] for body in seen["bodies"][: len(bodies)]]), places)
+    balls = drops.gaps(np.array([body["rest"] for body in seen["bodies"][: len(bodies)]]), places)
     off = np.concatenate([balls, [_car_off(car, places) for car in cars]])
-    figures = {"meshes": len(seen["meshes"]), "solids": seen["solids"], **gate_drops.told(off)}
+    figures = {"meshes": len(seen["meshes"]), "solids": seen["solids"], **drops.told(off)}
     left, right = (f"{wheel.name}_joint" for wheel in ROBOT.wheels)
     with checker.Driven(world, ROBOT.name, (left, right)) as driven:
-        return figures | gate_drive.drive(_Robot(driven), places)
+        return figures | drive.drive(_Robot(driven), places)
 
 
 class _Robot:
@@ -74,7 +74,7 @@ def _over(place: F64, places: Places) -> tuple[float, float, float]:
     """Where a car's box begins to fall: over the highest ground below it."""
     below = _underside()[:, :2] + place[:2]
     highest = float(np.nanmax([place[2], *places.heights(below)]))
-    return float(place[0]), float(place[1]), highest + CAR[2] / 2 + gate_drops.FALL
+    return float(place[0]), float(place[1]), highest + CAR[2] / 2 + drops.FALL
 
 
 def _underside() -> F64:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.consumers import Fault
-from bench.gate_places import Places
+from bench.gate.places import Places
 from tests.cesium import node_module
 
 FORMAT = "glb"

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from bench import gate_drive, gate_drops, gate_pictures
-from bench.gate_drive import Pose
-from bench.gate_pictures import Photo
-from bench.gate_places import Places
-from scan2sim.pipeline.robot import ROBOT
-from scan2sim.pipeline.types import U8
+from bench.gate import drive, drops, renderings
+from bench.gate.drive import Pose
+from bench.gate.places import Places
+from bench.gate.renderings import Photo
+from scan2sim.pipeline.core.types import U8
+from scan2sim.pipeline.simulation.robot import ROBOT
 
 FORMAT = "mujoco"
 REST = 2.5
@@ -39,10 +39,10 @@ def check(export: Path, places: Places) -> dict[str, Any]:
     """Load the world; see the module."""
     (world,) = (path for path in export.glob("*.xml") if path.stem != ROBOT.name)
     engine = _Engine(world, places)
-    figures = gate_drops.told(gate_drops.gaps(engine.fallen(), places))
-    figures |= gate_drive.drive(engine, places)
-    seen = gate_pictures.photo(places)
-    return figures | gate_pictures.compare(export, "mujoco", seen, *engine.picture(seen))
+    figures = drops.told(drops.gaps(engine.fallen(), places))
+    figures |= drive.drive(engine, places)
+    seen = renderings.photo(places)
+    return figures | renderings.compare(export, "mujoco", seen, *engine.picture(seen))
 
 
 class _Engine:
@@ -53,15 +53,15 @@ class _Engine:
 
         self._mj = mujoco
         spec = mujoco.MjSpec.from_file(str(world))
-        self._balls = len(gate_drops.starts(places))
-        for i, place in enumerate(gate_drops.starts(places)):
+        self._balls = len(drops.starts(places))
+        for i, place in enumerate(drops.starts(places)):
             ball = spec.worldbody.add_body(name=f"ball{i}", pos=place)
             ball.add_freejoint()
             ball.add_geom(
-                name=f"ball{i}", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[gate_drops.BALL, 0, 0], mass=1, condim=6,
+                name=f"ball{i}", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[drops.BALL, 0, 0], mass=1, condim=6,
                 friction=[0.9, 0.01, 0.01],
             )  # fmt: skip
-        seen = gate_pictures.photo(places)
+        seen = renderings.photo(places)
         own = seen.camera
         spec.worldbody.add_camera(
             name="photo", pos=seen.pose[:3, 3], quat=_quaternion(seen.pose[:3, :3] * [1, -1, -1]),

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.consumers import Fault
-from bench.gate_places import Places
+from bench.gate.places import Places
 
 FORMAT = "usd"
 FAILED = ("ERROR", "FAILURE")

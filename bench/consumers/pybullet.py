@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from bench import gate_drive, gate_drops, gate_pictures
-from bench.gate_drive import Pose
-from bench.gate_pictures import Photo
-from bench.gate_places import Places
-from scan2sim.pipeline.robot import ROBOT
-from scan2sim.pipeline.types import F64, U8
+from bench.gate import drive, drops, renderings
+from bench.gate.drive import Pose
+from bench.gate.places import Places
+from bench.gate.renderings import Photo
+from scan2sim.pipeline.core.types import F64, U8
+from scan2sim.pipeline.simulation.robot import ROBOT
 
 FORMAT = "urdf"
 STEP = 1 / 240
@@ -36,10 +36,10 @@ def check(export: Path, places: Places) -> dict[str, Any]:
     client = pybullet.connect(pybullet.DIRECT)
     try:
         engine = _Engine(export)
-        figures = gate_drops.told(gate_drops.gaps(engine.fallen(gate_drops.starts(places)), places))
-        figures |= gate_drive.drive(engine, places)
-        seen = gate_pictures.photo(places)
-        return figures | gate_pictures.compare(export, "pybullet", seen, *engine.picture(seen))
+        figures = drops.told(drops.gaps(engine.fallen(drops.starts(places)), places))
+        figures |= drive.drive(engine, places)
+        seen = renderings.photo(places)
+        return figures | renderings.compare(export, "pybullet", seen, *engine.picture(seen))
     finally:
         pybullet.disconnect(client)
 
@@ -62,7 +62,7 @@ class _Engine:
 
     def fallen(self, starts: F64) -> F64:
         """(N, 3) where balls rest; they are taken away then."""
-        shape = self._p.createCollisionShape(self._p.GEOM_SPHERE, radius=gate_drops.BALL)
+        shape = self._p.createCollisionShape(self._p.GEOM_SPHERE, radius=drops.BALL)
         balls = [self._p.createMultiBody(1, shape, basePosition=place) for place in starts.tolist()]
         for ball in balls:
             self._p.changeDynamics(ball, -1, rollingFriction=0.01, spinningFriction=0.01)

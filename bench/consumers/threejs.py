@@ -7,9 +7,9 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from bench import gate_pictures
 from bench.consumers import Fault
-from bench.gate_places import Places
+from bench.gate import renderings
+from bench.gate.places import Places
 from tests import threejs
 
 FORMAT = "glb"
@@ -23,11 +23,11 @@ def missing() -> str:
 def check(export: Path, places: Places) -> dict[str, Any]:
     """Load all GLBs, and look from a photo's pose."""
     wanted = json.loads((export / "metadata.json").read_text(encoding="utf-8"))["triangles_by_file"]
-    seen = gate_pictures.photo(places)
+    seen = renderings.photo(places)
     size = seen.camera.width, seen.camera.height
     with tempfile.TemporaryDirectory() as work, threejs.viewer(export, list(wanted), Path(work), size) as view:
         picture = view.picture(seen.camera, seen.pose)
     if view.told["triangles"] != sum(wanted.values()):
         raise Fault(f"{view.told['triangles']} triangles are loaded of {sum(wanted.values())}", view.told)
-    likeness = gate_pictures.compare(export, "threejs", seen, picture, (picture != threejs.SKY).any(axis=2))
+    likeness = renderings.compare(export, "threejs", seen, picture, (picture != threejs.SKY).any(axis=2))
     return {**view.told, **likeness}

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.consumers import Fault
-from bench.gate_places import Places
+from bench.gate.places import Places
 
 FORMAT = "usd"
 

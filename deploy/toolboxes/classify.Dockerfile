@@ -5,10 +5,10 @@ FROM scan2sim-toolbox AS network
 COPY constraints.txt deploy/toolboxes/imagenet.txt /requirements/
 USER root
 RUN pip install --no-cache-dir -c /requirements/constraints.txt -r /requirements/imagenet.txt
-RUN python -m scan2sim.services.toolboxes.networks.imagenet /models/efficientnet-lite0.onnx
+RUN python -m scan2sim.services.toolboxes.detector.imagenet /models/efficientnet-lite0.onnx
 
 FROM scan2sim-toolbox
 COPY --from=network /models /models
-HEALTHCHECK --interval=10s --timeout=5s --start-period=60s CMD ["python", "-m", "scan2sim.services.ready"]
+HEALTHCHECK --interval=10s --timeout=5s --start-period=60s CMD ["python", "-m", "scan2sim.services.http.healthcheck"]
 ENTRYPOINT ["scan2sim", "toolbox", "serve", "classify", "--host", "0.0.0.0", \
     "--set", "weights=/models/efficientnet-lite0.onnx"]

@@ -8,15 +8,15 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from scan2sim.flows.commands import numbers
-from scan2sim.flows.recipes.settings import Settings
+from scan2sim.flows.commands import option_ranges
+from scan2sim.flows.pipelines.settings import Settings
 
 
 class _Command(TyperCommand):
     """A command whose numbers are looked at before it begins."""
 
     def invoke(self, ctx: Any) -> Any:
-        numbers.check(ctx.params)
+        option_ranges.check(ctx.params)
         return super().invoke(ctx)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import NamedTuple
 
-from scan2sim.pipeline.errors import SettingError
+from scan2sim.pipeline.core.errors import SettingError
 
 TIMES = {"": 1, "k": 1e3, "M": 1e6}
 LEAST = {"triangles": 1000, "texture": 1e5}

@@ -14,10 +14,10 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Column
 
-from scan2sim.flows.engine.frontier import Event
-from scan2sim.flows.recipes.graph import Node
-from scan2sim.pipeline.errors import printable
-from scan2sim.pipeline.step import Report
+from scan2sim.flows.engine.ready_queue import Event
+from scan2sim.flows.pipelines.graph import Node
+from scan2sim.pipeline.core.errors import printable
+from scan2sim.pipeline.core.step import Report
 
 console = Console()
 

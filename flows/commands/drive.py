@@ -10,10 +10,10 @@ from scan2sim.flows.commands.slam import check_sure, publish_path
 from scan2sim.flows.engine.execution import Executor
 from scan2sim.flows.engine.lock import locked
 from scan2sim.flows.engine.planning import STORE, Planned, drop_damaged, plan
-from scan2sim.flows.recipes.drive import Drive, recipe
-from scan2sim.pipeline.errors import InputError
+from scan2sim.flows.pipelines.drive import Drive, recipe
+from scan2sim.pipeline.core.cache import Digests, Manifest, Store
+from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.io.remote import is_remote, likeness
-from scan2sim.pipeline.store import Digests, Manifest, Store
 
 PREPARED, DRIVE = "prepared", "drive.toml"
 SHOWN = {"import_sweeps": "corridor", "cut": "survey"}

@@ -14,13 +14,13 @@ from scan2sim.flows.commands.app import App
 from scan2sim.flows.commands.budget import Budget, parse
 from scan2sim.flows.commands.display import console, progress, warn
 from scan2sim.flows.commands.options import options
-from scan2sim.pipeline.errors import SettingError
-from scan2sim.pipeline.io import scenes
-from scan2sim.pipeline.io.crs import LOCAL
-from scan2sim.pipeline.io.importing import tile_folder
-from scan2sim.pipeline.io.scene import Scene, read_scene
-from scan2sim.pipeline.io.scenes import SceneParams
-from scan2sim.pipeline.step import Report
+from scan2sim.pipeline.core.errors import SettingError
+from scan2sim.pipeline.core.step import Report
+from scan2sim.pipeline.importers.tile_folder import tile_folder
+from scan2sim.pipeline.io import world_formats
+from scan2sim.pipeline.io.geodata.crs import LOCAL
+from scan2sim.pipeline.io.world_formats import SceneParams
+from scan2sim.pipeline.io.worlds.scene import Scene, read_scene
 
 app = App()
 
@@ -30,11 +30,11 @@ def _within(scene: Scene, limits: Budget, levels: int, report: Report) -> Iterat
     """The scene within a budget and in levels of detail, for as long as it is written."""
     with tempfile.TemporaryDirectory() as work:
         if limits != Budget():
-            from scan2sim.texturing.reduce import reduced
+            from scan2sim.texturing.simplify_textured import reduced
 
             scene = reduced(scene, limits.triangles, limits.texels, Path(work) / "within", report)
         if levels > 1:
-            from scan2sim.texturing.levels import detailed
+            from scan2sim.texturing.levels_of_detail import detailed
 
             scene = detailed(scene, levels, Path(work) / "levels", report)
         yield scene
@@ -72,16 +72,16 @@ def export(
     """Write a finished world in other formats, for other simulators."""
     formats = list(dict.fromkeys(filter(None, map(str.strip, to.split(",")))))
     if not formats:
-        raise SettingError("--to", "names no format", f"Choose of: {', '.join(scenes.known())}")
-    scenes.check(formats, params, "--to", robot)
+        raise SettingError("--to", "names no format", f"Choose of: {', '.join(world_formats.known())}")
+    world_formats.check(formats, params, "--to", robot)
     limits = parse(budget)
     scene = read_scene(world)
     with (
         progress("export") as report,
         tile_folder(out, overwrite, "world") as folder,
-        _within(scene, limits, levels or scenes.levels(formats), report) as small,
+        _within(scene, limits, levels or world_formats.levels(formats), report) as small,
     ):
-        scenes.write(small, formats, folder, params, report, robot)
+        world_formats.write(small, formats, folder, params, report, robot)
         _tell(small, limits)
     if scene.frame.crs == LOCAL:
         warn(f"{scene.name} has no CRS, so nothing says where on the earth it is")

@@ -12,12 +12,12 @@ from scan2sim.flows.commands.app import App, Classes, Crs, Link, Name, Overwrite
 from scan2sim.flows.commands.display import progress
 from scan2sim.flows.commands.options import options
 from scan2sim.flows.commands.sweeps import scanner_path
-from scan2sim.flows.recipes.sweeps import Sweeps, path, placed
-from scan2sim.pipeline.classes import parse
-from scan2sim.pipeline.io.import_model import import_model
-from scan2sim.pipeline.io.kitti import import_kitti_raw
-from scan2sim.pipeline.io.kitti_odometry import import_kitti_odometry
-from scan2sim.pipeline.io.las_csv import import_las
+from scan2sim.flows.pipelines.sweeps import Sweeps, path, placed
+from scan2sim.pipeline.core.classes import parse
+from scan2sim.pipeline.importers.clouds_and_photos import import_las
+from scan2sim.pipeline.importers.kitti_odometry import import_kitti_odometry
+from scan2sim.pipeline.importers.kitti_raw import import_kitti_raw
+from scan2sim.pipeline.importers.photogrammetry import import_model
 from scan2sim.pipeline.steps.import_sweeps import tile_of
 
 app = App("Make a tile from your files.")

@@ -14,12 +14,12 @@ from rich.table import Table
 
 from scan2sim.flows.commands.app import App
 from scan2sim.flows.commands.display import console
-from scan2sim.pipeline.classes import name_of
-from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.io import clouds, files, xml
-from scan2sim.pipeline.io.crs import name as crs_name
+from scan2sim.pipeline.core.classes import name_of
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.types import Frame
+from scan2sim.pipeline.io import clouds, file_checks, xml
+from scan2sim.pipeline.io.geodata.crs import name as crs_name
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.pipeline.types import Frame
 
 Facts = list[tuple[str, str]]
 
@@ -61,7 +61,7 @@ def _reader(path: Path) -> Callable[[Path], tuple[str, Facts]]:
         raise InputError(
             path, "holds neither tile.toml nor a world", "Name a cloud, a tile (of a survey, too), a mesh or a world"
         )
-    files.check(path, "Mend the name")
+    file_checks.check(path, "Mend the name")
     readers = {
         **dict.fromkeys(clouds.formats(), _cloud), ".toml": _tile, ".sdf": _world, ".npz": _result,
         ".obj": _mesh, ".dae": _mesh, ".glb": _mesh, ".ply": _ply,

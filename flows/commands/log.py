@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from scan2sim.flows.reports.side_products import SideProducts
-from scan2sim.pipeline.errors import ScanError, from_os_error
+from scan2sim.pipeline.core.errors import ScanError, from_os_error
 
 
 class Log:

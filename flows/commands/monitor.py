@@ -13,13 +13,19 @@ import typer
 from scan2sim.flows.commands.app import App
 from scan2sim.flows.commands.display import console, warn
 from scan2sim.flows.commands.options import options
-from scan2sim.flows.commands.spinning import spin
-from scan2sim.pipeline import extras
-from scan2sim.services.monitoring.joined import AlarmsParams, PoolParams, ScaleParams
-from scan2sim.services.monitoring.kept import ArchiveParams, QueryParams
-from scan2sim.services.monitoring.shown import PageParams
-from scan2sim.services.monitoring.traffic import TrafficParams
-from scan2sim.services.monitoring.watched import DatasetParams, ListenerParams, TalkerParams, TopicParams, WorkParams
+from scan2sim.flows.commands.ros_spin import spin
+from scan2sim.pipeline.core import optional_deps
+from scan2sim.services.monitoring.autoscale.traffic_model import TrafficParams
+from scan2sim.services.monitoring.settings.archive import ArchiveParams, QueryParams
+from scan2sim.services.monitoring.settings.bus import AlarmsParams, PoolParams, ScaleParams
+from scan2sim.services.monitoring.settings.dashboard import PageParams
+from scan2sim.services.monitoring.settings.monitor import (
+    DatasetParams,
+    ListenerParams,
+    TalkerParams,
+    TopicParams,
+    WorkParams,
+)
 
 app = App("The event bus: topics of ROS 2 watched, and what goes through them told.")
 
@@ -39,14 +45,14 @@ BUS_OPTIONS = {"kafka_bootstrap_servers": "--kafka", "log_file": "--log"}
 
 @app.callback()
 def _bus() -> None:
-    extras.need("the event bus", "psutil")
+    optional_deps.need("the event bus", "psutil")
 
 
 @app.command("topic")
 @options(TopicParams, topics="TOPIC...", **NODE_OPTIONS)
 def monitor_topic(params: TopicParams, limit: Limits = None) -> None:
     """Watch topics from outside, whoever publishes on them."""
-    from scan2sim.services.monitoring.topic_monitor import TopicMonitor
+    from scan2sim.services.monitoring.node.topic_monitor import TopicMonitor
 
     def made() -> Any:
         node = TopicMonitor(params)
@@ -61,7 +67,7 @@ def monitor_topic(params: TopicParams, limit: Limits = None) -> None:
 @options(TalkerParams, **NODE_OPTIONS)
 def monitor_talker(params: TalkerParams, limit: Limits = None) -> None:
     """Send messages of a size at an interval, to try the bus with."""
-    from scan2sim.services.monitoring.nodes.talker import Talker
+    from scan2sim.services.monitoring.example_nodes.talker import Talker
 
     spin(lambda: Talker(params))
 
@@ -70,7 +76,7 @@ def monitor_talker(params: TalkerParams, limit: Limits = None) -> None:
 @options(DatasetParams, **NODE_OPTIONS)
 def monitor_dataset_talker(params: DatasetParams, limit: Limits = None) -> None:
     """Send messages when, and as large as, a file says."""
-    from scan2sim.services.monitoring.nodes.dataset_talker import DatasetTalker
+    from scan2sim.services.monitoring.example_nodes.dataset_talker import DatasetTalker
 
     spin(lambda: DatasetTalker(params), lambda node: node.finished)
 
@@ -79,7 +85,7 @@ def monitor_dataset_talker(params: DatasetParams, limit: Limits = None) -> None:
 @options(ListenerParams, **NODE_OPTIONS)
 def monitor_listener(params: ListenerParams, limit: Limits = None) -> None:
     """Hear strings, and say what was heard."""
-    from scan2sim.services.monitoring.nodes.listener import Listener
+    from scan2sim.services.monitoring.example_nodes.listener import Listener
 
     spin(lambda: Listener(params))
 
@@ -88,7 +94,7 @@ def monitor_listener(params: ListenerParams, limit: Limits = None) -> None:
 @options(TrafficParams, cameras="--cameras", from_hour="--from", to_hour="--to")
 def monitor_traffic(params: TrafficParams) -> None:
     """Draw events of cameras over some hours of a day, for `dataset-talker`."""
-    from scan2sim.services.monitoring.traffic import write
+    from scan2sim.services.monitoring.autoscale.traffic_model import write
 
     count = write(params)
     console.print(f"{count} events of {params.cameras} cameras in {params.out}", highlight=False, markup=False)
@@ -98,7 +104,7 @@ def monitor_traffic(params: TrafficParams) -> None:
 @options(WorkParams, command="WORKER", **NODE_OPTIONS)
 def monitor_work(params: WorkParams, limit: Limits = None) -> None:
     """Have a topic's events worked on by local processes, as many as are asked for on the bus."""
-    from scan2sim.services.monitoring.work import Work
+    from scan2sim.services.monitoring.work.worker_node import Work
 
     spin(lambda: Work(params))
 
@@ -107,7 +113,7 @@ def monitor_work(params: WorkParams, limit: Limits = None) -> None:
 @options(ScaleParams, **BUS_OPTIONS)
 def monitor_scale(params: ScaleParams) -> None:
     """Ask for as many workers as the queues that are told of on the bus need."""
-    from scan2sim.services.monitoring.scaler import ScalerNode
+    from scan2sim.services.monitoring.autoscale.node import ScalerNode
 
     spin(lambda: ScalerNode(params))
 
@@ -116,8 +122,8 @@ def monitor_scale(params: ScaleParams) -> None:
 @options(PoolParams, **BUS_OPTIONS)
 def monitor_pool(params: PoolParams) -> None:
     """Start and stop workers of a Prefect pool as the bus asks for them."""
-    from scan2sim.services.monitoring.actuators.prefect import PrefectWorkers
-    from scan2sim.services.monitoring.pool import PoolNode
+    from scan2sim.services.monitoring.autoscale.actuators.prefect import PrefectWorkers
+    from scan2sim.services.monitoring.autoscale.pool_node import PoolNode
 
     spin(lambda: PoolNode(params, params.queue or params.pool, PrefectWorkers(params.pool)))
 
@@ -126,7 +132,7 @@ def monitor_pool(params: PoolParams) -> None:
 @options(AlarmsParams, **BUS_OPTIONS)
 def monitor_alarms(params: AlarmsParams) -> None:
     """Hold rules against what monitors tell: alarms go to the bus and to the console."""
-    from scan2sim.services.monitoring.alarms import AlarmsNode
+    from scan2sim.services.monitoring.events.alarm_node import AlarmsNode
 
     def tell(alarm: Any) -> None:
         console.print(f"{alarm.state} {alarm.rule}: {alarm.subject}, {alarm.value:.4g}", highlight=False, markup=False)
@@ -138,8 +144,8 @@ def monitor_alarms(params: AlarmsParams) -> None:
 @options(PageParams, kafka_bootstrap_servers="--kafka")
 def monitor_page(params: PageParams, limit: Limits = None) -> None:
     """Show what nodes tell by Kafka as a page in the browser, live."""
-    extras.need("the page", "fastapi", "uvicorn", "prometheus_client", "confluent_kafka")
-    from scan2sim.services.monitoring.page import serve
+    optional_deps.need("the page", "fastapi", "uvicorn", "prometheus_client", "confluent_kafka")
+    from scan2sim.services.monitoring.dashboard.app import serve
 
     serve(params, lambda text: console.print(text, highlight=False, markup=False))
 
@@ -148,8 +154,8 @@ def monitor_page(params: PageParams, limit: Limits = None) -> None:
 @options(ArchiveParams, kafka_bootstrap_servers="--kafka")
 def monitor_archive(params: ArchiveParams) -> None:
     """Keep records that come by Kafka, as Parquet by hour."""
-    extras.need("the archive", "pyarrow", "confluent_kafka")
-    from scan2sim.services.monitoring.archive import keep
+    optional_deps.need("the archive", "pyarrow", "confluent_kafka")
+    from scan2sim.services.monitoring.export.archive import keep
 
     ended = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -166,9 +172,9 @@ def monitor_query(
     out: Annotated[Path | None, typer.Option("--out", "-o", help="CSV file; default: print it.")] = None,
 ) -> None:
     """Ask an archive: messages, bandwidth, losses and latency by node, topic and span of time, as CSV."""
-    extras.need("the archive", "pyarrow")
+    optional_deps.need("the archive", "pyarrow")
     from pyarrow import csv
 
-    from scan2sim.services.monitoring.archive import query
+    from scan2sim.services.monitoring.export.archive import query
 
     csv.write_csv(query(params), sys.stdout.buffer if out is None else out)

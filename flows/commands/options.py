@@ -9,9 +9,9 @@ from typing import Annotated, Any, TypeVar, get_args, get_origin
 import typer
 from pydantic.fields import FieldInfo
 
-from scan2sim.flows.recipes.settings import parsed
-from scan2sim.pipeline.errors import SettingError
-from scan2sim.pipeline.step import Params
+from scan2sim.flows.pipelines.settings import parsed
+from scan2sim.pipeline.core.errors import SettingError
+from scan2sim.pipeline.core.step import Params
 
 P = TypeVar("P", bound=Params)
 

@@ -15,9 +15,9 @@ from rich.table import Table
 from scan2sim.flows.commands.app import App
 from scan2sim.flows.commands.display import console, progress
 from scan2sim.flows.commands.options import options
-from scan2sim.flows.commands.spinning import ends, spin
-from scan2sim.pipeline import extras
-from scan2sim.pipeline.errors import ScanError, SettingError
+from scan2sim.flows.commands.ros_spin import ends, spin
+from scan2sim.pipeline.core import optional_deps
+from scan2sim.pipeline.core.errors import ScanError, SettingError
 from scan2sim.services.orchestration import description, placement
 from scan2sim.services.orchestration.settings import (
     ActParams,
@@ -45,7 +45,7 @@ Services = Annotated[Path, typer.Argument(metavar="SERVICES", help="TOML file of
 
 @app.callback()
 def _orchestration() -> None:
-    extras.need("orchestration", "httpx", "yaml", "jsonschema")
+    optional_deps.need("orchestration", "httpx", "yaml", "jsonschema")
 
 
 @app.command("package")
@@ -246,7 +246,7 @@ def orchestrate_place(
 @options(PageParams)
 def orchestrate_page(params: PageParams) -> None:
     """Show services as a page in the browser: upload packages, onboard, instantiate, delete."""
-    extras.need("the page", "fastapi", "uvicorn", "prometheus_client")
+    optional_deps.need("the page", "fastapi", "uvicorn", "prometheus_client")
     from scan2sim.services.orchestration.page import serve
 
     serve(params, _say)
@@ -256,11 +256,11 @@ def orchestrate_page(params: PageParams) -> None:
 @options(ScaledParams, kafka_bootstrap_servers="--kafka", log_file="--log")
 def orchestrate_pool(params: ScaledParams) -> None:
     """Scale an instance as the event bus asks for workers."""
-    extras.need("the event bus", "psutil")
+    optional_deps.need("the event bus", "psutil")
 
     def made() -> Any:
-        from scan2sim.services.monitoring.actuators.osm import OsmReplicas
-        from scan2sim.services.monitoring.pool import PoolNode
+        from scan2sim.services.monitoring.autoscale.actuators.osm import OsmReplicas
+        from scan2sim.services.monitoring.autoscale.pool_node import PoolNode
 
         return PoolNode(params, params.queue or params.instance, OsmReplicas(params, params.instance))
 

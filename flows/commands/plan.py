@@ -12,13 +12,13 @@ from scan2sim.flows.commands.display import console
 from scan2sim.flows.commands.drive import DRIVE, PREPARED, plan_drive
 from scan2sim.flows.engine.planning import STORE, Planned, check
 from scan2sim.flows.engine.planning import plan as plan_nodes
-from scan2sim.flows.recipes.graph import NodeId
-from scan2sim.flows.recipes.settings import Settings
-from scan2sim.flows.recipes.tile import recipe
-from scan2sim.pipeline.errors import SettingError
+from scan2sim.flows.pipelines.graph import NodeId
+from scan2sim.flows.pipelines.settings import Settings
+from scan2sim.flows.pipelines.tile import recipe
+from scan2sim.pipeline.core.cache import Store
+from scan2sim.pipeline.core.errors import SettingError
+from scan2sim.pipeline.core.types import Tile
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.pipeline.store import Store
-from scan2sim.pipeline.types import Tile
 
 app = App()
 
@@ -41,7 +41,7 @@ def show_plan(path: Path, out: Path, settings: Settings, *, force: bool = False,
     """Print each step of the tile or drive, whether it would run, and why.
 
     Raises:
-        ScanError: see `pipeline.errors`; also if a step couldn't run here.
+        ScanError: see `pipeline.core.errors`; also if a step couldn't run here.
     """
     drive = path / DRIVE if path.is_dir() else path
     if drive.name == DRIVE and drive.is_file():

@@ -11,17 +11,17 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from scan2sim.flows.commands import verdicts
+from scan2sim.flows.commands import qos_table
 from scan2sim.flows.commands.app import App
 from scan2sim.flows.commands.display import console, progress
 from scan2sim.flows.commands.options import options
-from scan2sim.flows.commands.verdicts import or_dash
-from scan2sim.pipeline import extras
+from scan2sim.flows.commands.qos_table import or_dash
+from scan2sim.pipeline.core import optional_deps
 from scan2sim.services.qos import requirements
+from scan2sim.services.qos.compare import RATES, Needs, Row, needs, passed, rows
 from scan2sim.services.qos.encoding import ChoiceParams, Jpeg, choose_h264, choose_jpeg
 from scan2sim.services.qos.measure import MeasureParams, measure
 from scan2sim.services.qos.requirements import MACHINE, NETWORK, UNITS, Environment, Requirements
-from scan2sim.services.qos.verdict import RATES, Needs, Row, needs, passed, rows
 from scan2sim.services.toolboxes import sources
 
 TRIED = 60
@@ -54,13 +54,13 @@ def qos_measure(
     out: Annotated[Path | None, typer.Option("--out", "-o", help="JSON file for all that was measured.")] = None,
 ) -> None:
     """Run a toolbox and a robot over a network like the environment's, and hold what is measured against its needs."""
-    extras.need("measuring", "psutil", "fastapi", "uvicorn", "prometheus_client")
+    optional_deps.need("measuring", "psutil", "fastapi", "uvicorn", "prometheus_client")
     service = requirements.read(params.requirements or params.toolbox)
     required = service.of(params.environment)
     with progress(f"{params.toolbox} {params.environment}") as report:
         measured = measure(params, service, report)
     found = rows(required, measured)
-    console.print(verdicts.table(f"{service.title}, {params.environment} ({service.source})", found))
+    console.print(qos_table.table(f"{service.title}, {params.environment} ({service.source})", found))
     console.print(_needs_table([needs(measured, rate) for rate in RATES]))
     answers = measured.answers
     done = answers.states.get("done", 0)

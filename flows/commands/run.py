@@ -14,20 +14,20 @@ from scan2sim.flows.commands.app import App, Bus, Config, Force, From, HoldOut, 
 from scan2sim.flows.commands.display import console, warn
 from scan2sim.flows.commands.log import Log
 from scan2sim.flows.commands.plan import plan_tile
-from scan2sim.flows.commands.shown import execute_shown, show_failed, show_findings, show_results
+from scan2sim.flows.commands.run_with_progress import execute_shown, show_failed, show_findings, show_results
 from scan2sim.flows.engine.execution import Executor, run_to_world
-from scan2sim.flows.engine.frontier import Outcome
 from scan2sim.flows.engine.lock import locked
 from scan2sim.flows.engine.planning import Planned, drop_damaged
 from scan2sim.flows.engine.progress import PublishedRun, published
+from scan2sim.flows.engine.ready_queue import Outcome
 from scan2sim.flows.engine.versions import versions
-from scan2sim.flows.recipes.graph import NodeId
-from scan2sim.flows.recipes.settings import Settings
+from scan2sim.flows.pipelines.graph import NodeId
+from scan2sim.flows.pipelines.settings import Settings
 from scan2sim.flows.reports.publish import publish, to_read
 from scan2sim.flows.reports.side_products import SideProducts
 from scan2sim.flows.reports.tile import DATA, PAGE, write_report
+from scan2sim.pipeline.core.cache import Store
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.pipeline.store import Store
 
 app = App()
 
@@ -71,7 +71,7 @@ def run_tile(
 
     Raises:
         IncompleteError: side products failed; the world is finished.
-        ScanError: see `pipeline.errors`; earlier results stay.
+        ScanError: see `pipeline.core.errors`; earlier results stay.
     """
     began = time.perf_counter()
     tile, side, report = read_tile(path), SideProducts(out), None

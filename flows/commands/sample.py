@@ -12,8 +12,8 @@ from scan2sim.data_samples import SMALL
 from scan2sim.data_samples.street import generate
 from scan2sim.flows.commands.app import App, Overwrite
 from scan2sim.flows.commands.display import progress
-from scan2sim.pipeline import libraries
-from scan2sim.pipeline.io.importing import tile_folder
+from scan2sim.pipeline.core import system_libs
+from scan2sim.pipeline.importers.tile_folder import tile_folder
 
 app = App()
 
@@ -33,6 +33,6 @@ def sample(
         if small:
             shutil.copytree(SMALL, folder, dirs_exist_ok=True)
         else:
-            libraries.check()
+            system_libs.check()
             generate(folder, length=length, points=points, photos=photos, seed=seed, report=report)
     typer.echo(f"Tile: {out / 'tile.toml'}")

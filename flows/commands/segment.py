@@ -12,29 +12,29 @@ import typer
 from scan2sim.flows.commands.app import App, Config, Sets, TilePath, settings_of
 from scan2sim.flows.commands.display import console, progress
 from scan2sim.flows.commands.log import Log
-from scan2sim.flows.commands.shown import run_shown, show_warnings
+from scan2sim.flows.commands.run_with_progress import run_shown, show_warnings
 from scan2sim.flows.engine.lock import locked
 from scan2sim.flows.engine.planning import STORE
-from scan2sim.flows.recipes.graph import NodeId, needed
-from scan2sim.flows.recipes.settings import Settings
-from scan2sim.flows.recipes.tile import recipe
-from scan2sim.pipeline.errors import DataError, SettingError
-from scan2sim.pipeline.extras import need
-from scan2sim.pipeline.io import image
+from scan2sim.flows.pipelines.graph import NodeId, needed
+from scan2sim.flows.pipelines.settings import Settings
+from scan2sim.flows.pipelines.tile import recipe
+from scan2sim.pipeline.core.cache import Store
+from scan2sim.pipeline.core.errors import DataError, SettingError
+from scan2sim.pipeline.core.optional_deps import need
+from scan2sim.pipeline.core.types import U8, Camera, PointCloud, Tile
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.clouds import las
+from scan2sim.pipeline.io.images import image
 from scan2sim.pipeline.io.las_classes import write_classified
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.pipeline.store import Store
-from scan2sim.pipeline.types import U8, Camera, PointCloud, Tile
 from scan2sim.segmentation.backends import load
-from scan2sim.segmentation.label import LABEL
-from scan2sim.segmentation.labelled import pairs, read, read_channels
 from scan2sim.segmentation.labels import CLASSES, IGNORED, code_of_index
+from scan2sim.segmentation.metrics import confusion
 from scan2sim.segmentation.photos import Classifier, class_map
-from scan2sim.segmentation.score import confusion
-from scan2sim.segmentation.segment import OWN, SHAPE
-from scan2sim.segmentation.things import THINGS
+from scan2sim.segmentation.steps.instances import THINGS
+from scan2sim.segmentation.steps.label import LABEL
+from scan2sim.segmentation.steps.segment import OWN, SHAPE
+from scan2sim.segmentation.training.dataset import pairs, read, read_channels
 
 CLOUDS = (".las", ".laz", ".copc")
 
@@ -84,7 +84,7 @@ def segment_tile(path: Path, out: Path, settings: Settings) -> None:
     Results are kept in `out/steps`, so that `scan2sim run --out` the same folder goes on from there.
 
     Raises:
-        ScanError: see `pipeline.errors`; earlier results stay.
+        ScanError: see `pipeline.core.errors`; earlier results stay.
     """
     tile = read_tile(path)
     with locked(out):
@@ -183,7 +183,7 @@ def train_network(folder: Path, weights: Path, *, minutes: float, steps: int, se
         raise SettingError("--out", f"{weights.name} is no name of an ONNX file", "Name one that ends in .onnx")
     need("segment train", "torch", "safetensors", "onnx")
     from scan2sim.segmentation.backends.street import save
-    from scan2sim.segmentation.train import Recipe, train
+    from scan2sim.segmentation.training.train import Recipe, train
 
     recipe_ = Recipe(steps=steps, minutes=minutes, seed=seed, start=start)
     with progress("training") as report:

@@ -14,18 +14,18 @@ from scan2sim.flows.commands.app import App, Bus, Config, Sets, settings_of
 from scan2sim.flows.commands.display import console, warn
 from scan2sim.flows.commands.log import Log
 from scan2sim.flows.commands.options import options
-from scan2sim.flows.commands.shown import run_shown
+from scan2sim.flows.commands.run_with_progress import run_shown
 from scan2sim.flows.commands.study import study_compression
 from scan2sim.flows.engine.lock import locked
 from scan2sim.flows.engine.planning import STORE, Planned
 from scan2sim.flows.engine.progress import PublishedRun, published
-from scan2sim.flows.recipes.settings import Settings
-from scan2sim.flows.recipes.video import ALONE, STEPS, Video, recipe
-from scan2sim.pipeline.errors import SettingError, UnsureError
+from scan2sim.flows.pipelines.settings import Settings
+from scan2sim.flows.pipelines.video import ALONE, STEPS, Video, recipe
+from scan2sim.pipeline.core.cache import Digests, Manifest, Store
+from scan2sim.pipeline.core.errors import SettingError, UnsureError
 from scan2sim.pipeline.io import trajectory as trajectory_io
-from scan2sim.pipeline.io.worlds import link
-from scan2sim.pipeline.store import Digests, Manifest, Store
-from scan2sim.slam.evaluate import AlignmentKind, Evaluation, evaluate, plot, read_truth
+from scan2sim.pipeline.io.worlds.merge import link
+from scan2sim.slam.trajectory.evaluate import AlignmentKind, Evaluation, evaluate, plot, read_truth
 
 T = TypeVar("T", int, float)
 MADE = (
@@ -109,7 +109,7 @@ def slam_video(video: Video, out: Path, settings: Settings, bus: PublishedRun | 
         Results by the steps' names.
 
     Raises:
-        ScanError: see `pipeline.errors`; earlier results stay.
+        ScanError: see `pipeline.core.errors`; earlier results stay.
     """
     nodes = recipe(video, settings)
     with locked(out):

@@ -9,20 +9,20 @@ from typing import TypeVar
 
 from scan2sim.flows.commands.display import console
 from scan2sim.flows.commands.log import Log
-from scan2sim.flows.commands.shown import execute_shown
+from scan2sim.flows.commands.run_with_progress import execute_shown
 from scan2sim.flows.engine.execution import limit_cores
 from scan2sim.flows.engine.lock import locked
 from scan2sim.flows.engine.planning import STORE, Planned, plan
 from scan2sim.flows.engine.progress import PublishedRun, published
-from scan2sim.flows.recipes.graph import NodeId
-from scan2sim.flows.recipes.settings import Settings
-from scan2sim.flows.recipes.study import Cell, Study, cells, recipe, refused, segment_of
+from scan2sim.flows.pipelines.graph import NodeId
+from scan2sim.flows.pipelines.settings import Settings
+from scan2sim.flows.pipelines.study import Cell, Study, cells, recipe, refused, segment_of
 from scan2sim.flows.reports.study import Result, Tables, write
-from scan2sim.pipeline.errors import ScanError, SettingError, SpaceError
-from scan2sim.pipeline.extras import need
-from scan2sim.pipeline.store import Digests, Store
-from scan2sim.slam.evaluate import read_truth
+from scan2sim.pipeline.core.cache import Digests, Store
+from scan2sim.pipeline.core.errors import ScanError, SettingError, SpaceError
+from scan2sim.pipeline.core.optional_deps import need
 from scan2sim.slam.steps.track import TRACK, can_track
+from scan2sim.slam.trajectory.evaluate import read_truth
 from scan2sim.slam.video import Video
 
 T = TypeVar("T", int, float)
@@ -35,7 +35,7 @@ def study_compression(
     """Print the table of what compression costs; in a drive's folder, what isn't named is found by its name.
 
     Raises:
-        ScanError: see `pipeline.errors`.
+        ScanError: see `pipeline.core.errors`.
     """
 
     def found(given: Path | None, name: str) -> Path | None:
@@ -63,7 +63,7 @@ def study(requested: Study, out: Path, settings: Settings, jobs: int = 1, bus: P
     A cell that fails is N/A with its reason; an interrupted study leaves the tables of what is there.
 
     Raises:
-        ScanError: see `pipeline.errors`.
+        ScanError: see `pipeline.core.errors`.
     """
     need("slam study", "av", "matplotlib")
     can_track(settings.params(TRACK))

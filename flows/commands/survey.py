@@ -15,30 +15,30 @@ from scan2sim.flows.commands.app import App, Bus, Config, HoldOut, Sets, setting
 from scan2sim.flows.commands.display import console, warn
 from scan2sim.flows.commands.drive import survey_of
 from scan2sim.flows.commands.log import Log
-from scan2sim.flows.commands.shown import default_jobs, execute_shown, show_failed, show_results
+from scan2sim.flows.commands.run_with_progress import default_jobs, execute_shown, show_failed, show_results
 from scan2sim.flows.engine import workers
 from scan2sim.flows.engine.execution import Executor, limit_cores
-from scan2sim.flows.engine.frontier import Outcome
 from scan2sim.flows.engine.lock import locked
 from scan2sim.flows.engine.memory import parse
 from scan2sim.flows.engine.planning import STORE, Planned, Reason, drop_damaged, plan
 from scan2sim.flows.engine.progress import published
+from scan2sim.flows.engine.ready_queue import Outcome
 from scan2sim.flows.engine.versions import versions
-from scan2sim.flows.recipes.graph import NodeId
-from scan2sim.flows.recipes.settings import Settings
-from scan2sim.flows.recipes.survey import survey_recipe
-from scan2sim.flows.recipes.tile import check_here
+from scan2sim.flows.pipelines.graph import NodeId
+from scan2sim.flows.pipelines.settings import Settings
+from scan2sim.flows.pipelines.survey import survey_recipe
+from scan2sim.flows.pipelines.tile import check_here
 from scan2sim.flows.reports.finish import TILES, Made, finish, is_finished
 from scan2sim.flows.reports.publish import to_read
 from scan2sim.flows.reports.side_products import SideProducts
-from scan2sim.pipeline import libraries
-from scan2sim.pipeline.errors import ScanError, SettingError, SpaceError, StepError
-from scan2sim.pipeline.extras import need
+from scan2sim.pipeline.core import system_libs
+from scan2sim.pipeline.core.cache import Digests, Manifest, Store
+from scan2sim.pipeline.core.errors import ScanError, SettingError, SpaceError, StepError
+from scan2sim.pipeline.core.optional_deps import need
+from scan2sim.pipeline.core.types import Tile
 from scan2sim.pipeline.io.remote import Remote, is_remote, likeness
 from scan2sim.pipeline.io.survey import Survey, read_survey
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.pipeline.store import Digests, Manifest, Store
-from scan2sim.pipeline.types import Tile
 
 app = App()
 
@@ -90,11 +90,11 @@ def run_source(
         address: of a Dask scheduler or a Ray cluster.
         cores: that a step may use.
         prefect: makes a survey as a flow of Prefect (`flows.cli`).
-        bus: that is told how steps fare (`services.monitoring.outlets`).
+        bus: that is told how steps fare (`services.monitoring.export.event_publishers`).
 
     Raises:
         StepError: tiles failed; all others are finished.
-        ScanError: see `pipeline.errors`; earlier results stay.
+        ScanError: see `pipeline.core.errors`; earlier results stay.
     """
     jobs, gigabytes = jobs or default_jobs(), parse(memory)
     if runner != "processes":
@@ -103,7 +103,7 @@ def run_source(
         prefect(source, target, length, buffer, settings.values, runner, jobs, memory, cores, address, bus)
         return
     limit_cores(cores)
-    libraries.check()
+    system_libs.check()
     check_here(settings)
     log = Log(likeness(target) / "run.log")
 
@@ -128,7 +128,7 @@ def make_survey(place: str | Path, target: str | Path, settings: Settings, run: 
     Raises:
         StepError: tiles failed; all others are finished.
         IncompleteError: side products failed; the world is finished.
-        ScanError: see `pipeline.errors`; earlier results stay.
+        ScanError: see `pipeline.core.errors`; earlier results stay.
     """
     began = time.perf_counter()
     sources, results = _remote(place), _remote(target)
@@ -242,7 +242,7 @@ def changes(place: str | Path, target: str | Path, settings: Settings) -> dict[s
     """Why each tile of a survey would run, by name; empty where all is as it was.
 
     Raises:
-        ScanError: see `pipeline.errors`.
+        ScanError: see `pipeline.core.errors`.
     """
     sources, store = _remote(place), _store(place, target)
     digests = Digests(store.root / "digests.json")

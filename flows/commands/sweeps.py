@@ -6,12 +6,12 @@ from pathlib import Path
 
 from scan2sim.flows.commands.display import console, warn
 from scan2sim.flows.commands.log import Log
-from scan2sim.flows.commands.shown import run_shown
+from scan2sim.flows.commands.run_with_progress import run_shown
 from scan2sim.flows.engine.lock import locked
 from scan2sim.flows.engine.planning import STORE
-from scan2sim.flows.recipes.graph import Node
-from scan2sim.pipeline.io.worlds import link
-from scan2sim.pipeline.store import Digests, Store
+from scan2sim.flows.pipelines.graph import Node
+from scan2sim.pipeline.core.cache import Digests, Store
+from scan2sim.pipeline.io.worlds.merge import link
 
 
 def scanner_path(nodes: list[Node], out: Path) -> Path:

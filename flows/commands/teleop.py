@@ -15,10 +15,9 @@ from rich.table import Table
 from scan2sim.flows.commands.app import App
 from scan2sim.flows.commands.display import console, progress
 from scan2sim.flows.commands.options import assigned, options
-from scan2sim.flows.commands.spinning import ends
-from scan2sim.pipeline import extras
-from scan2sim.pipeline.errors import SettingError, StepError
-from scan2sim.services.teleoperation import translators
+from scan2sim.flows.commands.ros_spin import ends
+from scan2sim.pipeline.core import optional_deps
+from scan2sim.pipeline.core.errors import SettingError, StepError
 from scan2sim.services.teleoperation.settings import (
     DemoParams,
     GatewayParams,
@@ -26,7 +25,8 @@ from scan2sim.services.teleoperation.settings import (
     StationParams,
     VehicleParams,
 )
-from scan2sim.services.teleoperation.translating import TranslateParams, Translating
+from scan2sim.services.teleoperation.vehicle import adapters
+from scan2sim.services.teleoperation.vehicle.adapter import TranslateParams, Translating
 
 app = App("Vehicles driven from afar, by several links at once.")
 NEEDED = ("OpenSSL", "pylibsrtp", "websockets")
@@ -48,7 +48,7 @@ def teleop_certificates(
 ) -> None:
     """Make certificates of a gateway, vehicles and stations, and the authority that signs them, or renew them."""
     _need()
-    from scan2sim.services.teleoperation.authority import certify
+    from scan2sim.services.teleoperation.gateway.pki import certify
 
     if not (gateway or vehicle or station):
         raise SettingError("teleop certificates", "nobody is named", "Give --gateway, --vehicle or --station")
@@ -63,15 +63,13 @@ def teleop_certificates(
 @options(TranslateParams)
 def teleop_translate(
     params: TranslateParams,
-    name: Annotated[
-        str, typer.Argument(metavar="TRANSLATOR", help=f"The vehicle's: {', '.join(translators.names())}.")
-    ],
+    name: Annotated[str, typer.Argument(metavar="TRANSLATOR", help=f"The vehicle's: {', '.join(adapters.names())}.")],
     set_: Annotated[
         list[str] | None, typer.Option("--set", metavar="PARAM=VALUE", help="One of its settings; may be given again.")
     ] = None,
 ) -> None:
     """Run a vehicle's translator: a car unit's orders in, the vehicle's own commands out."""
-    found = translators.find(name)
+    found = adapters.find(name)
     settings = found.Params.of(name, assigned(set_ or (), "channel=can0"), remedy="docs/teleoperation.md lists them")
     ended = threading.Event()
     with ends(ended):
@@ -85,7 +83,7 @@ def teleop_translate(
 def teleop_gateway(params: GatewayParams) -> None:
     """Be the gateway that vehicles and stations meet at, and serve the fleet's page."""
     _need("fastapi", "uvicorn")
-    from scan2sim.services.teleoperation.management import serve
+    from scan2sim.services.teleoperation.gateway.web import serve
 
     serve(params, _say)
 
@@ -98,7 +96,7 @@ def teleop_station(
 ) -> None:
     """Be a station: show what its vehicle's cameras see, and send what its driver asks for."""
     _need("fastapi", "uvicorn")
-    from scan2sim.services.teleoperation.cockpit import serve
+    from scan2sim.services.teleoperation.station.web import serve
 
     serve(params, _say, window)
 
@@ -108,7 +106,7 @@ def teleop_station(
 def teleop_vehicle(params: VehicleParams) -> None:
     """Be a vehicle's car unit: send what its cameras see, and have its translator do what the driver asks for."""
     _need("av")
-    from scan2sim.services.teleoperation.vehicle import serve
+    from scan2sim.services.teleoperation.vehicle.app import serve
 
     ended = threading.Event()
     with ends(ended):
@@ -124,15 +122,15 @@ def teleop_demo(
 ) -> None:
     """Drive a simulated car through a finished world: gateway, vehicle and station on this machine."""
     _need("av", "fastapi", "uvicorn")
-    from scan2sim.services.teleoperation import own_window
-    from scan2sim.services.teleoperation.demo import demo
+    from scan2sim.services.teleoperation.sim.demo import demo
+    from scan2sim.services.teleoperation.station import app_window
 
     if window:
-        own_window.browser()
+        app_window.browser()
     ended = threading.Event()
     with ends(ended), demo(params, _say) as made, ExitStack() as stack:
         if window:
-            stack.enter_context(own_window.window(made.page))
+            stack.enter_context(app_window.window(made.page))
         elif browse:
             webbrowser.open(made.page)
         while not ended.wait(1.0):
@@ -145,18 +143,18 @@ def teleop_demo(
 def teleop_measure(params: MeasureParams) -> None:
     """Drive by a script over a network like the environment's, and hold what is measured against D3.2's table 6."""
     _need("av", "psutil")
-    from scan2sim.flows.commands import verdicts
+    from scan2sim.flows.commands import qos_table
     from scan2sim.services.qos import requirements
+    from scan2sim.services.qos.compare import passed, rows
     from scan2sim.services.qos.requirements import MACHINE, NETWORK
-    from scan2sim.services.qos.verdict import passed, rows
-    from scan2sim.services.teleoperation.measure import measure, percentile
+    from scan2sim.services.teleoperation.qos.measure import measure, percentile
 
     service = requirements.read("teleoperation")
     required = service.of(params.environment)
     with progress(f"teleoperation {params.environment}") as report:
         measured = measure(params, required, report)
     found = rows(required, measured)
-    console.print(verdicts.table(f"{service.title}, {params.environment} ({service.source})", found))
+    console.print(qos_table.table(f"{service.title}, {params.environment} ({service.source})", found))
     times = measured.glass_to_glass
     _say(
         f"{len(times)} pictures were shown, half of them within {percentile(times, 50):.0f} ms of their taking, "
@@ -172,7 +170,7 @@ def teleop_measure(params: MeasureParams) -> None:
 
 
 def _need(*packages: str) -> None:
-    extras.need("teleop", *NEEDED, *packages, extra="teleop")
+    optional_deps.need("teleop", *NEEDED, *packages, extra="teleop")
 
 
 def _say(text: str) -> None:

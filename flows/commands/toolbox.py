@@ -12,20 +12,20 @@ from scan2sim.flows.commands.app import App
 from scan2sim.flows.commands.display import console, progress, warn
 from scan2sim.flows.commands.monitor import NODE_OPTIONS, Limits
 from scan2sim.flows.commands.options import assigned, options
-from scan2sim.flows.commands.spinning import spin
-from scan2sim.pipeline import extras
-from scan2sim.services.toolboxes import boxes, offline
-from scan2sim.services.toolboxes.boxes import classify, detect, movement, segment
+from scan2sim.flows.commands.ros_spin import spin
+from scan2sim.pipeline.core import optional_deps
+from scan2sim.services.toolboxes import offline, tasks
 from scan2sim.services.toolboxes.engine import Engine
 from scan2sim.services.toolboxes.results import State
 from scan2sim.services.toolboxes.settings import CameraParams, NodeParams, ServeParams, ToolboxParams
+from scan2sim.services.toolboxes.tasks import classify, detect, movement, segment
 
 app = App("ML toolboxes: objects, movement, classes, segments of images, from files or as a service.")
 
 Images = Annotated[Path, typer.Argument(metavar="IMAGES", help="A folder of pictures, a picture or a video.")]
 Out = Annotated[Path, typer.Option("--out", "-o", help="Folder for results, and pictures or a film with them.")]
 Draw = Annotated[bool, typer.Option(help="Draw results into pictures, or a film of a video.")]
-Box = Annotated[str, typer.Argument(metavar="TOOLBOX", help=", ".join(boxes.names()))]
+Box = Annotated[str, typer.Argument(metavar="TOOLBOX", help=", ".join(tasks.names()))]
 Sets = Annotated[list[str] | None, typer.Option("--set", metavar="PARAM=VALUE", help="Change one of its settings.")]
 
 
@@ -68,8 +68,8 @@ def toolbox_serve(
     ] = None,
 ) -> None:
     """Serve a toolbox by HTTP, as the Open Inference Protocol says."""
-    extras.need("a toolbox by HTTP", "fastapi", "uvicorn", "prometheus_client")
-    from scan2sim.services import serving
+    optional_deps.need("a toolbox by HTTP", "fastapi", "uvicorn", "prometheus_client")
+    from scan2sim.services.http import factory
     from scan2sim.services.toolboxes.api import application
     from scan2sim.services.toolboxes.sources import Cameras
 
@@ -80,7 +80,7 @@ def toolbox_serve(
         if cameras:
             cameras.start()
         try:
-            serving.run(served, params, lambda address: _say(f"{address}v2/models/{box}/infer; Ctrl-C ends it"))
+            factory.run(served, params, lambda address: _say(f"{address}v2/models/{box}/infer; Ctrl-C ends it"))
         finally:
             if cameras:
                 cameras.stop()
@@ -97,7 +97,7 @@ def toolbox_node(
     set_: Sets = None,
 ) -> None:
     """Run a toolbox as a node of ROS 2: images on topics in, results on a topic out."""
-    extras.need("a toolbox as a node", "psutil")
+    optional_deps.need("a toolbox as a node", "psutil")
     from scan2sim.services.toolboxes.node import ToolboxNode
 
     with closing(Engine(box, _params(box, set_))) as engine:
@@ -108,7 +108,7 @@ def toolbox_node(
 @options(CameraParams, **NODE_OPTIONS)
 def toolbox_camera(params: CameraParams, limit: Limits = None) -> None:
     """Run a camera as a node of ROS 2: images of a folder, a video or a camera on a topic."""
-    extras.need("a camera as a node", "psutil")
+    optional_deps.need("a camera as a node", "psutil")
     from scan2sim.services.toolboxes.camera import CameraNode
 
     spin(lambda: CameraNode(params), lambda node: node.finished)
@@ -131,7 +131,7 @@ def _params(box: str, assignments: list[str] | None) -> ToolboxParams:
         SettingError: there is no such toolbox, or setting.
     """
     given = assigned(assignments or (), "threshold=0.4")
-    kind = boxes.find(box).Params
+    kind = tasks.find(box).Params
     return kind.of(box, given, remedy=f"`scan2sim toolbox {box} --help` lists its settings")
 
 

@@ -16,9 +16,9 @@ from scan2sim.flows.engine.lock import locked
 from scan2sim.flows.engine.planning import STORE
 from scan2sim.flows.reports.finish import TILES
 from scan2sim.flows.reports.publish import PLACES
-from scan2sim.pipeline.errors import DamagedError, InputError
-from scan2sim.pipeline.io.worlds import EDITED, STAMP
-from scan2sim.pipeline.store import TEMPORARY, Manifest, damaged, digest, read_manifest
+from scan2sim.pipeline.core.cache import TEMPORARY, Manifest, damaged, digest, read_manifest
+from scan2sim.pipeline.core.errors import DamagedError, InputError
+from scan2sim.pipeline.io.worlds.merge import EDITED, STAMP
 
 app = App()
 
@@ -34,7 +34,7 @@ def verify(
 def verify_results(out: Path) -> None:
     """Digest all kept results and published worlds below a run's or survey's folder, and print what is damaged.
 
-    What users edit (`pipeline.io.worlds.EDITED`) may be as they left it: it is printed where it was changed.
+    What users edit (`pipeline.io.worlds.merge.EDITED`) may be as they left it: it is printed where it was changed.
     A survey's common world isn't read: the next `survey` compares it with the tiles'.
 
     What is damaged the next `run` or `survey` makes anew, and nothing else: a damaged file is marked as changed now, a

@@ -15,9 +15,9 @@ from scan2sim.flows.commands.display import console, progress
 from scan2sim.flows.commands.options import options
 from scan2sim.flows.reports import film as films
 from scan2sim.flows.reports.view import INDEX, Pages, ViewParams, server
-from scan2sim.pipeline.extras import need
-from scan2sim.pipeline.io.importing import tile_folder
-from scan2sim.pipeline.io.scene import Scene, read_scene
+from scan2sim.pipeline.core.optional_deps import need
+from scan2sim.pipeline.importers.tile_folder import tile_folder
+from scan2sim.pipeline.io.worlds.scene import Scene, read_scene
 
 app = App()
 

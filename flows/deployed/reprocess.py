@@ -14,8 +14,8 @@ from scan2sim.flows.commands.survey import changes
 from scan2sim.flows.deployed.survey import survey
 from scan2sim.flows.deployed.tile import WITH_WARNINGS, by_tasks
 from scan2sim.flows.engine.progress import published
-from scan2sim.flows.recipes.settings import Settings
-from scan2sim.pipeline.errors import BusyError
+from scan2sim.flows.pipelines.settings import Settings
+from scan2sim.pipeline.core.errors import BusyError
 
 
 @flow(name="reprocess")

@@ -19,12 +19,12 @@ from prefect.states import Completed
 
 from scan2sim.flows.commands.drive import survey_of
 from scan2sim.flows.commands.survey import make_survey
-from scan2sim.flows.deployed.ephemeral import guard
+from scan2sim.flows.deployed.prefect_server_guard import guard
 from scan2sim.flows.deployed.tile import artifact_key, by_tasks, with_warnings
 from scan2sim.flows.engine.progress import published
-from scan2sim.flows.recipes.settings import Settings
+from scan2sim.flows.pipelines.settings import Settings
 from scan2sim.flows.reports.survey import PAGE, overview, rows
-from scan2sim.pipeline.errors import INTERRUPTED, IncompleteError, StepError, UnavailableError, exit_code
+from scan2sim.pipeline.core.errors import INTERRUPTED, IncompleteError, StepError, UnavailableError, exit_code
 from scan2sim.pipeline.io.remote import likeness
 
 
@@ -85,7 +85,8 @@ def survey(
         memory: what steps on one machine may need together, "20GB".
         cores: that a step may use; default: all.
         address: of a Dask scheduler or a Ray cluster; default: started here.
-        bus: that is told how steps fare, by the flow and by its workers (`services.monitoring.outlets`).
+        bus: that is told how steps fare, by the flow and by its workers
+        (`services.monitoring.export.event_publishers`).
     """
     try:
         with published(bus, "survey", source, here=False) as on_bus:

@@ -17,15 +17,15 @@ from prefect.states import Completed
 from scan2sim.flows.commands.run import run_tile
 from scan2sim.flows.engine.dispatch import dispatch
 from scan2sim.flows.engine.execution import Executor, run_on_worker
-from scan2sim.flows.engine.frontier import Outcome, unwatched
 from scan2sim.flows.engine.memory import parse
 from scan2sim.flows.engine.planning import Planned, check
 from scan2sim.flows.engine.progress import PublishedRun, published
+from scan2sim.flows.engine.ready_queue import Outcome, unwatched
 from scan2sim.flows.engine.versions import versions
 from scan2sim.flows.engine.workers import workers
-from scan2sim.flows.recipes.settings import Settings
-from scan2sim.pipeline.errors import IncompleteError
-from scan2sim.pipeline.store import Manifest, Store
+from scan2sim.flows.pipelines.settings import Settings
+from scan2sim.pipeline.core.cache import Manifest, Store
+from scan2sim.pipeline.core.errors import IncompleteError
 
 WITH_WARNINGS = "CompletedWithWarnings"
 """Name of a flow's final state where the world is finished, but side products failed."""

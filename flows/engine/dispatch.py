@@ -8,11 +8,11 @@ from functools import partial
 from queue import SimpleQueue
 from typing import Any, Protocol
 
-from scan2sim.flows.engine.frontier import Event, Frontier, Outcome, Watch, unwatched
 from scan2sim.flows.engine.planning import Planned
-from scan2sim.flows.recipes.graph import Node, NodeId
-from scan2sim.pipeline.errors import DamagedError, ScanError, StepError
-from scan2sim.pipeline.store import Store
+from scan2sim.flows.engine.ready_queue import Event, Frontier, Outcome, Watch, unwatched
+from scan2sim.flows.pipelines.graph import Node, NodeId
+from scan2sim.pipeline.core.cache import Store
+from scan2sim.pipeline.core.errors import DamagedError, ScanError, StepError
 
 PERIOD = 1.0  # seconds between two looks; what shows it may cost a tenth of one
 

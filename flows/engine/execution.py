@@ -9,15 +9,15 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerProcess
 
 from scan2sim.flows.engine import processes
-from scan2sim.flows.engine.frontier import Frontier, Outcome, Watch
 from scan2sim.flows.engine.memory import need, share
 from scan2sim.flows.engine.planning import Planned, check
 from scan2sim.flows.engine.progress import Channel, published_step
+from scan2sim.flows.engine.ready_queue import Frontier, Outcome, Watch
 from scan2sim.flows.engine.versions import check_version
-from scan2sim.flows.recipes.graph import NodeId
-from scan2sim.pipeline import libraries
-from scan2sim.pipeline.errors import DamagedError, ScanError
-from scan2sim.pipeline.store import Manifest, Store
+from scan2sim.flows.pipelines.graph import NodeId
+from scan2sim.pipeline.core import system_libs
+from scan2sim.pipeline.core.cache import Manifest, Store
+from scan2sim.pipeline.core.errors import DamagedError, ScanError
 
 Executor = Callable[[list[Planned], Store], Outcome]
 """Runs what a plan says is missing."""
@@ -163,7 +163,7 @@ def run_on_worker(
         ScanError: as `run_node`.
     """
     check_version(item, wanted)
-    libraries.check()
+    system_libs.check()
     limit_cores(cores)
     os.environ.pop("MALLOC_TRIM_THRESHOLD_", None)  # Dask's, for processes that live on: it slows steps down
     with share(memory, need(item, store)), published_step(channel, item, store) as watch:

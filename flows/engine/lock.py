@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from scan2sim.pipeline.errors import BusyError, from_os_error
+from scan2sim.pipeline.core.errors import BusyError, from_os_error
 
 
 @contextmanager

@@ -12,12 +12,12 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from scan2sim.pipeline.errors import SettingError, UnavailableError, from_os_error
-from scan2sim.pipeline.io.image import SUFFIXES
+from scan2sim.pipeline.core.errors import SettingError, UnavailableError, from_os_error
+from scan2sim.pipeline.io.images.image import SUFFIXES
 
 if TYPE_CHECKING:
     from scan2sim.flows.engine.planning import Planned
-    from scan2sim.pipeline.store import Store
+    from scan2sim.pipeline.core.cache import Store
 
 SLOT = 0.25  # GB; memory is shared out in pieces of it
 LARGEST = 20_000  # GB, of what steps may need together

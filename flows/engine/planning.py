@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 
-from scan2sim.flows.recipes.graph import Node, NodeId, Output
-from scan2sim.pipeline import libraries
-from scan2sim.pipeline.errors import DamagedError
-from scan2sim.pipeline.store import Manifest, Store, digest, key_of
+from scan2sim.flows.pipelines.graph import Node, NodeId, Output
+from scan2sim.pipeline.core import system_libs
+from scan2sim.pipeline.core.cache import Manifest, Store, digest, key_of
+from scan2sim.pipeline.core.errors import DamagedError
 
 STORE = "steps"
 """Folder of kept results, below that of a run."""
@@ -156,7 +156,7 @@ def check(planned: Sequence[Planned]) -> None:
     """
     missing = [item.node for item in planned if item.reason is not None]
     if missing:
-        libraries.check()
+        system_libs.check()
     for node in missing:
         if node.step.check:
             node.step.check(node.params)

@@ -15,11 +15,11 @@ from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import Any
 
-from scan2sim.flows.engine.frontier import Watch
-from scan2sim.flows.engine.node import run_node
 from scan2sim.flows.engine.planning import Planned
-from scan2sim.pipeline.errors import ScanError, StepError
-from scan2sim.pipeline.store import Manifest, Store
+from scan2sim.flows.engine.ready_queue import Watch
+from scan2sim.flows.engine.run_task import run_node
+from scan2sim.pipeline.core.cache import Manifest, Store
+from scan2sim.pipeline.core.errors import ScanError, StepError
 
 TRACKER = "ignore:resource_tracker"
 """A filter of warnings for Python's own process that clears up after killed ones, and says so."""
@@ -33,7 +33,7 @@ def _processes() -> Any:
     if TRACKER not in sys.warnoptions:
         sys.warnoptions.append(TRACKER)
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["scan2sim.flows.engine.preload"])
+    context.set_forkserver_preload(["scan2sim.flows.engine.forkserver_preload"])
     # Ctrl-C in a terminal reaches the server as well: until it is ready, it would die of it, and say so at length
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:

@@ -1,7 +1,7 @@
 """Publishes on the event bus how the steps of a run fare; no run waits for that, or fails because of it.
 
 `watch` only notes what it is told. A thread of the publisher's own opens the ways onto the bus, looks once a second for
-what has changed, and sends that; what a broker doesn't take waits on disk (`services.records`).
+what has changed, and sends that; what a broker doesn't take waits on disk (`services.outbox`).
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from scan2sim.flows.engine.frontier import Event, Watch, unwatched
 from scan2sim.flows.engine.planning import Planned
-from scan2sim.flows.recipes.graph import Node, NodeId
-from scan2sim.pipeline.errors import DamagedError, IncompleteError, ScanError, printable
-from scan2sim.pipeline.store import Store, read_manifest
-from scan2sim.services.monitoring import outlets
-from scan2sim.services.monitoring.events import Events, Outlet, RunState, StepState
+from scan2sim.flows.engine.ready_queue import Event, Watch, unwatched
+from scan2sim.flows.pipelines.graph import Node, NodeId
+from scan2sim.pipeline.core.cache import Store, read_manifest
+from scan2sim.pipeline.core.errors import DamagedError, IncompleteError, ScanError, printable
+from scan2sim.services.monitoring.events.schema import Events, Outlet, RunState, StepState
+from scan2sim.services.monitoring.export import event_publishers
 
 log = logging.getLogger(__name__)
 
@@ -53,7 +53,7 @@ class Channel:
     """Where the steps of a run are told of, for workers elsewhere that run them.
 
     Attributes:
-        where: as `--bus` has it (`services.monitoring.outlets`).
+        where: as `--bus` has it (`services.monitoring.export.event_publishers`).
         run: the run's id.
     """
 
@@ -193,7 +193,7 @@ def published(where: str | None, command: str, source: str, *, here: bool = True
     if where is None:
         yield None
         return
-    outlets.check(where)
+    event_publishers.check(where)
     run = PublishedRun(where, command, source, here=here)
     try:
         yield run
@@ -223,7 +223,7 @@ class PublishedRun:
         self._state: Literal["running", "done", "failed", "stopped"] = "running"
         self._message = ""
         host = self._host if here else None
-        self.steps = Publisher(self.channel.run, lambda: outlets.opened(where), self._about, host)
+        self.steps = Publisher(self.channel.run, lambda: event_publishers.opened(where), self._about, host)
 
     def end(self, state: Literal["done", "failed", "stopped"], message: str = "") -> None:
         """Tell how it ended."""
@@ -253,7 +253,7 @@ def published_step(channel: Channel | None, item: Planned, store: Store) -> Iter
     if channel is None:
         yield unwatched
         return
-    publisher = Publisher(channel.run, lambda: outlets.opened(channel.where), host=platform.node())
+    publisher = Publisher(channel.run, lambda: event_publishers.opened(channel.where), host=platform.node())
     watch = publisher.watching([item], store)
     try:
         watch(item.node, "start", 0.0, "")

@@ -12,8 +12,8 @@ from functools import cache
 
 from scan2sim import __version__
 from scan2sim.flows.engine.planning import Planned
-from scan2sim.flows.recipes.steps import STEPS
-from scan2sim.pipeline.errors import UnavailableError
+from scan2sim.flows.pipelines.steps import STEPS
+from scan2sim.pipeline.core.errors import UnavailableError
 
 APART = ("flows", "ray", "s3", "bus", "orchestration", "toolboxes", "teleop", "can", "dev")
 """Extras that hand work out, bring files, watch, serve or try the project: no step depends on their packages."""

@@ -14,8 +14,8 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
-from scan2sim.pipeline.errors import SettingError, UnavailableError
-from scan2sim.pipeline.extras import need
+from scan2sim.pipeline.core.errors import SettingError, UnavailableError
+from scan2sim.pipeline.core.optional_deps import need
 
 Call = Callable[..., Any]
 """Has a worker call a function with arguments, waits, and returns its result or raises its exception."""

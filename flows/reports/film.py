@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from scan2sim.pipeline import render
-from scan2sim.pipeline.io.scene import Scene
-from scan2sim.pipeline.io.start import courses
+from scan2sim.pipeline.camera import renderer
+from scan2sim.pipeline.core.step import Report
+from scan2sim.pipeline.core.types import F64, Mesh
+from scan2sim.pipeline.io.images.video import Encoder
 from scan2sim.pipeline.io.trajectory import replacing
-from scan2sim.pipeline.io.video import Encoder
-from scan2sim.pipeline.step import Report
-from scan2sim.pipeline.types import F64, Mesh
+from scan2sim.pipeline.io.worlds.scene import Scene
+from scan2sim.pipeline.simulation.spawn import courses
 
 FPS = 24
 OVER = {"path": 0.5, "lane": 2.5, "road": 2.5}
@@ -50,8 +50,10 @@ def film(scene: Scene, file: Path, seconds: float, width: int, report: Report) -
     import cv2
 
     size = width // 2 * 2, width * 9 // 32 * 2
-    camera = render.pinhole(*size)
-    world = render.Renderer([placed(tile.folder / group, tile.offset) for tile in scene.tiles for group in tile.groups])
+    camera = renderer.pinhole(*size)
+    world = renderer.Renderer(
+        [placed(tile.folder / group, tile.offset) for tile in scene.tiles for group in tile.groups]
+    )
     poses = flight(scene, round(seconds * FPS))
     with replacing(file) as fresh, Encoder(fresh, size, FPS, preset="medium", crf="20") as encoder:
         for i, pose in enumerate(poses):
@@ -81,12 +83,12 @@ def flight(scene: Scene, count: int) -> list[F64]:
         return np.column_stack([np.interp(at, np.arange(len(of)), of[:, k]) for k in range(3)])
 
     lines = line(eye), line(target)
-    return [render.look_at(e + (0, 0, up), t) for e, t, up in zip(*lines, rise, strict=True)]
+    return [renderer.look_at(e + (0, 0, up), t) for e, t, up in zip(*lines, rise, strict=True)]
 
 
-def placed(folder: Path, offset: tuple[float, float, float]) -> render.Body:
+def placed(folder: Path, offset: tuple[float, float, float]) -> renderer.Body:
     """A textured mesh of a tile in its place in the world."""
-    body = render.textured(folder)
+    body = renderer.textured(folder)
     mesh: Mesh = body.mesh
     return replace(body, mesh=replace(mesh, vertices=(mesh.vertices + np.asarray(offset)).astype(np.float32)))
 
@@ -96,7 +98,7 @@ def _circle(scene: Scene, count: int) -> list[F64]:
     high = np.max([np.add(tile.high, tile.offset) for tile in scene.tiles], axis=0)
     middle, reach = (low + high) / 2, 0.7 * float(np.linalg.norm((high - low)[:2]))
     turns = np.linspace(0, 2 * np.pi, count, endpoint=False)
-    return [render.look_at(middle + (reach * np.cos(a), reach * np.sin(a), 0.5 * reach), middle) for a in turns]
+    return [renderer.look_at(middle + (reach * np.cos(a), reach * np.sin(a), 0.5 * reach), middle) for a in turns]
 
 
 def _evenly(places: F64) -> F64:

@@ -6,9 +6,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from scan2sim.pipeline.classes import SURFACES
-from scan2sim.pipeline.errors import ScanError
-from scan2sim.pipeline.store import Manifest
+from scan2sim.pipeline.core.cache import Manifest
+from scan2sim.pipeline.core.classes import SURFACES
+from scan2sim.pipeline.core.errors import ScanError
 
 Level = Literal["unusable", "poor", "note"]
 LEVELS: tuple[Level, ...] = ("unusable", "poor", "note")

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from scan2sim.flows.engine.planning import Planned
-from scan2sim.flows.recipes.settings import Settings
+from scan2sim.flows.pipelines.settings import Settings
 from scan2sim.flows.reports.findings import findings
 from scan2sim.flows.reports.publish import publish, published, to_read
 from scan2sim.flows.reports.side_products import SideProducts
@@ -20,12 +20,14 @@ from scan2sim.flows.reports.survey import DATA as SURVEY_DATA
 from scan2sim.flows.reports.survey import PAGE as SURVEY_PAGE
 from scan2sim.flows.reports.survey import TileState, write_survey_report
 from scan2sim.flows.reports.tile import DATA, PAGE, failed_before, figures, write_report
-from scan2sim.pipeline.cells import outline
-from scan2sim.pipeline.errors import ScanError
-from scan2sim.pipeline.io import clouds, geotiff, stac, worlds
+from scan2sim.pipeline.core.cache import Digests, Manifest, Store
+from scan2sim.pipeline.core.errors import ScanError
+from scan2sim.pipeline.core.types import Tile
+from scan2sim.pipeline.io import clouds
+from scan2sim.pipeline.io.geodata import geotiff, stac
 from scan2sim.pipeline.io.survey import Survey
-from scan2sim.pipeline.store import Digests, Manifest, Store
-from scan2sim.pipeline.types import Tile
+from scan2sim.pipeline.io.worlds import merge
+from scan2sim.pipeline.tiling.voronoi_cell import outline
 
 TILES, PICTURE = "tiles", "picture.jpg"
 Warn = Callable[[str], None]
@@ -77,7 +79,7 @@ def finish(
         warn: gets warnings of files that were edited.
 
     Raises:
-        ScanError: see `pipeline.errors`; what was there stays.
+        ScanError: see `pipeline.core.errors`; what was there stays.
     """
     whole = [one for one in made if one.done is not None]
     for one in whole:
@@ -120,10 +122,10 @@ def _together(
     survey: Survey, done: Sequence[Made], out: Path, digests: Digests, side: SideProducts, warn: Warn
 ) -> None:
     """The world of all tiles, their roads, the STAC catalogue, the virtual point cloud and rasters."""
-    tiles = [worlds.TileWorld(one.name, out / TILES / one.name / "world", one.tile.frame) for one in done if one.tile]
-    worlds.assemble(out, survey.name, tiles, warn=warn)
+    tiles = [merge.TileWorld(one.name, out / TILES / one.name / "world", one.tile.frame) for one in done if one.tile]
+    merge.assemble(out, survey.name, tiles, warn=warn)
     with side.attempt("roads"):
-        worlds.add_roads(out)
+        merge.add_roads(out)
     with side.attempt("catalogue"):
         _catalogue(survey, done, out, digests)
 

@@ -9,12 +9,12 @@ from pathlib import Path
 
 from scan2sim.flows.engine.planning import Planned
 from scan2sim.flows.engine.versions import versions
-from scan2sim.flows.recipes.settings import Settings
+from scan2sim.flows.pipelines.settings import Settings
 from scan2sim.flows.reports.tile import PAGES, SCRIPTS
-from scan2sim.pipeline.errors import DamagedError
-from scan2sim.pipeline.io.worlds import EDITED, STAMP, link, same_file, same_unless_edited, swap
-from scan2sim.pipeline.store import Manifest, Store
-from scan2sim.pipeline.types import Tile
+from scan2sim.pipeline.core.cache import Manifest, Store
+from scan2sim.pipeline.core.errors import DamagedError
+from scan2sim.pipeline.core.types import Tile
+from scan2sim.pipeline.io.worlds.merge import EDITED, STAMP, link, same_file, same_unless_edited, swap
 
 THREE = "three.js"
 PLACES = {"export": ("world", "world"), "rasters": ("rasters", "rasters"), "preview": ("preview", SCRIPTS)}

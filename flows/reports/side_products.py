@@ -7,9 +7,9 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
-from scan2sim.flows.recipes.graph import NodeId
+from scan2sim.flows.pipelines.graph import NodeId
 from scan2sim.flows.reports.findings import without
-from scan2sim.pipeline.errors import IncompleteError, ScanError, from_exception
+from scan2sim.pipeline.core.errors import IncompleteError, ScanError, from_exception
 
 
 class SideProducts:

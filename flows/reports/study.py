@@ -13,9 +13,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from scan2sim.flows.recipes.study import Cell
+from scan2sim.flows.pipelines.study import Cell
 from scan2sim.pipeline.io.trajectory import replacing
-from scan2sim.slam.evaluate import SEGMENT
+from scan2sim.slam.trajectory.evaluate import SEGMENT
 from scan2sim.slam.video import Video
 
 

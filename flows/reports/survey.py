@@ -19,9 +19,9 @@ import numpy.typing as npt
 from scan2sim.flows.engine.versions import versions
 from scan2sim.flows.reports import gazebo
 from scan2sim.flows.reports.tile import write_whole
-from scan2sim.pipeline.classes import SURFACES
-from scan2sim.pipeline.errors import ScanError, from_os_error
-from scan2sim.pipeline.types import F64
+from scan2sim.pipeline.core.classes import SURFACES
+from scan2sim.pipeline.core.errors import ScanError, from_os_error
+from scan2sim.pipeline.core.types import F64
 
 State = Literal["done", "kept", "failed", "waiting"]
 STATES: tuple[State, ...] = ("failed", "waiting", "done", "kept")

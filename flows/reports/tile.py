@@ -14,11 +14,11 @@ from scan2sim.flows.engine.planning import Planned
 from scan2sim.flows.engine.versions import versions
 from scan2sim.flows.reports import gazebo
 from scan2sim.flows.reports.findings import findings
-from scan2sim.pipeline.classes import SURFACES
-from scan2sim.pipeline.errors import ScanError
-from scan2sim.pipeline.io import crs
-from scan2sim.pipeline.store import Manifest, Store
-from scan2sim.pipeline.types import Tile
+from scan2sim.pipeline.core.cache import Manifest, Store
+from scan2sim.pipeline.core.classes import SURFACES
+from scan2sim.pipeline.core.errors import ScanError
+from scan2sim.pipeline.core.types import Tile
+from scan2sim.pipeline.io.geodata import crs
 
 TEMPLATE = "tile.html.j2"
 PAGE, DATA = "report.html", "report.json"

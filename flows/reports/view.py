@@ -14,17 +14,18 @@ import numpy as np
 from pydantic import Field
 
 from scan2sim.flows.reports.tile import PAGES
-from scan2sim.pipeline.classes import CODE_OF_SURFACE, colour_of, name_of
-from scan2sim.pipeline.errors import SettingError
-from scan2sim.pipeline.io import glb, image
-from scan2sim.pipeline.io.files import make_folder
-from scan2sim.pipeline.io.glb import GlbParams
-from scan2sim.pipeline.io.provenance import SOURCES
-from scan2sim.pipeline.io.scene import Scene, SceneTile
-from scan2sim.pipeline.io.start import courses
-from scan2sim.pipeline.step import Params
+from scan2sim.pipeline.core.classes import CODE_OF_SURFACE, colour_of, name_of
+from scan2sim.pipeline.core.errors import SettingError
+from scan2sim.pipeline.core.step import Params
+from scan2sim.pipeline.core.types import F64, View
+from scan2sim.pipeline.io.file_checks import make_folder
+from scan2sim.pipeline.io.images import image
+from scan2sim.pipeline.io.worlds import glb
+from scan2sim.pipeline.io.worlds.glb import GlbParams
+from scan2sim.pipeline.io.worlds.provenance import SOURCES
+from scan2sim.pipeline.io.worlds.scene import Scene, SceneTile
+from scan2sim.pipeline.simulation.spawn import courses
 from scan2sim.pipeline.steps.pictures import EYE_HEIGHT, SEEN_RGB, bird_pose
-from scan2sim.pipeline.types import F64, View
 
 TEMPLATE, INDEX, TILES, COLLISION = "view.html.j2", "index.html", "tiles", "_collision"
 SCRIPTS = ("three.js", "walk.js", "view.js")

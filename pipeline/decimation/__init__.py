@@ -1,6 +1,6 @@
 """Decimation: fewer triangles by quadric edge collapse (Garland and Heckbert 1997).
 
-A file a library (`pipeline.backends`), named in `decimate.backend`.
+A file a library (`pipeline.core.plugins`), named in `decimate.backend`.
 """
 
 from __future__ import annotations
@@ -9,9 +9,9 @@ from typing import Protocol
 
 import numpy as np
 
-from scan2sim.pipeline import backends
-from scan2sim.pipeline.errors import SettingError
-from scan2sim.pipeline.types import F64, I32, Mesh
+from scan2sim.pipeline.core import plugins
+from scan2sim.pipeline.core.errors import SettingError
+from scan2sim.pipeline.core.types import F64, I32, Mesh
 
 SETTING = "decimate.backend"
 
@@ -41,9 +41,9 @@ def find(name: str, *, keep_border: bool = False) -> Backend:
         SettingError: there is none of that name, or it can't keep borders.
         UnavailableError: it isn't installed.
     """
-    backend: Backend = backends.find(__name__, name, SETTING)
+    backend: Backend = plugins.find(__name__, name, SETTING)
     if keep_border and not backend.KEEPS_BORDER:
-        able = [one for one in backends.names(__name__) if backends.module(__name__, one).KEEPS_BORDER]
+        able = [one for one in plugins.names(__name__) if plugins.module(__name__, one).KEEPS_BORDER]
         raise SettingError(SETTING, f"{name!r} can't keep borders, where tiles meet", f"Choose {' or '.join(able)}")
     return backend
 

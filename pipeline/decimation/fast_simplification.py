@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from scan2sim.pipeline.types import F64, I32
+from scan2sim.pipeline.core.types import F64, I32
 
 NEEDS = ("fast_simplification",)
 KEEPS_BORDER = True

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from scan2sim.pipeline.types import F64, I32
+from scan2sim.pipeline.core.types import F64, I32
 
 KEEPS_BORDER = False
 

@@ -1,4 +1,4 @@
-"""COLMAP models, written as text; `pipeline.io.models.colmap` reads them.
+"""COLMAP models, written as text; `pipeline.io.photogrammetry.colmap` reads them.
 
 Of our own rather than pycolmap's: it needs no package, keeps the order of names and ids, and says of which CRS the
 metres are.
@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from scan2sim.pipeline.errors import DataError
-from scan2sim.pipeline.io import files
+from scan2sim.pipeline.core.errors import DataError
+from scan2sim.pipeline.core.types import F64, I32, U8, Camera, Frame, Trajectory
+from scan2sim.pipeline.io import file_checks
 from scan2sim.pipeline.io.trajectory import replacing
-from scan2sim.pipeline.types import F64, I32, U8, Camera, Frame, Trajectory
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def write(
         where = " ".join(f"{value:.9g}" for value in xyz)
         cloud.append(f"{i + 1} {where} {' '.join(map(str, colour))} {error:.4f} {' '.join(seen)}\n")
 
-    files.make_folder(folder)
+    file_checks.make_folder(folder)
     texts = {
         "cameras.txt": _camera(camera, frame or Frame()),
         "images.txt": "".join(images),
@@ -132,7 +132,7 @@ def _camera(camera: Camera, frame: Frame) -> str:
 
 def _reprojection(trajectory: Trajectory, camera: Camera, sparse: SparseMap) -> F64:
     """(M,) mean reprojection error of each point in pixels; -1, COLMAP's word for unknown, for one never seen."""
-    from scan2sim.pipeline.cameras import project
+    from scan2sim.pipeline.camera.models import project
 
     assert trajectory.rotations is not None
     away = sparse.xyz[sparse.point] - trajectory.positions[sparse.frame]

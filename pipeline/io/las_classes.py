@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from scan2sim.pipeline.classes import CLASSES
-from scan2sim.pipeline.errors import DataError, SpaceError, UnavailableError, from_os_error
+from scan2sim.pipeline.core.classes import CLASSES
+from scan2sim.pipeline.core.errors import DataError, SpaceError, UnavailableError, from_os_error
+from scan2sim.pipeline.core.types import U8
 from scan2sim.pipeline.io import las_header
 from scan2sim.pipeline.io.clouds.las import CHUNK, _open, _parts
-from scan2sim.pipeline.types import U8
 
 ADDED = {"confidence": "255: sure", "told_from": "1 photos 2 shape 3 own"}
 """Extra bytes that are added (uint8 each): name and description."""

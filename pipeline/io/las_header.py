@@ -10,7 +10,7 @@ import struct
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.core.errors import InputError
 
 AGAIN = "Copy it again, or export it anew"
 HEADERS = {0: 227, 1: 227, 2: 227, 3: 235, 4: 375, 5: 393}

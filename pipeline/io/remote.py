@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from scan2sim.pipeline.errors import InputError, UnavailableError
-from scan2sim.pipeline.inside import inside
-from scan2sim.pipeline.step import Report, silent
+from scan2sim.pipeline.core.errors import InputError, UnavailableError
+from scan2sim.pipeline.core.paths import inside
+from scan2sim.pipeline.core.step import Report, silent
 
 INDEX, PUSHED = ".remote.json", ".pushed.json"
 CACHE = "SCAN2SIM_CACHE"

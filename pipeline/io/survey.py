@@ -22,10 +22,10 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.parameters import NAME, Name
 from scan2sim.pipeline.io import toml
 from scan2sim.pipeline.io.tile import tile_name
-from scan2sim.pipeline.ranges import NAME, Name
 
 
 class SurveyFile(BaseModel):

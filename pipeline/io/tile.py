@@ -30,8 +30,8 @@ mask = "masks/0001.png"     # optional: 0 where the photo must not be used
 name = "photos/0001"        # optional: what it is called; default: the file without its suffix
 ```
 Paths are relative to the `tile.toml`. A tile that was cut from a survey also says what of it is its own:
-`[cell]` with `seed` (x, y in the CRS) and `[cell.neighbours]`, names of tiles to their seeds (`pipeline.cells`).
-A generated tile also names its ground truth:
+`[cell]` with `seed` (x, y in the CRS) and `[cell.neighbours]`, names of tiles to their seeds
+(`pipeline.tiling.voronoi_cell`). A generated tile also names its ground truth:
 `[truth]` with `mesh` and `points`.
 """
 
@@ -44,16 +44,17 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from scan2sim.pipeline.cells import Cell
-from scan2sim.pipeline.classes import mapping, name_of
-from scan2sim.pipeline.errors import InputError, SettingError
+from scan2sim.pipeline.camera.poses import nearest_rotation
+from scan2sim.pipeline.core.classes import mapping, name_of
+from scan2sim.pipeline.core.errors import InputError, SettingError
+from scan2sim.pipeline.core.parameters import Name
+from scan2sim.pipeline.core.types import Camera, CameraModel, Frame, Tile, Trajectory, View
 from scan2sim.pipeline.io import clouds as cloud_io
-from scan2sim.pipeline.io import crs as crs_io
-from scan2sim.pipeline.io import files, orthophoto, toml
+from scan2sim.pipeline.io import file_checks, toml
 from scan2sim.pipeline.io import trajectory as trajectory_io
-from scan2sim.pipeline.poses import nearest_rotation
-from scan2sim.pipeline.ranges import Name
-from scan2sim.pipeline.types import Camera, CameraModel, Frame, Tile, Trajectory, View
+from scan2sim.pipeline.io.geodata import crs as crs_io
+from scan2sim.pipeline.io.geodata import orthophoto
+from scan2sim.pipeline.tiling.voronoi_cell import Cell
 
 Vector = tuple[float, float, float]
 FARTHEST, STRONGEST = 1e6, 1e6
@@ -242,9 +243,9 @@ def read_spec(path: Path) -> TileFile:
 
 def _existing(tile: Path, name: str, field: str) -> Path:
     path = tile.parent / name
-    cause = files.problem(path)
+    cause = file_checks.problem(path)
     if cause is not None:
-        raise InputError(path, f"{cause} (named under `{field}` of {tile.name})", files.PUT_THERE)
+        raise InputError(path, f"{cause} (named under `{field}` of {tile.name})", file_checks.PUT_THERE)
     return path
 
 

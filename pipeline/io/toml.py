@@ -8,8 +8,8 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.io import files
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.io import file_checks
 
 M = TypeVar("M", bound=BaseModel)
 LARGEST = 64_000_000
@@ -34,13 +34,13 @@ def read(path: Path, model: type[M], *, absent: tuple[str, str], fields: str) ->
         raise InputError(path, f"field `{where}`: {first['msg']}", fields) from None
 
 
-def table(path: Path, absent: tuple[str, str] = ("is missing", files.PUT_THERE)) -> dict[str, Any]:
+def table(path: Path, absent: tuple[str, str] = ("is missing", file_checks.PUT_THERE)) -> dict[str, Any]:
     """What a file says, unchecked; a byte order mark, as Windows' editors write it, is no part of it.
 
     Raises:
         InputError: it is missing (`absent` are cause and remedy then), no file, or not TOML.
     """
-    cause = files.problem(path)
+    cause = file_checks.problem(path)
     if cause is not None:
         raise InputError(path, *(absent if cause == "is missing" else (cause, absent[1])))
     if path.stat().st_size > LARGEST:

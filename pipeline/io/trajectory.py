@@ -22,11 +22,11 @@ from typing import Any
 
 import numpy as np
 
-from scan2sim.pipeline.errors import DataError, InputError, SettingError, from_os_error
-from scan2sim.pipeline.io import crs as crs_io
-from scan2sim.pipeline.io import files
-from scan2sim.pipeline.poses import nearest_rotation
-from scan2sim.pipeline.types import F64, Frame, Trajectory
+from scan2sim.pipeline.camera.poses import nearest_rotation
+from scan2sim.pipeline.core.errors import DataError, InputError, SettingError, from_os_error
+from scan2sim.pipeline.core.types import F64, Frame, Trajectory
+from scan2sim.pipeline.io import file_checks
+from scan2sim.pipeline.io.geodata import crs as crs_io
 
 POSITION = ("time", "x", "y", "z")
 QUATERNION = ("qx", "qy", "qz", "qw")
@@ -122,7 +122,7 @@ def _bad(path: Path, kind: str, line: int, cause: str, remedy: str | None = None
 
 def _lines(path: Path) -> tuple[str, Lines]:
     """The format of a file and its lines, without blank ones and (but for a CSV's heading) comments."""
-    files.check(path)
+    file_checks.check(path)
     try:
         text = path.read_text(encoding="utf-8-sig")
     except OSError as error:

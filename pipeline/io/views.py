@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.types import Camera, View
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.types import Camera, View
 
 CAMERA_FIELDS = ("model", "width", "height", "fx", "fy", "cx", "cy", "distortion")
 

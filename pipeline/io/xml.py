@@ -6,8 +6,8 @@ from pathlib import Path
 from xml.etree import ElementTree
 from xml.parsers import expat
 
-from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.io import files
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.io import file_checks
 
 LARGEST = 512_000_000
 """Bytes: cameras of a hundred thousand photos have room."""
@@ -19,7 +19,7 @@ def root(path: Path, remedy: str = "Export it again") -> ElementTree.Element:
     Raises:
         InputError: it is no file, too large, no readable XML, or declares a document type, whatever its encoding.
     """
-    files.check(path)
+    file_checks.check(path)
     if path.stat().st_size > LARGEST:
         raise InputError(path, f"is of {path.stat().st_size:,} bytes, more than {LARGEST:,}", remedy)
     try:

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from scan2sim.pipeline.types import F64
+from scan2sim.pipeline.core.types import F64
 
 KNOT = 5.0
 """Metres, about, between places where the rate of curvature may change."""

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from scan2sim.pipeline.core.types import F64
 from scan2sim.pipeline.roads.lanes import Section, sections
 from scan2sim.pipeline.roads.listed import surface
 from scan2sim.pipeline.roads.model import Road
-from scan2sim.pipeline.types import F64
 
 STEP = 0.5
 """Metres between places of a course."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from scan2sim.pipeline.types import F64, Bools
+from scan2sim.pipeline.core.types import F64, Bools
 
 STEP = 1.0
 """Metres between places of a way."""

@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from scan2sim.pipeline.types import F64, Bools
+from scan2sim.pipeline.core.types import F64, Bools
 
 ROW = 0.5
 """Metres along the road between places where its edges are looked for."""

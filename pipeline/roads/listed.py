@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from scan2sim.pipeline.io import geojson
+from scan2sim.pipeline.core.types import F64, Frame
+from scan2sim.pipeline.io.geodata import geojson
 from scan2sim.pipeline.roads.lanes import sections
 from scan2sim.pipeline.roads.model import Line, Road
 from scan2sim.pipeline.roads.profile import Profile
-from scan2sim.pipeline.types import F64, Frame
 
 STEP = 1.0
 """Metres between places of a line."""

@@ -8,11 +8,11 @@ from typing import Literal
 
 import numpy as np
 
+from scan2sim.pipeline.core.types import F64, I64
 from scan2sim.pipeline.roads import clothoid, driven, kerbs, observed, paint, profile
 from scan2sim.pipeline.roads.clothoid import Clothoids
 from scan2sim.pipeline.roads.observed import BEYOND, Observed
 from scan2sim.pipeline.roads.profile import Profile
-from scan2sim.pipeline.types import F64, I64
 
 KNOT = 10.0
 """Metres, about, between places where cubics meet."""

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
+from scan2sim.pipeline.core.types import F64, I64, Bools, Frame
 from scan2sim.pipeline.roads import clothoid, driven, kerbs, paint
-from scan2sim.pipeline.types import F64, I64, Bools, Frame
 
 if TYPE_CHECKING:
-    from scan2sim.pipeline.render import Renderer
+    from scan2sim.pipeline.camera.renderer import Renderer
 
 BEYOND = 15.0
 """Metres beyond the driven way's ends up to which a road is looked at."""

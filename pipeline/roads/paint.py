@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from scan2sim.pipeline.core.types import F64, I64
 from scan2sim.pipeline.roads.clothoid import Clothoids
-from scan2sim.pipeline.types import F64, I64
 
 if TYPE_CHECKING:
-    from scan2sim.pipeline.render import Renderer
+    from scan2sim.pipeline.camera.renderer import Renderer
 
 ALONG, ACROSS = 0.05, 0.02
 """Metres of a pixel of the road's picture."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from scan2sim.pipeline.types import F64
+from scan2sim.pipeline.core.types import F64
 
 ROUNDS = 12
 COARSE = 16.0

@@ -8,11 +8,11 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from scan2sim.pipeline.classes import CODE
-from scan2sim.pipeline.io.files import pass_on
-from scan2sim.pipeline.ranges import Coordinate
-from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.types import F64, Bools, Frame, PointCloud, Trajectory
+from scan2sim.pipeline.core.classes import CODE
+from scan2sim.pipeline.core.parameters import Coordinate
+from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.types import F64, Bools, Frame, PointCloud, Trajectory
+from scan2sim.pipeline.io.file_checks import pass_on
 
 WINDOW = 0.1
 """Seconds: a turn of most spinning scanners."""
@@ -56,7 +56,7 @@ def carve(inputs: Inputs, params: CarveParams, out: Path, report: Report) -> Don
     `moving`, what moved, with time, normals towards the scanner and the class "vehicle"; `dropped`, .npy (N,) uint8 by
     point of the cloud, 0 where it is kept, else "vehicle" (it moved) or "low_noise"; empty where all are.
     """
-    from scan2sim.pipeline.swept import in_first_metre, in_swept, swept
+    from scan2sim.pipeline.dynamic_objects.ego_vehicle_mask import in_first_metre, in_swept, swept
 
     if params.when == "never" or not (params.cameras or "path" in inputs):
         why = "carve.when=never" if params.when == "never" else "neither path nor cameras are known"
@@ -152,7 +152,7 @@ def _origins(cloud: PointCloud, path: Trajectory) -> tuple[F64, str]:
 
 def _moved(cloud: PointCloud, origins: F64, path: Trajectory | None, params: CarveParams) -> tuple[Bools, float]:
     """(N,) which points other rays passed through, and the share of those that rays can tell of."""
-    from scan2sim.pipeline.freespace import in_free_space
+    from scan2sim.pipeline.dynamic_objects.free_space import in_free_space
 
     assert cloud.time is not None and path is not None
     order = np.argsort(cloud.time, kind="stable")

@@ -6,10 +6,10 @@ from pathlib import Path
 
 from pydantic import Field
 
-from scan2sim.pipeline.cells import Cell
-from scan2sim.pipeline.ranges import Place
-from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.types import Mesh
+from scan2sim.pipeline.core.parameters import Place
+from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.types import Mesh
+from scan2sim.pipeline.tiling.voronoi_cell import Cell
 
 
 class CellParams(Params):
@@ -31,7 +31,7 @@ class CellParams(Params):
 
 def clip(inputs: Inputs, params: CellParams, out: Path, report: Report) -> Done:
     """Cut `mesh` to the tile's own cell, and tell which vertices lie on which border (`on`)."""
-    from scan2sim.pipeline.borders.clip import clip as clip_mesh
+    from scan2sim.pipeline.tiling.borders.clip import clip as clip_mesh
 
     mesh = Mesh.load(inputs["mesh"])
     clipped = clip_mesh(mesh, params.cell)

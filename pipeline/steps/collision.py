@@ -11,12 +11,12 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
-from scan2sim.pipeline.cells import Cell
-from scan2sim.pipeline.classes import CODE, SURFACES, name_of
-from scan2sim.pipeline.errors import DataError, StepError
-from scan2sim.pipeline.ranges import Place, Seed
-from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.types import F32, U8, Frame, Mesh, PointCloud
+from scan2sim.pipeline.core.classes import CODE, SURFACES, name_of
+from scan2sim.pipeline.core.errors import DataError, StepError
+from scan2sim.pipeline.core.parameters import Place, Seed
+from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.types import F32, U8, Frame, Mesh, PointCloud
+from scan2sim.pipeline.tiling.voronoi_cell import Cell
 
 SAMPLES = 100_000  # points at which the distance to what is seen is measured
 POINTS = 1_000_000  # of the cloud, at most, that the ground is fitted to
@@ -53,7 +53,8 @@ def collision(inputs: Inputs, params: CollisionParams, out: Path, report: Report
     scanned; optional): smooth, and nearer to what was measured than what is seen. `building` and `vehicle` (and
     `vegetation`, if asked) share what is left of the triangles. Of open edges, those on borders with other tiles
     stay as they are, vertex for vertex; all others are thinned. Street furniture stays as it is, so that its poles and
-    trunks can be told apart as cylinders (`pipeline.cylinders`); where it would take more than half the budget, it is
+    trunks can be told apart as cylinders (`pipeline.geometry.cylinders`); where it would take more than half the
+    budget, it is
     simplified as well. Where neither ground nor building has a face, plants are solid, and a warning says so.
 
     File: `mesh`, with a class code for every face: of the ground, that of the points around it. Facts in metres:
@@ -63,8 +64,8 @@ def collision(inputs: Inputs, params: CollisionParams, out: Path, report: Report
         DataError: no mesh has a face.
         StepError: the borders alone need over 200,000 triangles.
     """
-    from scan2sim.pipeline.borders.rims import on_border
-    from scan2sim.pipeline.cylinders import told_apart
+    from scan2sim.pipeline.geometry.cylinders import told_apart
+    from scan2sim.pipeline.tiling.borders.open_edges import on_border
 
     meshes = {group: Mesh.load(inputs[group]) for group in SURFACES if group in inputs}
     frame = next(iter(meshes.values())).frame
@@ -129,8 +130,8 @@ def _ground_points(inputs: Inputs, seed: int) -> PointCloud | None:
 
 def _ground(terrain: Mesh, points: PointCloud | None, params: CollisionParams, cell: Cell | None) -> Mesh:
     """The ground, light and smooth, with its classes."""
-    from scan2sim.pipeline.borders.rims import on_border, thinned
-    from scan2sim.pipeline.fit import fitted
+    from scan2sim.pipeline.terrain.ground_fit import fitted
+    from scan2sim.pipeline.tiling.borders.open_edges import on_border, thinned
 
     ground = thinned(terrain, min(round(GROUND * params.triangles), _enough(terrain)), on_border(terrain, cell))
     if points is not None:
@@ -140,7 +141,7 @@ def _ground(terrain: Mesh, points: PointCloud | None, params: CollisionParams, c
 
 def _walls(surfaces: Sequence[Mesh], budget: int, cell: Cell | None) -> list[Mesh]:
     """What stands, thinned, the triangles shared out by area; each of one class."""
-    from scan2sim.pipeline.borders.rims import on_border, thinned
+    from scan2sim.pipeline.tiling.borders.open_edges import on_border, thinned
 
     wanted = [(mesh, _enough(mesh)) for mesh in surfaces if len(mesh)]
     share = min(1.0, max(0, budget) / max(1, sum(count for _, count in wanted)))
@@ -202,7 +203,7 @@ def _areas(ground: Mesh) -> dict[str, float]:
 
 def _off(ground: Mesh, points: F32) -> dict[str, float]:
     """Heights between points of the cloud and the ground in metres; all within 15 cm of it count."""
-    from scan2sim.pipeline.fit import off_ground
+    from scan2sim.pipeline.terrain.ground_fit import off_ground
 
     _, _, above = off_ground(ground, points)
     return _figures(np.abs(above)) if len(above) else {}

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from scan2sim.pipeline.corridor import VERSION, CutParams, cut_survey
-from scan2sim.pipeline.step import Done, Inputs, Report, Step
+from scan2sim.pipeline.core.step import Done, Inputs, Report, Step
+from scan2sim.pipeline.tiling.cut_corridor import VERSION, CutParams, cut_survey
 
 
 def cut(inputs: Inputs, params: CutParams, out: Path, report: Report) -> Done:

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
-from scan2sim.pipeline.ranges import Name
-from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.types import Mesh
+from scan2sim.pipeline.core.parameters import Name
+from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.types import Mesh
 
 
 class DecimateParams(Params):

@@ -9,15 +9,15 @@ from typing import Annotated
 import numpy as np
 from pydantic import AfterValidator, Field
 
-from scan2sim.pipeline.classes import SURFACES
-from scan2sim.pipeline.extras import need
-from scan2sim.pipeline.io import scenes
+from scan2sim.pipeline.core.classes import SURFACES
+from scan2sim.pipeline.core.optional_deps import need
+from scan2sim.pipeline.core.parameters import Coordinate, Name
+from scan2sim.pipeline.core.step import Done, Inputs, Report, Step
+from scan2sim.pipeline.core.types import I32
 from scan2sim.pipeline.io import views as views_io
-from scan2sim.pipeline.io.scene import PATH, ROADS, keep
-from scan2sim.pipeline.io.scenes import SceneParams
-from scan2sim.pipeline.ranges import Coordinate, Name
-from scan2sim.pipeline.step import Done, Inputs, Report, Step
-from scan2sim.pipeline.types import I32
+from scan2sim.pipeline.io import world_formats
+from scan2sim.pipeline.io.world_formats import SceneParams
+from scan2sim.pipeline.io.worlds.scene import PATH, ROADS, keep
 
 LISTS = {
     "plants": "plants.geojson", "plants_csv": "plants.csv",
@@ -37,7 +37,7 @@ class ExportParams(SceneParams):
 
     Attributes:
         name: of the tile, its world and its model; set by the recipe.
-        formats: files of `pipeline/io/scenes`; `scan2sim export` writes others later.
+        formats: files of `pipeline/io/world_formats`; `scan2sim export` writes others later.
         friction: Coulomb friction coefficient of roads; 0.9 is rubber on dry asphalt, and other classes follow.
         world_origin: metres in the CRS; several tiles with the same one share their georeference.
             Default: the tile's own origin.
@@ -57,8 +57,10 @@ class ExportParams(SceneParams):
 def export(inputs: Inputs, params: ExportParams, out: Path, report: Report) -> Done:
     """Write the textured groups and the collision mesh as a world.
 
-    Below `world/` is what `pipeline.io.scenes` writes of each of the formats, `metadata.json`, the lists that are
-    given, and `scene/`, from which other formats can be written later (`pipeline.io.scene`). Meshes are in the tile's
+    Below `world/` is what `pipeline.io.world_formats` writes of each of the formats, `metadata.json`, the lists that
+    are
+    given, and `scene/`, from which other formats can be written later (`pipeline.io.worlds.scene`). Meshes are in the
+    tile's
     local metres; its place is in poses, nodes and the georeference alone. Files of the folder `opendrive` (of the step
     `roads`) are placed beside the formats. With `views` and `choice.*` the scene records for each face the photo
     that gives its detail.
@@ -69,7 +71,7 @@ def export(inputs: Inputs, params: ExportParams, out: Path, report: Report) -> D
         UnavailableError: a format can't be written here.
         InputError: a textured mesh is incomplete, or in another frame than the others.
     """
-    scenes.check(params.formats, params, "export.formats")
+    world_formats.check(params.formats, params, "export.formats")
     world = out / "world"
     views = views_io.load(inputs["views"]) if "views" in inputs else ()
     photos = {str(group): _details(inputs[f"choice.{group}"]) for group in SURFACES if f"choice.{group}" in inputs}
@@ -78,7 +80,7 @@ def export(inputs: Inputs, params: ExportParams, out: Path, report: Report) -> D
     scene = keep(
         world, params.name, surfaces, inputs["collision"], lists, params.friction, params.world_origin, views, photos
     )
-    scenes.write(scene, params.formats, world, params, report)
+    world_formats.write(scene, params.formats, world, params, report)
     for file in inputs["opendrive"].iterdir() if "opendrive" in inputs else ():
         shutil.copyfile(file, world / file.name)
     tile = scene.tiles[0]
@@ -92,7 +94,7 @@ def export(inputs: Inputs, params: ExportParams, out: Path, report: Report) -> D
 
 
 def _details(path: Path) -> I32:
-    """(F,) of a choice (`texturing.choose`), which view gives each face its detail."""
+    """(F,) of a choice (`texturing.view_selection.step`), which view gives each face its detail."""
     with np.load(path) as choice:
         return np.asarray(choice["label"], np.int32)
 
@@ -104,7 +106,7 @@ def can_export(params: ExportParams) -> None:
         SettingError: there is no such format.
         UnavailableError: a package isn't installed.
     """
-    scenes.check(params.formats, params, "export.formats")
+    world_formats.check(params.formats, params, "export.formats")
     if params.rasters:
         need("export.rasters", "rasterio")
 

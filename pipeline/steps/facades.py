@@ -11,17 +11,17 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from scan2sim.pipeline.cells import Cell
-from scan2sim.pipeline.classes import CODE, SHOWN
-from scan2sim.pipeline.io import image
+from scan2sim.pipeline.core.classes import CODE, SHOWN
+from scan2sim.pipeline.core.parameters import Place, Voxel
+from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.types import F64, I64, UNCOLOURED, Bools, PointCloud, Trajectory
 from scan2sim.pipeline.io import views as views_io
-from scan2sim.pipeline.ranges import Place, Voxel
-from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.types import F64, I64, UNCOLOURED, Bools, PointCloud, Trajectory
+from scan2sim.pipeline.io.images import image
+from scan2sim.pipeline.tiling.voronoi_cell import Cell
 
 if TYPE_CHECKING:
-    from scan2sim.pipeline.facades import Rays, Wall
-    from scan2sim.pipeline.planesweep import Photo
+    from scan2sim.pipeline.buildings.facade_completion import Rays, Wall
+    from scan2sim.pipeline.buildings.facade_stereo import Photo
 
 MOST = 1_000_000  # pixels at which a photo is sampled: all of a tile are kept in memory
 PIXELS = 120_000  # of the range images that tell what hides a wall
@@ -60,10 +60,10 @@ def facades(inputs: Inputs, params: FacadesParams, out: Path, report: Report) ->
     import numba
     from scipy.spatial import cKDTree
 
-    from scan2sim.pipeline import facades as kernels
-    from scan2sim.pipeline.borders.grid import on_grid
-    from scan2sim.pipeline.planes import detect
-    from scan2sim.pipeline.planesweep import WINDOW
+    from scan2sim.pipeline.buildings import facade_completion as kernels
+    from scan2sim.pipeline.buildings.facade_stereo import WINDOW
+    from scan2sim.pipeline.geometry.planes import detect
+    from scan2sim.pipeline.tiling.borders.grid import on_grid
 
     cloud = PointCloud.load(inputs["cloud"])
     whole = PointCloud.join([cloud, *(PointCloud.load(path) for name, path in inputs.items() if "other." in name)])
@@ -104,8 +104,8 @@ def photos_of(inputs: Inputs, whole: PointCloud) -> list[Photo]:
     """The photos from the ground that aren't held out, with what hides walls from them."""
     import cv2
 
-    from scan2sim.pipeline.planesweep import Photo
-    from scan2sim.pipeline.visibility import depth_map, scene
+    from scan2sim.pipeline.buildings.facade_stereo import Photo
+    from scan2sim.pipeline.camera.depth_map import depth_map, scene
 
     views, held = views_io.load(inputs["views"]), views_io.load_held_out(inputs["views"])
     hides = scene([], whole)
@@ -135,8 +135,8 @@ def raised(wall: Wall, rays: Rays, own: I64, through: Bools, photos: Callable[[]
 
     Photos are compared for walls that somewhere end where the scanner's rays do.
     """
-    from scan2sim.pipeline.facades import ceiling, highest, solid
-    from scan2sim.pipeline.planesweep import BELOW, WINDOW, evidence
+    from scan2sim.pipeline.buildings.facade_completion import ceiling, highest, solid
+    from scan2sim.pipeline.buildings.facade_stereo import BELOW, WINDOW, evidence
 
     above, margin = np.zeros_like(wall.known), round(WINDOW / 2 / wall.cell)
     most = ceiling(wall, rays, own)

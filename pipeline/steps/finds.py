@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydantic import Field
 
-from scan2sim.pipeline.cells import Cell
-from scan2sim.pipeline.ranges import Place
-from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.types import F32, Bools, PointCloud, Trajectory
+from scan2sim.pipeline.core.parameters import Place
+from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.types import F32, Bools, PointCloud, Trajectory
+from scan2sim.pipeline.tiling.voronoi_cell import Cell
 
 if TYPE_CHECKING:
-    from scan2sim.pipeline.furniture import Thing
+    from scan2sim.pipeline.furniture.classify import Thing
 
     Bools = Bools
 
@@ -60,8 +60,8 @@ def finds(inputs: Inputs, params: FindsParams, out: Path, report: Report) -> Don
 
 def seen(cloud: PointCloud, path: Trajectory) -> list[Thing]:
     """What stands in a cloud, local metres."""
-    from scan2sim.pipeline.furniture import eligible, find
-    from scan2sim.pipeline.standing import Columns
+    from scan2sim.pipeline.furniture.classify import eligible, find
+    from scan2sim.pipeline.furniture.poles import Columns
 
     ground, some = eligible(cloud)
     if not ground.any() or not len(some):
@@ -76,7 +76,7 @@ def heights(ground: F32, xyz: F32) -> F32:
     """(N,) metres of points (N, 3) above the lowest ground (M, 3) near them."""
     from scipy import ndimage
 
-    from scan2sim.pipeline.heightfield import Raster
+    from scan2sim.pipeline.geometry.height_map import Raster
 
     raster = Raster.over(CELL, [ground, xyz])
     low = -raster.highest(np.column_stack([ground[:, :2], -ground[:, 2]]).astype(np.float32))

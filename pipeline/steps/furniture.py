@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from scan2sim.pipeline.ranges import Place
-from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.parameters import Place
+from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.types import I64, Bools, Frame, Mesh, PointCloud
 from scan2sim.pipeline.steps.finds import KINDS
-from scan2sim.pipeline.types import I64, Bools, Frame, Mesh, PointCloud
 
 if TYPE_CHECKING:
-    from scan2sim.pipeline.furniture import Thing
-    from scan2sim.pipeline.plates import Plate
+    from scan2sim.pipeline.furniture.classify import Thing
+    from scan2sim.pipeline.furniture.sign_panels import Plate
 
     Bools = Bools
 
@@ -81,8 +81,8 @@ def furniture(inputs: Inputs, params: FurnitureParams, out: Path, report: Report
 
 def _parted(inputs: Inputs, params: FurnitureParams, frame: Frame) -> tuple[list[Thing], list[Thing]]:
     """The tile's own things and its neighbours', local metres."""
-    from scan2sim.pipeline.borders.finds import agreed
-    from scan2sim.pipeline.furniture import Thing
+    from scan2sim.pipeline.furniture.classify import Thing
+    from scan2sim.pipeline.tiling.borders.merge_detections import agreed
 
     def read(path: Path) -> list[Thing]:
         return [Thing.from_json(row) for row in json.loads(path.read_text(encoding="utf-8"))]
@@ -100,7 +100,7 @@ def _parted(inputs: Inputs, params: FurnitureParams, frame: Frame) -> tuple[list
 
 def listed(out: Path, crs: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, Path]:
     """Write `furniture.csv` and `furniture.geojson`; each row's `x`, `y` and `z` are in the CRS."""
-    from scan2sim.pipeline.io import geojson
+    from scan2sim.pipeline.io.geodata import geojson
 
     files = {"csv": out / "furniture.csv", "geojson": out / "furniture.geojson"}
     text = "\n".join([",".join(COLUMNS), *(",".join(str(row.get(c, "")) for c in COLUMNS) for row in rows)])
@@ -112,8 +112,8 @@ def listed(out: Path, crs: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, 
 
 def _held(cloud: PointCloud, own: Sequence[Thing], others: Sequence[Thing]) -> tuple[I64, Bools]:
     """(N,) indices of the points that are a thing's, ascending, and which of them are an own one's."""
-    from scan2sim.pipeline.furniture import eligible
-    from scan2sim.pipeline.standing import Columns
+    from scan2sim.pipeline.furniture.classify import eligible
+    from scan2sim.pipeline.furniture.poles import Columns
 
     _, some = eligible(cloud)
     xyz = cloud.xyz[some]
@@ -130,7 +130,7 @@ def _held(cloud: PointCloud, own: Sequence[Thing], others: Sequence[Thing]) -> t
 
 def _mesh(frame: Frame, things: list[Thing]) -> Mesh:
     """All of the things' parts, each face with its class."""
-    from scan2sim.pipeline import primitives
+    from scan2sim.pipeline.geometry import primitives
 
     parts = [part for thing in things for part in thing.meshes()]
     vertices, faces = primitives.join([triangles for triangles, _ in parts])

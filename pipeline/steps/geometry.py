@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from scan2sim.pipeline.cells import Cell
-from scan2sim.pipeline.classes import GROUPS, SURFACES, group_of
-from scan2sim.pipeline.ranges import Place
-from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.types import F32, Mesh, PointCloud
+from scan2sim.pipeline.core.classes import GROUPS, SURFACES, group_of
+from scan2sim.pipeline.core.parameters import Place
+from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.types import F32, Mesh, PointCloud
+from scan2sim.pipeline.tiling.voronoi_cell import Cell
 
 FAR = 1.0  # metres from the mesh beyond which one point in twenty is worth a warning
 

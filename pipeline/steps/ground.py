@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from pydantic import Field
 
-from scan2sim.pipeline.cells import Cell, nearest
-from scan2sim.pipeline.classes import CODE
-from scan2sim.pipeline.ranges import Place
-from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.types import UNCOLOURED, Bools, Frame, PointCloud
+from scan2sim.pipeline.core.classes import CODE
+from scan2sim.pipeline.core.parameters import Place
+from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.types import UNCOLOURED, Bools, Frame, PointCloud
+from scan2sim.pipeline.tiling.voronoi_cell import Cell, nearest
 
 if TYPE_CHECKING:
-    from scan2sim.pipeline.heightfield import Raster
+    from scan2sim.pipeline.geometry.height_map import Raster
 
     Bools = Bools
 
@@ -67,8 +67,8 @@ def ground(inputs: Inputs, params: GroundParams, out: Path, report: Report) -> D
     clouds (`terrain.NAME` and so on) are looked at as well: both tiles fill a hole on their border alike.
     File: `made`, a `PointCloud` with normals, as dense as the ground's own points are.
     """
-    from scan2sim.pipeline.borders.grid import on_grid
-    from scan2sim.pipeline.heightfield import Raster, closed, grown, membrane, spacing
+    from scan2sim.pipeline.geometry.height_map import Raster, closed, grown, membrane, spacing
+    from scan2sim.pipeline.tiling.borders.grid import on_grid
 
     terrain = united(inputs, params, "terrain")
     above = [united(inputs, params, part) for part in ("building", "vegetation", "rest") if part in inputs]
@@ -118,7 +118,7 @@ def gaps(has: Bools, stood: Bools, cell: float, gap: float) -> Bools:
     """
     from scipy import ndimage
 
-    from scan2sim.pipeline.heightfield import closed
+    from scan2sim.pipeline.geometry.height_map import closed
 
     whole = closed(has, gap / cell) | stood
     holes, count = ndimage.label(ndimage.binary_fill_holes(whole) & ~whole)
@@ -132,8 +132,8 @@ def stood(inputs: Inputs, raster: Raster, frame: Frame) -> Bools:
 
     They are of `things`, and of the neighbours' `things.NAME`.
     """
-    from scan2sim.pipeline.heightfield import drawn, grown
-    from scan2sim.pipeline.remains import outlines
+    from scan2sim.pipeline.dynamic_objects.vehicle_residue import outlines
+    from scan2sim.pipeline.geometry.height_map import drawn, grown
 
     listed = [path for name, path in sorted(inputs.items()) if name.partition(".")[0] == "things"]
     rings = [ring / raster.cell - raster.low for path in listed for ring in outlines(path, frame)]
@@ -155,7 +155,7 @@ def near_cell(xy: object, params: MadeUpParams, cloud: PointCloud) -> object:
 
 def united(inputs: Inputs, params: MadeUpParams, part: str) -> PointCloud:
     """The cloud `part` with what the neighbours' clouds `part.NAME` have where they own it, in the tile's own frame."""
-    from scan2sim.pipeline.borders.grid import on_grid
+    from scan2sim.pipeline.tiling.borders.grid import on_grid
 
     own = PointCloud.load(inputs[part])
     given = sorted(name for name in params.neighbours if f"{part}.{name}" in inputs)

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from pydantic import Field
 
-from scan2sim.pipeline.io import sweeps as io
-from scan2sim.pipeline.ranges import Focal, Pixels
-from scan2sim.pipeline.step import Done, Inputs, Report, Step
+from scan2sim.pipeline.core.parameters import Focal, Pixels
+from scan2sim.pipeline.core.step import Done, Inputs, Report, Step
+from scan2sim.pipeline.importers import sweeps as io
 
 
 class SweepsParams(io.Placing):
@@ -24,7 +24,7 @@ def import_sweeps(inputs: Inputs, params: SweepsParams, out: Path, report: Repor
     """A tile of `sweeps` (a folder) placed by `poses`; see `tile_of` for what else may be given.
 
     Raises:
-        ScanError: as `pipeline.io.sweeps.import_sweeps`.
+        ScanError: as `pipeline.importers.sweeps.import_sweeps`.
     """
     warnings: list[str] = []
     tile = tile_of(inputs, params, out / "corridor", link=True, warn=warnings.append, report=report)
@@ -48,10 +48,10 @@ def tile_of(
         inputs: `sweeps` and `poses`; `extrinsics`, `times`; `photos`, `photo_times`, `mask`, and `camera`, a file that
             describes theirs.
         params: how.
-        warn, report, link, overwrite, name: as of `pipeline.io.sweeps.import_sweeps`.
+        warn, report, link, overwrite, name: as of `pipeline.importers.sweeps.import_sweeps`.
 
     Raises:
-        ScanError: as `pipeline.io.sweeps.import_sweeps`.
+        ScanError: as `pipeline.importers.sweeps.import_sweeps`.
     """
     extrinsics, photos = inputs.get("extrinsics"), inputs.get("photos")
     pictures = None

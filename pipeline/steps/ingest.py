@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
-from scan2sim.pipeline import classes
-from scan2sim.pipeline.errors import DataError
-from scan2sim.pipeline.ranges import Coordinate
-from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.types import Frame, PointCloud
+from scan2sim.pipeline.core import classes
+from scan2sim.pipeline.core.errors import DataError
+from scan2sim.pipeline.core.parameters import Coordinate
+from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.types import Frame, PointCloud
 
 MIN_POINTS = 1000
 WIDEST = 5000.0

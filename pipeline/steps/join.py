@@ -6,7 +6,7 @@ from pathlib import Path
 
 from pydantic import Field
 
-from scan2sim.pipeline.step import Done, Inputs, Report, Step
+from scan2sim.pipeline.core.step import Done, Inputs, Report, Step
 from scan2sim.pipeline.steps.clip import CellParams
 
 
@@ -30,8 +30,8 @@ def join(inputs: Inputs, params: JoinParams, out: Path, report: Report) -> Done:
 
     Neighbours whose names sort after the tile's own needn't be given: they fit theirs to this one.
     """
-    from scan2sim.pipeline.borders.clip import Clipped
-    from scan2sim.pipeline.borders.join import join as join_mesh
+    from scan2sim.pipeline.tiling.borders.clip import Clipped
+    from scan2sim.pipeline.tiling.borders.join import join as join_mesh
 
     clips = {params.name: Clipped.load(inputs["mesh"], inputs["on"])}
     for name in sorted(params.neighbours):

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
-from scan2sim.pipeline.cells import nearest
-from scan2sim.pipeline.step import Done, Inputs, Report, Step
+from scan2sim.pipeline.core.step import Done, Inputs, Report, Step
+from scan2sim.pipeline.core.types import PointCloud
 from scan2sim.pipeline.steps.clip import CellParams
-from scan2sim.pipeline.types import PointCloud
+from scan2sim.pipeline.tiling.voronoi_cell import nearest
 
 
 class OverlapParams(CellParams):
@@ -32,9 +32,9 @@ def overlap(inputs: Inputs, params: OverlapParams, out: Path, report: Report) ->
     A point belongs to the tile with the nearest seed (of several as near, to the one whose name sorts first), and
     is taken from there with what that tile knows of it, its class above all. So tiles see the same points around
     their border. Where the nearest tile's cloud is not given, the tile's own points stand in. Coordinates are
-    rounded to `pipeline.borders.grid.GRID`: the same in every tile.
+    rounded to `pipeline.tiling.borders.grid.GRID`: the same in every tile.
     """
-    from scan2sim.pipeline.borders.grid import on_grid
+    from scan2sim.pipeline.tiling.borders.grid import on_grid
 
     seeds = dict(sorted({params.name: params.seed, **params.neighbours}.items()))
     given = [name for name in seeds if name == params.name or f"cloud.{name}" in inputs]

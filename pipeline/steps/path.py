@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from pydantic import ConfigDict
 
-from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.types import Trajectory
+from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.types import Trajectory
 
 
 class PathParams(Params):

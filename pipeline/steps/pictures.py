@@ -13,14 +13,14 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
-from scan2sim.pipeline.classes import SURFACES, colour_of
-from scan2sim.pipeline.io import image
+from scan2sim.pipeline.core.classes import SURFACES, colour_of
+from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.types import F64, U8, Camera, Mesh, PointCloud, Trajectory
 from scan2sim.pipeline.io import views as views_io
-from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.types import F64, U8, Camera, Mesh, PointCloud, Trajectory
+from scan2sim.pipeline.io.images import image
 
 if TYPE_CHECKING:
-    from scan2sim.pipeline.render import Image
+    from scan2sim.pipeline.camera.renderer import Image
 
 GROUP_RGB = {
     "terrain": (176, 158, 138),
@@ -76,7 +76,7 @@ def pictures(inputs: Inputs, params: PicturesParams, out: Path, report: Report) 
     Held-out photos come first. The textured world is shown from above and from where it was scanned: where there is a
     path, that is a driver's eye, else a bird's that has the whole tile before it.
     """
-    from scan2sim.pipeline import render
+    from scan2sim.pipeline.camera import renderer as render
 
     folder = out / "pictures"
     folder.mkdir()
@@ -170,7 +170,7 @@ def bounds(parts: list[Any]) -> tuple[F64, F64]:
 
 def whole_pose(points: npt.NDArray[np.floating], camera: Camera) -> F64:
     """(4, 4) pose of an eye in the air, across the longer side, as near as all points (N, 3) are in the picture."""
-    from scan2sim.pipeline.render import look_at
+    from scan2sim.pipeline.camera.renderer import look_at
 
     size = np.ptp(points, axis=0)
     side = np.array([-0.35, -0.94]) if size[0] >= size[1] else np.array([-0.94, -0.35])
@@ -188,7 +188,7 @@ def whole_pose(points: npt.NDArray[np.floating], camera: Camera) -> F64:
 
 def driver_pose(path: F64 | None, low: F64, high: F64, ground: Any) -> F64:
     """(4, 4) pose of an eye on the path, an eighth of it in, looking along it; without a path, along the tile."""
-    from scan2sim.pipeline.render import look_at
+    from scan2sim.pipeline.camera.renderer import look_at
 
     if path is not None and len(path) > 1:
         inside = path[((path[:, :2] > low[:2]) & (path[:, :2] < high[:2])).all(axis=1)]
@@ -220,7 +220,7 @@ def ground_height(renderer: Any, point: F64, low: F64, high: F64) -> float:
 
 def bird_pose(low: F64, high: F64) -> F64:
     """(4, 4) pose of an eye above one end that overlooks the tile."""
-    from scan2sim.pipeline.render import look_at
+    from scan2sim.pipeline.camera.renderer import look_at
 
     size = high - low
     along = 0 if size[0] >= size[1] else 1

@@ -8,10 +8,10 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
-from scan2sim.pipeline.cells import Cell
-from scan2sim.pipeline.ranges import Place, Voxel
-from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.types import F64, Mesh, PointCloud
+from scan2sim.pipeline.core.parameters import Place, Voxel
+from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.types import F64, Mesh, PointCloud
+from scan2sim.pipeline.tiling.voronoi_cell import Cell
 
 KEPT, FADED = 2.5, 5.0  # voxels from a border up to which Poisson's surface stays, and up to which it partly does
 
@@ -42,8 +42,8 @@ def planes(inputs: Inputs, params: PlanesParams, out: Path, report: Report) -> D
     where one ends before a parallel one (a window's reveal), it gets the face between them; where one ends and nothing
     is behind, none of `other.*` either, so does the mesh.
     """
-    from scan2sim.pipeline import extents, sharpen
-    from scan2sim.pipeline.planes import Planes, detect
+    from scan2sim.pipeline.geometry import plane_boundaries, plane_snapping
+    from scan2sim.pipeline.geometry.planes import Planes, detect
 
     mesh, cloud, voxel = Mesh.load(inputs["mesh"]), PointCloud.load(inputs["cloud"]), params.voxel
     assert cloud.normal is not None
@@ -54,24 +54,24 @@ def planes(inputs: Inputs, params: PlanesParams, out: Path, report: Report) -> D
         return Done({"mesh": out / "mesh.npz"}, facts | {"faces": len(mesh), "on_planes": 0.0})
     report(0.2, "extents")
     points = PointCloud.load(inputs["points"]).xyz
-    own = extents.members(points, found, cloud.xyz, which, voxel, tolerance)
+    own = plane_boundaries.members(points, found, cloud.xyz, which, voxel, tolerance)
     if "made" in inputs:
         made = PointCloud.load(inputs["made"])
         assert made.normal is not None
         theirs = found.of(made.xyz, made.normal)
         points, own = np.concatenate([points, made.xyz]), np.concatenate([own, theirs])
         cloud, which = PointCloud.join([cloud, made]), np.concatenate([which, theirs])
-    sides = extents.sides(points, own, found, voxel)
-    faces, between, of_face = extents.steps(sides, found, cloud.xyz, which, voxel, tolerance)
+    sides = plane_boundaries.sides(points, own, found, voxel)
+    faces, between, of_face = plane_boundaries.steps(sides, found, cloud.xyz, which, voxel, tolerance)
     others = [PointCloud.load(path).xyz for name, path in inputs.items() if name.startswith("other.")]
-    edges = sharpen.edges_of(mesh)
-    border = mesh.vertices[sharpen.border_of(edges)]
-    ends, of_side = extents.free(
+    edges = plane_snapping.edges_of(mesh)
+    border = mesh.vertices[plane_snapping.border_of(edges)]
+    ends, of_side = plane_boundaries.free(
         sides, found, cloud.xyz, which, np.concatenate([np.zeros((0, 3), np.float32), *others]), border, voxel
     )
     report(0.5, "vertices")
     on = which >= 0
-    near, beside = sharpen.plane_of(
+    near, beside = plane_snapping.plane_of(
         mesh,
         every := Planes.join([found, faces]),
         np.concatenate([cloud.xyz[on], between]).astype(np.float32),
@@ -79,13 +79,13 @@ def planes(inputs: Inputs, params: PlanesParams, out: Path, report: Report) -> D
         voxel,
         tolerance,
     )
-    laid = extents.ended(mesh.vertices.astype(np.float64), near, every, sides, ends, of_side, cloud.xyz, voxel)
+    laid = plane_boundaries.ended(mesh.vertices.astype(np.float64), near, every, sides, ends, of_side, cloud.xyz, voxel)
     report(0.7, "edges")
     beside |= laid != near
     share = inland(mesh, params)
     laid[share == 0] = -1
     every_end = Planes.join([every, sides.planes])
-    sharp = sharpen.sharpen(mesh, edges, every_end, laid, beside, share, len(every), voxel, tolerance)
+    sharp = plane_snapping.sharpen(mesh, edges, every_end, laid, beside, share, len(every), voxel, tolerance)
     sharp.mesh.save(out / "mesh.npz")
     facts |= {
         "faces": len(sharp.mesh),
@@ -102,7 +102,7 @@ def inland(mesh: Mesh, params: PlanesParams) -> F64:
 
     Beyond a tile's buffer its planes' points are missing, so its planes aren't quite the neighbour's.
     """
-    from scan2sim.pipeline.borders.grid import world
+    from scan2sim.pipeline.tiling.borders.grid import world
 
     share = np.ones(len(mesh.vertices))
     if params.seed is not None and params.neighbours:

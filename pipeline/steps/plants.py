@@ -8,10 +8,10 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
-from scan2sim.pipeline.cells import Cell
-from scan2sim.pipeline.ranges import Place
-from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.types import F32, F64, U8, PointCloud
+from scan2sim.pipeline.core.parameters import Place
+from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.types import F32, F64, U8, PointCloud
+from scan2sim.pipeline.tiling.voronoi_cell import Cell
 
 CELL = 0.25  # metres, of the canopy raster
 
@@ -44,8 +44,8 @@ def plants(inputs: Inputs, params: PlantsParams, out: Path, report: Report) -> D
     no colour. Crowns are grown from the tops by watershed (Vincent and Soille 1991). With `models` a textured mesh of
     low-poly plants is written, too (`mesh`, and `textured`, its folder).
     """
-    from scan2sim.pipeline import planting
-    from scan2sim.pipeline.io import geojson
+    from scan2sim.pipeline.io.geodata import geojson
+    from scan2sim.pipeline.terrain import low_poly_plants
 
     cloud, ground = PointCloud.load(inputs["vegetation"]), PointCloud.load(inputs["terrain"])
     found, crown = crowns(cloud.xyz, ground.xyz, params) if len(cloud) else (np.empty((0, 5)), np.empty(0, int))
@@ -70,14 +70,14 @@ def plants(inputs: Inputs, params: PlantsParams, out: Path, report: Report) -> D
     if params.models:
         models = out / "models"
         models.mkdir()
-        planting.plant(found[:, :3], found[:, 3], found[:, 4], colour, cloud.frame, models)
+        low_poly_plants.plant(found[:, :3], found[:, 3], found[:, 4], colour, cloud.frame, models)
         files |= {"textured": models, "mesh": models / "mesh.npz"}
     return Done(files, {"points": len(cloud), "plants": len(rows)})
 
 
 def _colours(cloud: PointCloud, crown: npt.NDArray[np.int_], count: int) -> U8:
     """(P, 3) mean colours of crowns' points; a usual green where they have none."""
-    from scan2sim.pipeline.planting import LEAVES
+    from scan2sim.pipeline.terrain.low_poly_plants import LEAVES
 
     use = cloud.coloured & (crown >= 0)
     each = np.bincount(crown[use], minlength=count)

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
-from scan2sim.pipeline.errors import StepError
-from scan2sim.pipeline.ranges import Seconds, Voxel
-from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.types import F32, I32, Mesh, PointCloud
+from scan2sim.pipeline.core.errors import StepError
+from scan2sim.pipeline.core.parameters import Seconds, Voxel
+from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.types import F32, I32, Mesh, PointCloud
 
 MIN_POINTS = 50
 MARGIN = 1.02  # the octree's cube must be a little larger than the cloud
@@ -49,7 +49,7 @@ def poisson(inputs: Inputs, params: PoissonParams, out: Path, report: Report) ->
     Raises:
         StepError: all three failed.
     """
-    from scan2sim.pipeline import isolate
+    from scan2sim.pipeline.core import sandbox
 
     cloud = PointCloud.load(inputs["cloud"])
     if "made" in inputs and len(cloud) and len(made := PointCloud.load(inputs["made"])):
@@ -73,7 +73,7 @@ def poisson(inputs: Inputs, params: PoissonParams, out: Path, report: Report) ->
     # tries: as asked; on one thread, since several race on some inputs; the same surface, coarser
     for threads, coarser in ((params.threads, 0), (1, 0), (1, 1)):
         try:
-            vertices, faces, density = isolate.call(
+            vertices, faces, density = sandbox.call(
                 "scan2sim.pipeline.steps.poisson:reconstruct",
                 *(xyz, normal, depth - coarser, scale, params.point_weight, threads),
                 timeout=params.timeout,

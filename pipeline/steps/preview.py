@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import Field
 
-from scan2sim.pipeline.classes import SURFACES
-from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.classes import SURFACES
+from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.types import F64, Trajectory
 from scan2sim.pipeline.steps.pictures import bird_pose, bounds, driver_pose, whole_pose
-from scan2sim.pipeline.types import F64, Trajectory
 
 if TYPE_CHECKING:
-    from scan2sim.pipeline.io.textured import Textured
+    from scan2sim.pipeline.io.worlds.textured_mesh import Textured
 
 CALL = b"scan2simWorld"  # the function of flows/pages/walk.js that is given the GLB
 
@@ -41,12 +41,12 @@ def preview(inputs: Inputs, params: PreviewParams, out: Path, report: Report) ->
     `bytes`, and where eyes are at first, `walk` and `turn`: [eye, target], local metres; `start` is one of both, as in
     the report's first picture.
     """
-    from scan2sim.pipeline import render
-    from scan2sim.pipeline.io import glb, textured
-    from scan2sim.pipeline.io.glb import GlbParams
-    from scan2sim.pipeline.io.scene import whole
+    from scan2sim.pipeline.camera import renderer
+    from scan2sim.pipeline.io.worlds import glb, textured_mesh
+    from scan2sim.pipeline.io.worlds.glb import GlbParams
+    from scan2sim.pipeline.io.worlds.scene import whole
 
-    read = {group: textured.read(inputs[group]) for group in SURFACES if group in inputs}
+    read = {group: textured_mesh.read(inputs[group]) for group in SURFACES if group in inputs}
     surfaces: dict[str, Textured] = {group: surface for group, surface in read.items() if surface is not None}
     triangles = sum(map(len, surfaces.values()))
     if not 0 < triangles <= params.triangles:
@@ -65,8 +65,8 @@ def preview(inputs: Inputs, params: PreviewParams, out: Path, report: Report) ->
     driven = len(path) > 1
     points = np.concatenate([surface.mesh.vertices for surface in surfaces.values()])
     low, high = bounds([points])
-    air = bird_pose(low, high) if driven else whole_pose(points.clip(low, high), render.pinhole(1280, 720))
-    shapes = render.Renderer([render.Body(surface.mesh) for surface in surfaces.values()])
+    air = bird_pose(low, high) if driven else whole_pose(points.clip(low, high), renderer.pinhole(1280, 720))
+    shapes = renderer.Renderer([renderer.Body(surface.mesh) for surface in surfaces.values()])
     facts: dict[str, Any] = {
         "triangles": triangles,
         "scale": round(scale, 4),

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import Field
 
-from scan2sim.pipeline.classes import SURFACES
-from scan2sim.pipeline.errors import DataError, SettingError
-from scan2sim.pipeline.ranges import Name, Texel
-from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.types import F64, U8
+from scan2sim.pipeline.core.classes import SURFACES
+from scan2sim.pipeline.core.errors import DataError, SettingError
+from scan2sim.pipeline.core.parameters import Name, Texel
+from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.types import F64, U8
 
 if TYPE_CHECKING:
-    from scan2sim.pipeline.render import Image, Renderer
+    from scan2sim.pipeline.camera.renderer import Image, Renderer
 
 BAND = 2_000_000
 """Pixels that are rendered at a time, in whole rows."""
@@ -50,9 +50,9 @@ def rasters(inputs: Inputs, params: RastersParams, out: Path, report: Report) ->
         DataError: no group has a face.
         SettingError: the raster would be too large.
     """
-    from scan2sim.pipeline import render
-    from scan2sim.pipeline.io import geotiff
-    from scan2sim.pipeline.io.crs import LOCAL
+    from scan2sim.pipeline.camera import renderer as render
+    from scan2sim.pipeline.io.geodata import geotiff
+    from scan2sim.pipeline.io.geodata.crs import LOCAL
 
     bodies = {group: render.textured(inputs[group]) for group in SURFACES if group in inputs}
     bodies = {group: body for group, body in bodies.items() if len(body.mesh)}

@@ -10,13 +10,13 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from scan2sim.pipeline.classes import GROUPS, group_of
+from scan2sim.pipeline.core.classes import GROUPS, group_of
+from scan2sim.pipeline.core.parameters import Voxel
+from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.types import F64, Bools, PointCloud, Trajectory, View
 from scan2sim.pipeline.io import views as views_io
-from scan2sim.pipeline.io.files import pass_on
-from scan2sim.pipeline.ranges import Voxel
-from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.io.file_checks import pass_on
 from scan2sim.pipeline.steps.voxel import sample, voxel_groups
-from scan2sim.pipeline.types import F64, Bools, PointCloud, Trajectory, View
 
 PATCH = 2.0
 """Voxels: a photo is asked for a pixel on every square of this side. Coarser, all that a voxel can show is a blur."""
@@ -64,7 +64,7 @@ def reach(inputs: Inputs, params: ReachParams, out: Path, report: Report) -> Don
     if _above(thin, path.positions) > HIGH:
         kept = np.ones(len(thin), bool)
     elif not isinstance(params.limit, str):
-        from scan2sim.pipeline.reach import along
+        from scan2sim.pipeline.camera.photo_coverage import along
 
         kept = along(thin.xyz, path.positions, params.limit)
     else:
@@ -92,8 +92,8 @@ def reach(inputs: Inputs, params: ReachParams, out: Path, report: Report) -> Don
 
 def _worth(thin: PointCloud, views: Sequence[View], path: Trajectory, size: float, report: Report) -> Bools:
     """(N,) which points photos show well enough, or lie by the path, or belong to what does."""
-    from scan2sim.pipeline.normals import oriented_normals
-    from scan2sim.pipeline.reach import along, around, closed, finest
+    from scan2sim.pipeline.camera.photo_coverage import along, around, closed, finest
+    from scan2sim.pipeline.geometry.normals import oriented_normals
 
     report(0.2, "normals")
     thin = oriented_normals(thin, 12, path)

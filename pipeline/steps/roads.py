@@ -9,11 +9,11 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from scan2sim.pipeline.cells import Cell
-from scan2sim.pipeline.classes import CODE
-from scan2sim.pipeline.ranges import Coordinate, Name, Place
-from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.types import F64, Bools, Frame, PointCloud, Trajectory
+from scan2sim.pipeline.core.classes import CODE
+from scan2sim.pipeline.core.parameters import Coordinate, Name, Place
+from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.types import F64, Bools, Frame, PointCloud, Trajectory
+from scan2sim.pipeline.tiling.voronoi_cell import Cell
 
 DRIVEN_ON = ("road", "bridge_deck")
 UNDER = 3.0
@@ -47,8 +47,8 @@ def roads(inputs: Inputs, params: RoadsParams, out: Path, report: Report) -> Don
     which OpenDRIVE is drawn, one road over all tiles of a survey; `opendrive`, a folder with `<name>.xodr`, empty where
     no road has lanes.
     """
-    from scan2sim.pipeline import render
-    from scan2sim.pipeline.io import opendrive
+    from scan2sim.pipeline.camera import renderer as render
+    from scan2sim.pipeline.io.geodata import opendrive
     from scan2sim.pipeline.roads import driven, listed, model, observed
 
     cloud, path = PointCloud.load(inputs["cloud"]), Trajectory.load(inputs["path"])

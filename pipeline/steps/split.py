@@ -8,10 +8,10 @@ from typing import Literal
 
 import numpy as np
 
-from scan2sim.pipeline.classes import CODE, GROUPS, NOISE, UNKNOWN, group_of, known, name_of
-from scan2sim.pipeline.errors import DataError
-from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.types import Bools, PointCloud
+from scan2sim.pipeline.core.classes import CODE, GROUPS, NOISE, UNKNOWN, group_of, known, name_of
+from scan2sim.pipeline.core.errors import DataError
+from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.types import Bools, PointCloud
 
 REST, FURNITURE, VEHICLE = -1, len(GROUPS) + 1, len(GROUPS) + 2
 """Of a point, beside the groups' numbers: it is of no surface, street furniture's, a parked vehicle's."""

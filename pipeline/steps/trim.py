@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from scan2sim.pipeline.ranges import Reach, Voxel
-from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.types import F32, Mesh, PointCloud
+from scan2sim.pipeline.core.parameters import Reach, Voxel
+from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.types import F32, Mesh, PointCloud
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree

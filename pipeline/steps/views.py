@@ -10,11 +10,11 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import AfterValidator, Field
 
-from scan2sim.pipeline.errors import DataError, InputError
-from scan2sim.pipeline.io import image
+from scan2sim.pipeline.core.errors import DataError, InputError
+from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.types import F32, PointCloud, View
 from scan2sim.pipeline.io import views as views_io
-from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.types import F32, PointCloud, View
+from scan2sim.pipeline.io.images import image
 
 REACH = 100.0  # metres; a photo further than this from every point sees nothing of the tile
 MARGIN = 8  # pixels of an orthophoto around the points
@@ -94,7 +94,7 @@ def views(inputs: Inputs, params: ViewsParams, out: Path, report: Report) -> Don
 
 def _cut(view: View, points: F32, folder: Path, index: int) -> View:
     """An orthophoto cut to what it shows of the points: a survey's may cover a town."""
-    from scan2sim.pipeline.projection import pixels
+    from scan2sim.pipeline.camera.projection import pixels
 
     camera = view.camera
     uv, _ = pixels(camera, view.T_world_cam, points)
@@ -149,7 +149,7 @@ def _problem(view: View) -> str | None:
 
 def _sees(view: View, points: F32) -> bool:
     """Whether any of the points (N, 3) is inside the image and within reach."""
-    from scan2sim.pipeline.projection import pixels
+    from scan2sim.pipeline.camera.projection import pixels
 
     if view.camera.model != "orthographic":
         points = points[np.linalg.norm(points - view.centre, axis=1) < REACH]

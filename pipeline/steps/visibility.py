@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
+from scan2sim.pipeline.core.parameters import Reach
+from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.types import Mesh, PointCloud
 from scan2sim.pipeline.io import views as views_io
-from scan2sim.pipeline.ranges import Reach
-from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.types import Mesh, PointCloud
 
 
 class VisibilityParams(Params):
@@ -32,7 +32,7 @@ def visibility(inputs: Inputs, params: VisibilityParams, out: Path, report: Repo
 
     The maps are `depth/<view index>.npy`: (H, W) float32, metres along the pixel's ray.
     """
-    from scan2sim.pipeline import visibility as kernel
+    from scan2sim.pipeline.camera import depth_map as kernel
 
     folder = out / "depth"
     folder.mkdir()

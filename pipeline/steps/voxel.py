@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
-from scan2sim.pipeline.ranges import Voxel
-from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.types import F32, I64, PointCloud, Trajectory
+from scan2sim.pipeline.core.parameters import Voxel
+from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.types import F32, I64, PointCloud, Trajectory
 
 Groups = tuple[I64, I64]
 
@@ -33,7 +33,7 @@ def voxel(inputs: Inputs, params: VoxelParams, out: Path, report: Report) -> Don
     Without a path (an airborne cloud, say) normals point up, and those of walls away from what
     stands behind them.
     """
-    from scan2sim.pipeline.normals import oriented_normals
+    from scan2sim.pipeline.geometry.normals import oriented_normals
 
     cloud = PointCloud.load(inputs["cloud"])
     n = len(cloud)
@@ -52,10 +52,10 @@ def sample(cloud: PointCloud, size: float, groups: Groups | None = None) -> Poin
     """One point a voxel of `size` metres: mean position and colour; class, intensity and time of one member.
 
     `groups` are its `voxel_groups`, where they are known.
-    Means are rounded to `pipeline.borders.grid.GRID`, so that tiles which know the same points around their border, in
-    the same order (`overlap`), have the same samples there.
+    Means are rounded to `pipeline.tiling.borders.grid.GRID`, so that tiles which know the same points around their
+    border, in the same order (`overlap`), have the same samples there.
     """
-    from scan2sim.pipeline.borders.grid import on_grid
+    from scan2sim.pipeline.tiling.borders.grid import on_grid
 
     if len(cloud) == 0:
         return cloud
@@ -87,7 +87,7 @@ def voxel_groups(xyz: F32, size: float) -> Groups:
     Returns:
         order (N,) int64 into `xyz`, stable within a voxel; starts (V,) int64 into `order`.
     """
-    from scan2sim.pipeline.ordering import first_of_each, ordered
+    from scan2sim.pipeline.geometry.sorting import first_of_each, ordered
 
     code = np.zeros(len(xyz), np.int64)
     for axis, shift in ((2, 0.5), (1, 0.0), (0, 0.0)):

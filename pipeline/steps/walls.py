@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydantic import Field
 
-from scan2sim.pipeline.classes import CODE
-from scan2sim.pipeline.step import Done, Inputs, Report, Step
+from scan2sim.pipeline.core.classes import CODE
+from scan2sim.pipeline.core.step import Done, Inputs, Report, Step
+from scan2sim.pipeline.core.types import F32, F64, PointCloud
 from scan2sim.pipeline.steps.ground import FLAT, MadeUpParams, from_above, near_cell, united
-from scan2sim.pipeline.types import F32, F64, PointCloud
 
 if TYPE_CHECKING:
-    from scan2sim.pipeline.heightfield import Raster
-    from scan2sim.pipeline.outlines import Places
+    from scan2sim.pipeline.buildings.roof_outlines import Places
+    from scan2sim.pipeline.geometry.height_map import Raster
 
 DENSE = 0.2  # metres between points of a wall
 SUNK = 0.3  # metres that walls reach into the ground
@@ -50,8 +50,8 @@ def walls(inputs: Inputs, params: WallsParams, out: Path, report: Report) -> Don
     up of it (`ground`); neighbours' clouds (`building.NAME` and so on) are looked at as by the step `ground`.
     File: `made`, a `PointCloud` with normals.
     """
-    from scan2sim.pipeline.heightfield import Raster, spacing
-    from scan2sim.pipeline.outlines import Places, rings, roofs
+    from scan2sim.pipeline.buildings.roof_outlines import Places, rings, roofs
+    from scan2sim.pipeline.geometry.height_map import Raster, spacing
 
     building = united(inputs, params, "building")
     floor = united(inputs, params, "terrain").xyz
@@ -149,7 +149,7 @@ def _given(inputs: Inputs, building: PointCloud) -> list[F64]:
     """Rings of the footprints, local metres."""
     if "footprints" not in inputs:
         return []
-    from scan2sim.pipeline.io import footprints
+    from scan2sim.pipeline.io.geodata import footprints
 
     return footprints.read(inputs["footprints"], building.frame)
 
@@ -158,7 +158,7 @@ def _apart(places: Places, given: F64) -> Places:
     """The places that no given footprint is beside."""
     from scipy.spatial import cKDTree
 
-    from scan2sim.pipeline.outlines import Places
+    from scan2sim.pipeline.buildings.roof_outlines import Places
 
     far = ~np.isfinite(cKDTree(given).query(places.xy, distance_upper_bound=BESIDE)[0])
     return Places(places.xy[far], places.outward[far], places.side[far])
@@ -168,7 +168,7 @@ def _cloud(xyz: F64, normal: F64, building: PointCloud, params: WallsParams) -> 
     """The made-up points that no real one of the building is near to, and that are the tile's."""
     from scipy.spatial import cKDTree
 
-    from scan2sim.pipeline.borders.grid import on_grid
+    from scan2sim.pipeline.tiling.borders.grid import on_grid
 
     keep = ~np.isfinite(cKDTree(building.xyz).query(xyz, distance_upper_bound=SEEN * DENSE)[0])
     if params.seed is not None:

@@ -1,4 +1,4 @@
-"""Segmentation networks behind one protocol: a file a backend (`pipeline.backends`), found by its name."""
+"""Segmentation networks behind one protocol: a file a backend (`pipeline.core.plugins`), found by its name."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from scan2sim.pipeline import backends
-from scan2sim.pipeline.errors import InputError, SettingError
-from scan2sim.pipeline.types import F32, U8
+from scan2sim.pipeline.core import plugins
+from scan2sim.pipeline.core.errors import InputError, SettingError
+from scan2sim.pipeline.core.types import F32, U8
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class Facts:
         sha256: of the weights' file.
         licence: of the weights, as far as the file tells.
         pixels_a_radian: angular resolution that photos should be resampled to; None: as they are.
-        channels: whether it takes those of `pipeline.channels`, too.
+        channels: whether it takes those of `segmentation.lidar_channels`, too.
     """
 
     name: str
@@ -82,7 +82,7 @@ def check(name: str, weights: Path | None) -> Backend:
         UnavailableError: a package is missing.
         InputError: the weights aren't there.
     """
-    backend: Backend = backends.find(__name__, name, "label.network")
+    backend: Backend = plugins.find(__name__, name, "label.network")
     backend.check(weights)
     return backend
 

@@ -4,7 +4,7 @@ The file has one input, (1, 3, H, W) float RGB, and one output, (1, C, h, w) log
 `metadata_props` may tell, as JSON: "labels", names of the C channels in order (else `<name>.labels.txt` beside it, one
 a line); "mean" and "std" that the input, 1 for white, is normalised with (else ImageNet's); "pixels_a_radian", the
 angular resolution that photos are resampled to (else they are taken as they are); "channels", true if the input is
-(1, 7, H, W), with those of `pipeline.channels` from 0 to 1 after the colours. "license" is told on.
+(1, 7, H, W), with those of `segmentation.lidar_channels` from 0 to 1 after the colours. "license" is told on.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from pathlib import Path
 
 import numpy as np
 
-from scan2sim.pipeline.channels import COUNT
-from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.types import F32, U8
-from scan2sim.segmentation import sessions
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.types import F32, U8
+from scan2sim.segmentation import onnx_session
 from scan2sim.segmentation.backends import Facts, given
 from scan2sim.segmentation.backends.segformer import MEAN, STD, numbers
+from scan2sim.segmentation.lidar_channels import COUNT
 
 NEEDS = ("onnxruntime",)
 REMEDY = "Export the network with one input (1, 3, H, W) of floats and one output (1, C, h, w)"
@@ -44,30 +44,30 @@ class Network:
 
     def __init__(self, path: Path, device: str, backend: str = "onnx") -> None:
         self._path = path
-        self._session = sessions.opened(path, device, "label.device")
+        self._session = onnx_session.opened(path, device, "label.device")
         inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
         if len(inputs) != 1 or len(outputs) != 1:
             names = ", ".join(value.name for value in [*inputs, *outputs])
             raise InputError(path, f"has {len(inputs)} inputs and {len(outputs)} outputs ({names})", REMEDY)
         (given,), (got,) = inputs, outputs
         meta = self._session.get_modelmeta().custom_metadata_map
-        more = bool(sessions.value(meta.get("channels"), False))
+        more = bool(onnx_session.value(meta.get("channels"), False))
         wanted, produced = _sizes(given.shape), _sizes(got.shape)
         fits = len(wanted) == 4 and wanted[0] in (1, None) and wanted[1] in (3 + COUNT * more, None)
-        if given.type not in sessions.FLOATS or not fits:
+        if given.type not in onnx_session.FLOATS or not fits:
             raise InputError(path, f"takes {given.type} of {given.shape}", REMEDY)
-        if got.type not in sessions.FLOATS or (got.shape and len(produced) != 4):
+        if got.type not in onnx_session.FLOATS or (got.shape and len(produced) != 4):
             raise InputError(path, f"gives {got.type} of {got.shape}", REMEDY)
-        self._input, self._type, self._size = given.name, sessions.FLOATS[given.type], wanted[2:]
-        labels = sessions.labels(path, meta)
+        self._input, self._type, self._size = given.name, onnx_session.FLOATS[given.type], wanted[2:]
+        labels = onnx_session.labels(path, meta)
         if got.shape and produced[1] not in (None, len(labels)):
             raise InputError(path, f"gives {produced[1]} channels, but {len(labels)} labels are named", "Name one each")
-        self._mean = numbers(sessions.value(meta.get("mean"), MEAN), 3, path, least=-np.inf)
-        self._std = numbers(sessions.value(meta.get("std"), STD), 3, path)
+        self._mean = numbers(onnx_session.value(meta.get("mean"), MEAN), 3, path, least=-np.inf)
+        self._std = numbers(onnx_session.value(meta.get("std"), STD), 3, path)
         licence = meta.get("license") or "not told"
-        density = sessions.value(meta.get("pixels_a_radian"), None)
+        density = onnx_session.value(meta.get("pixels_a_radian"), None)
         resolution = None if density is None else float(numbers([density], 1, path)[0])
-        self.facts = Facts(f"{backend} ({path.name})", labels, sessions.digest(path), licence, resolution, more)
+        self.facts = Facts(f"{backend} ({path.name})", labels, onnx_session.digest(path), licence, resolution, more)
 
     def probabilities(self, seen: U8) -> F32:
         """See `segmentation.backends.Network`.
@@ -86,7 +86,7 @@ class Network:
         try:
             (out,) = self._session.run(None, {self._input: x.transpose(2, 0, 1)[None].astype(self._type)})
         except Exception as error:  # onnxruntime's errors have no kind in common
-            raise sessions.failure(error, self._path, f"fails on a photo of {width} x {height}", REMEDY) from None
+            raise onnx_session.failure(error, self._path, f"fails on a photo of {width} x {height}", REMEDY) from None
         if out.ndim != 4 or out.shape[:2] != (1, len(self.facts.labels)):
             cause = f"gives {out.shape} for {len(self.facts.labels)} labels"
             raise InputError(self._path, cause, "Name a label for every channel of a (1, C, h, w) output")

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.types import F32, U8
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.types import F32, U8
 from scan2sim.segmentation.backends import Facts, given, torch_device
 
 NEEDS = ("torch", "safetensors", "transformers")

@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from scan2sim.pipeline import extras
-from scan2sim.pipeline.channels import COUNT
-from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.types import F32, U8
+from scan2sim.pipeline.core import optional_deps
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.types import F32, U8
 from scan2sim.segmentation.backends import Facts, given, onnx, torch_device
 from scan2sim.segmentation.backends import Network as AnyNetwork
+from scan2sim.segmentation.lidar_channels import COUNT
 
 if TYPE_CHECKING:
     from scan2sim.segmentation.network import StreetNet
@@ -33,7 +33,7 @@ OPSET = 17
 def check(weights: Path | None) -> None:
     """See `segmentation.backends.Backend`; without weights, the project's own are used."""
     if weights is not None and _is_torchs(weights):
-        extras.need("label.network street", "torch", "safetensors")
+        optional_deps.need("label.network street", "torch", "safetensors")
     if weights is not None:
         given("street", weights)
 
@@ -51,7 +51,7 @@ def _is_torchs(weights: Path) -> bool:
 
 def _has_gpu(device: str) -> bool:
     """Whether torch is here and has a GPU that is wanted."""
-    return device != "cpu" and not extras.missing("torch", "safetensors") and torch_device(device) != "cpu"
+    return device != "cpu" and not optional_deps.missing("torch", "safetensors") and torch_device(device) != "cpu"
 
 
 def save(network: StreetNet, path: Path, metadata: dict[str, object]) -> None:

@@ -14,8 +14,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from scan2sim.pipeline.errors import ScanError, StepError
-from scan2sim.pipeline.step import Report
+from scan2sim.pipeline.core.errors import ScanError, StepError
+from scan2sim.pipeline.core.step import Report
 from scan2sim.services.orchestration import deployment as files
 from scan2sim.services.orchestration.deployment import Deployment, Entry
 from scan2sim.services.orchestration.instance import MARK, Instance, Wanted, next_action

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from scan2sim.pipeline.errors import BusyError, InputError, ScanError, SettingError
+from scan2sim.pipeline.core.errors import BusyError, InputError, ScanError, SettingError
 from scan2sim.services.orchestration import operations, package
 from scan2sim.services.orchestration.instance import Instance
 from scan2sim.services.orchestration.lifecycle import Patience

@@ -8,9 +8,9 @@ from typing import Any
 
 from pydantic import Field, model_validator
 
-from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.step import Params
 from scan2sim.pipeline.io import toml
-from scan2sim.pipeline.step import Params
 from scan2sim.services.orchestration import description
 from scan2sim.services.orchestration.description import Label
 from scan2sim.services.orchestration.instance import Wanted

@@ -10,12 +10,12 @@ from typing import Annotated
 
 from pydantic import Field
 
+from scan2sim.pipeline.core.step import Params
 from scan2sim.pipeline.io import toml
-from scan2sim.pipeline.step import Params
 from scan2sim.services.qos import requirements
 from scan2sim.services.qos.requirements import Environment, Requirements
 
-FOLDER = Path(__file__).parent / "described"
+FOLDER = Path(__file__).parent / "services"
 LABEL = r"^[a-z]([-a-z0-9]{0,39}[a-z0-9])?$"
 """What Kubernetes takes for a name, short enough for OSM to add to it."""
 Label = Annotated[str, Field(pattern=LABEL, json_schema_extra={"range": "a-z, 0-9 and -, up to 41 characters"})]

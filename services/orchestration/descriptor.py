@@ -11,7 +11,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
-from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.core.errors import InputError
 
 Sort = Literal["vnfd", "nsd"]
 SCHEMAS = Path(__file__).parent / "schemas"

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
-from scan2sim.pipeline.errors import StepError
+from scan2sim.pipeline.core.errors import StepError
 from scan2sim.services.orchestration.chart import REPLICAS
 from scan2sim.services.orchestration.sol006 import ASPECT, MEMBER, Kind
 

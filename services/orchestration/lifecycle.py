@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from scan2sim.pipeline.errors import StepError
+from scan2sim.pipeline.core.errors import StepError
 from scan2sim.services.orchestration.instance import DONE, RUNNING, Action, Instance, Wanted, next_action
 from scan2sim.services.orchestration.osm import INSTANCES, PASSING, Osm, Refused, Unsure, pause
 

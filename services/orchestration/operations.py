@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from scan2sim.pipeline.errors import InputError, SettingError
+from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.services.orchestration import onboarding
 from scan2sim.services.orchestration.chart import REPLICAS
 from scan2sim.services.orchestration.descriptor import Descriptor

@@ -16,7 +16,7 @@ from typing import Any
 
 import httpx
 
-from scan2sim.pipeline.errors import SettingError, StepError, UnavailableError, printable
+from scan2sim.pipeline.core.errors import SettingError, StepError, UnavailableError, printable
 from scan2sim.services.orchestration.package import Package
 from scan2sim.services.orchestration.settings import Connection
 

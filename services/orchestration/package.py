@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.core.errors import InputError
 from scan2sim.services.orchestration import chart, descriptor, sol006
 from scan2sim.services.orchestration.description import Description
 from scan2sim.services.orchestration.descriptor import Descriptor

@@ -9,8 +9,8 @@ from fastapi import Body, FastAPI, Request
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import FileResponse
 
-from scan2sim.pipeline.errors import SettingError
-from scan2sim.services import serving
+from scan2sim.pipeline.core.errors import SettingError
+from scan2sim.services.http import factory
 from scan2sim.services.orchestration.catalogue import Catalogue
 from scan2sim.services.orchestration.description import LABEL
 from scan2sim.services.orchestration.osm import Osm
@@ -26,11 +26,11 @@ def application(params: PageParams, catalogue: Catalogue) -> FastAPI:
     Raises:
         InputError: the token can't be read.
     """
-    app = serving.application("Services in OSM", params, alive={}, public=("/",), largest=LARGEST)
+    app = factory.application("Services in OSM", params, alive={}, public=("/",), largest=LARGEST)
 
     @app.get("/", include_in_schema=False)
     def page() -> FileResponse:
-        return FileResponse(serving.PAGES / "orchestration.html")
+        return FileResponse(factory.PAGES / "orchestration.html")
 
     @app.get("/api/services")
     def services() -> dict[str, Any]:
@@ -80,6 +80,6 @@ def serve(params: PageParams, listening: Callable[[str], None]) -> None:
         site(osm)  # refuses a site that isn't there, and a wrong password, before anything is shown
         catalogue = Catalogue(osm, params.packages, site)
         try:
-            serving.run(application(params, catalogue), params, listening)
+            factory.run(application(params, catalogue), params, listening)
         finally:
             catalogue.close()

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from pydantic import BaseModel, ValidationError
 
-from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.core.errors import InputError
 from scan2sim.services.qos.requirements import UNITS, Environment
 
 LARGEST = 1_000_000

@@ -9,13 +9,13 @@ from urllib.parse import urlsplit
 
 from pydantic import Field
 
-from scan2sim.pipeline.errors import InputError, SettingError
-from scan2sim.pipeline.ranges import File
-from scan2sim.pipeline.step import Params
+from scan2sim.pipeline.core.errors import InputError, SettingError
+from scan2sim.pipeline.core.parameters import File
+from scan2sim.pipeline.core.step import Params
 from scan2sim.services.credentials import redacted
+from scan2sim.services.http.settings import Served
 from scan2sim.services.loopback import is_loopback
-from scan2sim.services.monitoring.joined import FollowedParams
-from scan2sim.services.served import Served
+from scan2sim.services.monitoring.settings.bus import FollowedParams
 
 
 class Connection(Params):

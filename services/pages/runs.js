@@ -1,4 +1,4 @@
-// Runs of steps and alarms on the page of the event bus, as the state of /api/live has them (services/monitoring/noticed.py).
+// Runs of steps and alarms on the page of the event bus, as the state of /api/live has them (services/monitoring/dashboard/state.py).
 "use strict";
 
 const details = new Map(); // by run: what the service tells only when it has changed

@@ -6,7 +6,7 @@ import json
 import subprocess
 from typing import Any, Literal, NamedTuple
 
-from scan2sim.pipeline.errors import UnavailableError
+from scan2sim.pipeline.core.errors import UnavailableError
 from scan2sim.services.qos.links import programs
 from scan2sim.services.qos.namespaces import WHAT, Namespace
 

@@ -1,7 +1,7 @@
 """How images are sent so that they fit a link: the quality and scale of JPEGs, or the bit rate of an H.264 stream.
 
 What is counted are the images' own bytes, encoded here, with the overhead of what carries them. What a choice costs in
-accuracy `bench/toolbox_quality.py` measures.
+accuracy `bench/toolboxes/quality.py` measures.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.extras import need
-from scan2sim.pipeline.ranges import File
-from scan2sim.pipeline.step import Params
-from scan2sim.pipeline.types import U8
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.optional_deps import need
+from scan2sim.pipeline.core.parameters import File
+from scan2sim.pipeline.core.step import Params
+from scan2sim.pipeline.core.types import U8
 
 QUALITIES = (90, 85, 80, 75, 70, 65, 60, 55, 50, 45, 40, 35, 30)
 """Of JPEGs, best first; above and below them a byte buys less than in the next scale."""

@@ -20,15 +20,15 @@ import numpy as np
 import psutil
 from pydantic import Field
 
-from scan2sim.pipeline.errors import InputError, StepError
-from scan2sim.pipeline.ranges import File
-from scan2sim.pipeline.step import Params, Report
-from scan2sim.pipeline.types import U8
-from scan2sim.services.qos import encoding, places, robot
+from scan2sim.pipeline.core.errors import InputError, StepError
+from scan2sim.pipeline.core.parameters import File
+from scan2sim.pipeline.core.step import Params, Report
+from scan2sim.pipeline.core.types import U8
+from scan2sim.services.qos import deployment, encoding, robot
+from scan2sim.services.qos.deployment import Places
 from scan2sim.services.qos.encoding import Jpeg
 from scan2sim.services.qos.environments import Network, network
-from scan2sim.services.qos.machine import Machine, Usage, machine
-from scan2sim.services.qos.places import Places
+from scan2sim.services.qos.host_load import Machine, Usage, machine
 from scan2sim.services.qos.probe import Seen
 from scan2sim.services.qos.requirements import Environment, Requirements, Service
 from scan2sim.services.qos.robot import Answers
@@ -123,7 +123,7 @@ def measure(params: MeasureParams, service: Service, report: Report) -> Measured
         StepError: the toolbox doesn't start, or the robot fails.
     """
     between = network(params.environment, params.network)
-    with tempfile.TemporaryDirectory(prefix="scan2sim-qos-") as folder, places.between(between) as ends:
+    with tempfile.TemporaryDirectory(prefix="scan2sim-qos-") as folder, deployment.between(between) as ends:
         chosen = _write_pictures(params, service, between, Path(folder))
         report(0.0, "the toolbox starts")
         with _serving(ends, params.toolbox, Path(folder)) as (server, port):
@@ -194,7 +194,7 @@ def _fitted(image: U8, size: tuple[int, int]) -> U8:
 @contextmanager
 def _serving(ends: Places, toolbox: str, folder: Path) -> Iterator[tuple[subprocess.Popen[Any], int]]:
     """A toolbox that serves, and its port."""
-    local = ends.address == places.Here.address
+    local = ends.address == deployment.Here.address
     token = folder / robot.TOKEN
     token.write_text(secrets.token_hex(32), encoding="utf-8")  # beyond the loopback nothing is served without one
     command = [sys.executable, "-m", "scan2sim.flows.cli", "toolbox", "serve", toolbox, "--host", ends.address]

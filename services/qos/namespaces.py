@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from scan2sim.pipeline.errors import UnavailableError
+from scan2sim.pipeline.core.errors import UnavailableError
 
 WHAT = "a shaped link"
 CLEAR = """

@@ -8,13 +8,13 @@ from typing import Annotated
 
 from pydantic import Field
 
-from scan2sim.pipeline.errors import SettingError
-from scan2sim.pipeline.ranges import File
-from scan2sim.pipeline.step import Params
+from scan2sim.pipeline.core.errors import SettingError
+from scan2sim.pipeline.core.parameters import File
+from scan2sim.pipeline.core.step import Params
+from scan2sim.services.http.settings import Served
 from scan2sim.services.qos.requirements import Environment
-from scan2sim.services.served import Served
-from scan2sim.services.teleoperation.car import CarParams
-from scan2sim.services.teleoperation.control import Address
+from scan2sim.services.teleoperation.gateway.protocol import Address
+from scan2sim.services.teleoperation.vehicle.onboard_unit import CarParams
 
 GATEWAY, STATION = 7443, 7444
 """Ports that are listened on, unless another is named."""

@@ -20,10 +20,10 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from pydantic import BaseModel, Field, ValidationError
 
 from scan2sim import __version__
-from scan2sim.pipeline.errors import InputError, SettingError, printable
-from scan2sim.pipeline.types import U8
-from scan2sim.services import serving
-from scan2sim.services.served import Served
+from scan2sim.pipeline.core.errors import InputError, SettingError, printable
+from scan2sim.pipeline.core.types import U8
+from scan2sim.services.http import factory
+from scan2sim.services.http.settings import Served
 from scan2sim.services.toolboxes import frames
 from scan2sim.services.toolboxes.engine import Engine
 from scan2sim.services.toolboxes.frames import Frame
@@ -70,7 +70,7 @@ def application(engine: Engine, served: Served, cameras: Cameras | None = None) 
     Raises:
         InputError: the token can't be read.
     """
-    app = serving.application(
+    app = factory.application(
         f"scan2sim toolbox {engine.name}",
         served,
         alive={"dispatcher": engine.is_alive},

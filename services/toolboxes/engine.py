@@ -14,16 +14,16 @@ import time
 from collections import Counter
 from dataclasses import dataclass
 
-from scan2sim.pipeline.errors import ScanError, UnavailableError
-from scan2sim.pipeline.types import U8
+from scan2sim.pipeline.core.errors import ScanError, UnavailableError
+from scan2sim.pipeline.core.types import U8
 from scan2sim.services.credentials import redacted
-from scan2sim.services.toolboxes import boxes, frames
-from scan2sim.services.toolboxes.boxes import Facts
-from scan2sim.services.toolboxes.following import Follower
+from scan2sim.services.toolboxes import frames, tasks
+from scan2sim.services.toolboxes.frame_queue import SOURCES, Waiting
 from scan2sim.services.toolboxes.frames import Frame
+from scan2sim.services.toolboxes.per_source_worker import Follower
 from scan2sim.services.toolboxes.results import Body, Result, State, Times
 from scan2sim.services.toolboxes.settings import ToolboxParams
-from scan2sim.services.toolboxes.waiting import SOURCES, Waiting
+from scan2sim.services.toolboxes.tasks import Facts
 from scan2sim.services.toolboxes.worker import Worker, WorkerDied
 
 log = logging.getLogger(__name__)
@@ -64,7 +64,7 @@ class Engine:
         Raises:
             ScanError: it can't be loaded.
         """
-        self.name, self._params, self._box = box, params, boxes.find(box)
+        self.name, self._params, self._box = box, params, tasks.find(box)
         self._box.check(params)
         self.counts: Counter[str] = Counter()
         self._counting, self._closed = threading.Lock(), threading.Event()

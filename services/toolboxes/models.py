@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 
-from scan2sim.pipeline.errors import InputError, SettingError
+from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.services.toolboxes.settings import ToolboxParams
 
 FOLDER = Path(__file__).parent / "weights"

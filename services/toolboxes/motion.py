@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from scan2sim.pipeline.types import F32, F64, U8, Bools
+from scan2sim.pipeline.core.types import F32, F64, U8, Bools
 from scan2sim.services.toolboxes.results import Detection
 
 WIDTH = 640

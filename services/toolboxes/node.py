@@ -6,10 +6,10 @@ import time
 from functools import partial
 from typing import Any
 
-from scan2sim.services.monitoring.bus import Bus
-from scan2sim.services.monitoring.events import QueueState
-from scan2sim.services.monitoring.joined import BusParams
-from scan2sim.services.monitoring.monitor import STRING, Monitor, ros
+from scan2sim.services.monitoring.events.bus import Bus
+from scan2sim.services.monitoring.events.schema import QueueState
+from scan2sim.services.monitoring.node.monitor import STRING, Monitor, ros
+from scan2sim.services.monitoring.settings.bus import BusParams
 from scan2sim.services.toolboxes.engine import Engine
 from scan2sim.services.toolboxes.frames import Frame, Raw
 from scan2sim.services.toolboxes.results import Result, State

@@ -10,10 +10,10 @@ from typing import IO, Any
 
 import numpy as np
 
-from scan2sim.pipeline.io.video import Encoder
-from scan2sim.pipeline.step import Report
-from scan2sim.pipeline.types import U8
-from scan2sim.services.toolboxes import boxes, frames, sources
+from scan2sim.pipeline.core.step import Report
+from scan2sim.pipeline.core.types import U8
+from scan2sim.pipeline.io.images.video import Encoder
+from scan2sim.services.toolboxes import frames, sources, tasks
 from scan2sim.services.toolboxes.engine import Engine
 from scan2sim.services.toolboxes.frames import Frame
 from scan2sim.services.toolboxes.results import Result, State
@@ -81,7 +81,7 @@ class _Pictures:
     """Pictures, or a film, of results."""
 
     def __init__(self, box: str, out: Path, rate: float | None) -> None:
-        self._box, self._out, self._rate = boxes.find(box), out, rate
+        self._box, self._out, self._rate = tasks.find(box), out, rate
         self._film: Encoder | None = None
         self._count = 0
 

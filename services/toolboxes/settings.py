@@ -6,10 +6,10 @@ from typing import Annotated
 
 from pydantic import Field
 
-from scan2sim.pipeline.ranges import Device, File
-from scan2sim.pipeline.step import Params
-from scan2sim.services.monitoring.watched import NodeName, Topic, Watched
-from scan2sim.services.served import Served
+from scan2sim.pipeline.core.parameters import Device, File
+from scan2sim.pipeline.core.step import Params
+from scan2sim.services.http.settings import Served
+from scan2sim.services.monitoring.settings.monitor import NodeName, Topic, Watched
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from scan2sim.pipeline import extras
+from scan2sim.pipeline.core import optional_deps
 from scan2sim.services.toolboxes.results import Detection
 
 NEEDS = ("trackers", "supervision")
@@ -34,7 +34,7 @@ class Tracker:
             lost: seconds for which a track is kept that isn't detected.
             rate: images a second, about.
         """
-        extras.need("following things", *NEEDS)
+        optional_deps.need("following things", *NEEDS)
         from trackers import ByteTrackTracker
 
         self._tracker: Any = ByteTrackTracker(

@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from scan2sim.pipeline.errors import ScanError, StepError
-from scan2sim.pipeline.isolate import die_with_parent
-from scan2sim.pipeline.types import U8
-from scan2sim.services.toolboxes import boxes
-from scan2sim.services.toolboxes.boxes import Facts
+from scan2sim.pipeline.core.errors import ScanError, StepError
+from scan2sim.pipeline.core.sandbox import die_with_parent
+from scan2sim.pipeline.core.types import U8
+from scan2sim.services.toolboxes import tasks
 from scan2sim.services.toolboxes.results import Body
 from scan2sim.services.toolboxes.settings import ToolboxParams
+from scan2sim.services.toolboxes.tasks import Facts
 
 LOADS_WITHIN = 300.0
 """Seconds for a model to be loaded and to answer its first image."""
@@ -110,7 +110,7 @@ def _serve(connection: Connection, box: str, params: ToolboxParams) -> None:
         os.environ["OMP_NUM_THREADS"] = str(params.threads)
     with contextlib.suppress(EOFError, OSError):  # the toolbox has ended
         try:
-            model = boxes.find(box).load(params)
+            model = tasks.find(box).load(params)
             model([PROBE])
         except ScanError as error:
             connection.send(error)
@@ -120,7 +120,7 @@ def _serve(connection: Connection, box: str, params: ToolboxParams) -> None:
             connection.send(_answered(model, connection.recv(), box))
 
 
-def _answered(model: boxes.Model, images: list[U8], box: str) -> list[Body] | ScanError:
+def _answered(model: tasks.Model, images: list[U8], box: str) -> list[Body] | ScanError:
     try:
         return model(images)
     except ScanError as error:

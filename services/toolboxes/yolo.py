@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from scan2sim.pipeline.types import F32, I32, U8
+from scan2sim.pipeline.core.types import F32, I32, U8
 
 GREY = 114
 """Of what fills a letterbox, of 255."""

@@ -10,8 +10,8 @@ import os
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from scan2sim.pipeline import extras
-from scan2sim.pipeline.errors import SettingError
+from scan2sim.pipeline.core import optional_deps
+from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.services.transport.types import Arrival, Endpoint, QoS
 
 CHOICE = "SCAN2SIM_TRANSPORT"
@@ -33,7 +33,7 @@ class Node(Protocol):
     """A node of ROS 2; methods are named as in rclpy, and their arguments mean the same.
 
     `published`, `received` and `unreadable` are called in the thread that sends a message or takes it; a subclass that
-    overrides them sees all that goes through the node (`services.monitoring.monitor`).
+    overrides them sees all that goes through the node (`services.monitoring.node.monitor`).
     """
 
     def __init__(self, node_name: str, *, namespace: str = "/", hidden: bool = False) -> None:
@@ -116,8 +116,8 @@ def load(name: str | None = None) -> Any:
     asked = name or os.environ.get(CHOICE)
     if asked and asked not in NAMES:
         raise SettingError(CHOICE, f"there is no transport {asked!r}", f"Choose one of: {', '.join(NAMES)}")
-    chosen = asked or ("rclpy" if extras.missing("rclpy") is None else "cyclone")
-    extras.need(f"the transport {chosen}", *{"rclpy": ("rclpy",), "cyclone": ("cyclonedds", "rosbags")}[chosen])
+    chosen = asked or ("rclpy" if optional_deps.missing("rclpy") is None else "cyclone")
+    optional_deps.need(f"the transport {chosen}", *{"rclpy": ("rclpy",), "cyclone": ("cyclonedds", "rosbags")}[chosen])
     return importlib.import_module(f"{__name__}.{chosen}")
 
 

@@ -15,7 +15,7 @@ from cyclonedds.idl import types as _types
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from scan2sim.pipeline.errors import SettingError
+from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.services.transport.names import checked_type, dds_type
 
 STORE: Typestore = get_typestore(Stores.ROS2_KILTED)

@@ -10,7 +10,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from scan2sim.pipeline.errors import SettingError
+from scan2sim.pipeline.core.errors import SettingError
 
 TOPIC = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 TopicName = Annotated[

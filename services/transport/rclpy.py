@@ -25,7 +25,7 @@ from rclpy.qos import (
 )
 from rclpy.signals import SignalHandlerOptions
 
-from scan2sim.pipeline.errors import SettingError
+from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.services.transport.cdr import size
 from scan2sim.services.transport.names import checked_type
 from scan2sim.services.transport.types import INFINITE, Arrival, Endpoint, Kind, QoS

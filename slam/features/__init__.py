@@ -1,6 +1,6 @@
 """Features: places in a picture that are found again in another, each with a descriptor.
 
-A file a backend (`pipeline.backends`), found by its name. Backends see pictures, never the sphere:
+A file a backend (`pipeline.core.plugins`), found by its name. Backends see pictures, never the sphere:
 `slam.trackers.descriptors` shows them the facets and makes bearings of what they find.
 """
 
@@ -12,9 +12,9 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from scan2sim.pipeline import backends
-from scan2sim.pipeline.errors import SettingError
-from scan2sim.pipeline.types import F32, U8
+from scan2sim.pipeline.core import plugins
+from scan2sim.pipeline.core.errors import SettingError
+from scan2sim.pipeline.core.types import F32, U8
 
 
 class Found(NamedTuple):
@@ -75,7 +75,7 @@ def named(
         UnavailableError: it can't run here.
         InputError: the weights are damaged, of another network, or unsafe to read.
     """
-    backend: Backend = backends.find(__name__, name, "track.features")
+    backend: Backend = plugins.find(__name__, name, "track.features")
     return backend.load(weights, count, upsample, device)
 
 

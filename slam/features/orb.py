@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scan2sim.pipeline.types import F64, I64, U8
+from scan2sim.pipeline.core.types import F64, I64, U8
 from scan2sim.slam.features import Found, enlarged, no_weights, reduced, unmasked
 
 THRESHOLD = 7

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scan2sim.pipeline.types import U8
+from scan2sim.pipeline.core.types import U8
 from scan2sim.slam.features import Found, enlarged, no_weights, reduced, unmasked
 
 CONTRAST = 0.02

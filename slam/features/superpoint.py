@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from scan2sim.pipeline.types import U8
+from scan2sim.pipeline.core.types import U8
 from scan2sim.slam import weights as files
 from scan2sim.slam.features import Found, enlarged, reduced, unmasked
 

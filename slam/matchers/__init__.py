@@ -1,4 +1,4 @@
-"""Matchers: which features of two pictures are the same. A file a backend (`pipeline.backends`), found by its name."""
+"""Matchers of features between two images: one file for each backend, found by its name (`pipeline.core.plugins`)."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from scan2sim.pipeline import backends
-from scan2sim.pipeline.errors import SettingError
-from scan2sim.pipeline.types import I64
+from scan2sim.pipeline.core import plugins
+from scan2sim.pipeline.core.errors import SettingError
+from scan2sim.pipeline.core.types import I64
 from scan2sim.slam.features import Features, Found
 from scan2sim.slam.weights import Weights
 
@@ -92,7 +92,7 @@ def named(name: str, weights: Path | None = None, *, device: str = "auto") -> Ma
         UnavailableError: it can't run here.
         InputError: the weights are damaged, of another network, or unsafe to read.
     """
-    backend: Backend = backends.find(__name__, name, "track.matcher")
+    backend: Backend = plugins.find(__name__, name, "track.matcher")
     return backend.load(weights, device)
 
 

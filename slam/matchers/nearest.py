@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from scan2sim.pipeline.types import I64, Bools
+from scan2sim.pipeline.core.types import I64, Bools
 from scan2sim.slam.features import Found, no_weights
 from scan2sim.slam.matchers import Sizes
 

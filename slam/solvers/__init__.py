@@ -1,11 +1,11 @@
-"""What solves the graph of cameras and points: a file a backend (`pipeline.backends`), found by its name."""
+"""What solves the graph of cameras and points: a file a backend (`pipeline.core.plugins`), found by its name."""
 
 from __future__ import annotations
 
 from typing import Protocol
 
-from scan2sim.pipeline import backends
-from scan2sim.slam.graph import Graph, Solution
+from scan2sim.pipeline.core import plugins
+from scan2sim.slam.mapping.factor_graph import Graph, Solution
 
 
 class Solver(Protocol):
@@ -22,5 +22,5 @@ def named(name: str) -> Solver:
         SettingError: there is none of that name.
         UnavailableError: it can't run here.
     """
-    solver: Solver = backends.find(__name__, name, "track.backend")
+    solver: Solver = plugins.find(__name__, name, "track.backend")
     return solver

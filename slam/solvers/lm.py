@@ -12,9 +12,9 @@ import math
 import numpy as np
 from numba import njit
 
-from scan2sim.pipeline.types import F64, I32, I64, Bools
+from scan2sim.pipeline.core.types import F64, I32, I64, Bools
 from scan2sim.slam.geometry import exp_so3
-from scan2sim.slam.graph import Factor, Graph, Solution
+from scan2sim.slam.mapping.factor_graph import Factor, Graph, Solution
 
 ITERATIONS = 8
 ENOUGH = 1e-4

@@ -1,1 +1,1 @@
-"""The steps from a video to a trajectory (D3.2, section 4.1), a file each; `flows/recipes/video.py` chains them."""
+"""The steps from a video to a trajectory (D3.2, section 4.1), a file each; `flows/pipelines/video.py` chains them."""

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from scan2sim.pipeline.extras import need
-from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.slam.adjust import adjust
-from scan2sim.slam.mapped import Mapped
+from scan2sim.pipeline.core.optional_deps import need
+from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.slam.mapping.global_adjustment import adjust
+from scan2sim.slam.mapping.map_file import Mapped
 
 
 def adjust_all(inputs: Inputs, params: Params, out: Path, report: Report) -> Done:

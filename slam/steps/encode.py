@@ -7,11 +7,11 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from scan2sim.pipeline.extras import need
-from scan2sim.pipeline.ranges import Rate
-from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.slam.encoding import encode
+from scan2sim.pipeline.core.optional_deps import need
+from scan2sim.pipeline.core.parameters import Rate
+from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.slam.video import open_video
+from scan2sim.slam.video_degradation import encode
 
 Pixels = Annotated[int, Field(ge=2, le=100_000, multiple_of=2)]
 

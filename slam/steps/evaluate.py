@@ -8,10 +8,10 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
+from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.types import GpsTrack, Trajectory
 from scan2sim.pipeline.io import trajectory as trajectory_io
-from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.types import GpsTrack, Trajectory
-from scan2sim.slam.evaluate import SEGMENT, evaluate, read_truth
+from scan2sim.slam.trajectory.evaluate import SEGMENT, evaluate, read_truth
 
 LOST = 0.5
 """Of the way: where more was bridged than this, nothing is measured."""

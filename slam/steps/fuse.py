@@ -9,19 +9,19 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
-from scan2sim.pipeline.errors import DataError, InputError
-from scan2sim.pipeline.io import crs as crs_io
+from scan2sim.pipeline.camera.poses import interpolate
+from scan2sim.pipeline.core.errors import DataError, InputError
+from scan2sim.pipeline.core.parameters import Shift
+from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.types import F64, Frame, GpsTrack, Trajectory
+from scan2sim.pipeline.importers import sweeps as io
 from scan2sim.pipeline.io import gps as gps_io
-from scan2sim.pipeline.io import sweeps as io
-from scan2sim.pipeline.poses import interpolate
-from scan2sim.pipeline.ranges import Shift
-from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.types import F64, Frame, GpsTrack, Trajectory
-from scan2sim.slam import output
-from scan2sim.slam.fusion import BELIEVED, Fixes, Fused, Steps, camera_steps, fuse, lidar_steps
-from scan2sim.slam.gps import smooth
-from scan2sim.slam.lidar import Matched
-from scan2sim.slam.scale import MEMORY, SLOW
+from scan2sim.pipeline.io.geodata import crs as crs_io
+from scan2sim.slam.lidar_odometry import Matched
+from scan2sim.slam.trajectory import output
+from scan2sim.slam.trajectory.fusion import BELIEVED, Fixes, Fused, Steps, camera_steps, fuse, lidar_steps
+from scan2sim.slam.trajectory.gps import smooth
+from scan2sim.slam.trajectory.scale import MEMORY, SLOW
 
 SMOOTHED = 2.0
 """Seconds of a track that was smoothed whose scatter is the same."""
@@ -37,7 +37,7 @@ class FuseParams(Params):
     """How the sensors belong together.
 
     Attributes:
-        scanner_poses, time_offset, crs: as of `pipeline.io.sweeps.Placing`.
+        scanner_poses, time_offset, crs: as of `pipeline.importers.sweeps.Placing`.
         gps_offset: seconds to add to GPS's times: to the clock of the trajectory, or of the sweeps.
     """
 

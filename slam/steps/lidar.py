@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
-from scan2sim.pipeline.errors import DataError, InputError
-from scan2sim.pipeline.extras import need
-from scan2sim.pipeline.io import sweeps as io
-from scan2sim.pipeline.ranges import Metres
-from scan2sim.pipeline.step import Done, Inputs, Report, Step
-from scan2sim.pipeline.types import F64
-from scan2sim.slam.lidar import FIRST, OVERLAP, REACH, LidarOdometry, Measured, begun
-from scan2sim.slam.state import WrongState, load, save
+from scan2sim.pipeline.core.errors import DataError, InputError
+from scan2sim.pipeline.core.optional_deps import need
+from scan2sim.pipeline.core.parameters import Metres
+from scan2sim.pipeline.core.step import Done, Inputs, Report, Step
+from scan2sim.pipeline.core.types import F64
+from scan2sim.pipeline.importers import sweeps as io
+from scan2sim.slam.lidar_odometry import FIRST, OVERLAP, REACH, LidarOdometry, Measured, begun
+from scan2sim.slam.odometry.checkpoint import WrongState, load, save
 
 KEEP_EVERY = 60.0
 """Seconds between states kept."""

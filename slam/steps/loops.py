@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from scan2sim.pipeline.ranges import Rate
-from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.slam.facets import Facets
-from scan2sim.slam.loops import Places, close
-from scan2sim.slam.mapped import Mapped
+from scan2sim.pipeline.core.parameters import Rate
+from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.slam.mapping.loop_closure import Places, close
+from scan2sim.slam.mapping.map_file import Mapped
+from scan2sim.slam.odometry.virtual_cameras import Facets
 from scan2sim.slam.video import open_video
 
 

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.slam import output
-from scan2sim.slam.finish import finish
-from scan2sim.slam.mapped import Mapped
-from scan2sim.slam.sparse import sparse_map
+from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.slam.mapping.map_file import Mapped
+from scan2sim.slam.mapping.sparse_model import sparse_map
+from scan2sim.slam.trajectory import output
+from scan2sim.slam.trajectory.align import finish
 
 
 class PlaceParams(Params):

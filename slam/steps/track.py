@@ -9,25 +9,26 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from scan2sim.pipeline import backends
-from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.extras import need
+from scan2sim.pipeline.core import plugins
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.optional_deps import need
+from scan2sim.pipeline.core.parameters import Focal, Pixels, Rate, Shift
+from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.types import U8, Camera, GpsTrack
 from scan2sim.pipeline.io import gps as gps_io
-from scan2sim.pipeline.io import image
-from scan2sim.pipeline.ranges import Focal, Pixels, Rate, Shift
-from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.types import U8, Camera, GpsTrack
-from scan2sim.slam import calibrate, features, lens, matchers, solvers, trackers
-from scan2sim.slam.camera import Found, camera_of, found
-from scan2sim.slam.facets import Facets
-from scan2sim.slam.gps import smooth
-from scan2sim.slam.mapped import Mapped
-from scan2sim.slam.odometry import Odometry, OdometryParams
-from scan2sim.slam.recording import Recording, record
-from scan2sim.slam.track import VERSION, track
+from scan2sim.pipeline.io.images import image
+from scan2sim.slam import features, matchers, solvers, trackers
+from scan2sim.slam.calibration import calibrate, lens
+from scan2sim.slam.calibration.camera import Found, camera_of, found
+from scan2sim.slam.mapping.map_file import Mapped
+from scan2sim.slam.odometry.odometry import Odometry, OdometryParams
+from scan2sim.slam.odometry.track_log import Recording, record
+from scan2sim.slam.odometry.video_odometry import VERSION, track
+from scan2sim.slam.odometry.virtual_cameras import Facets
 from scan2sim.slam.trackers import Tracker
+from scan2sim.slam.tracking_video import Recorder
+from scan2sim.slam.trajectory.gps import smooth
 from scan2sim.slam.video import Video, open_video
-from scan2sim.slam.view import Recorder
 
 
 class Filmed(Params):
@@ -114,8 +115,8 @@ def can_track(params: TrackParams) -> None:
     """Raise a ScanError for backends that don't exist, or can't run here."""
     solvers.named(params.backend)
     if params.features != "corners":
-        backends.find(features.__name__, params.features, "track.features")
-        backends.find(matchers.__name__, params.matcher, "track.matcher")
+        plugins.find(features.__name__, params.features, "track.features")
+        plugins.find(matchers.__name__, params.matcher, "track.matcher")
     if params.view:
         need("--view", "av")
 

@@ -1,4 +1,4 @@
-"""Trackers: what follows features from frame to frame. A file a backend (`pipeline.backends`), found by its name."""
+"""Trackers of features through frames: one file for each backend, found by its name (`pipeline.core.plugins`)."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from typing import Protocol
 
 import numpy as np
 
-from scan2sim.pipeline import backends
-from scan2sim.pipeline.types import F64, I64, U8, Bools
-from scan2sim.slam.facets import Facets
+from scan2sim.pipeline.core import plugins
+from scan2sim.pipeline.core.types import F64, I64, U8, Bools
 from scan2sim.slam.features import Features
 from scan2sim.slam.matchers import Matcher
+from scan2sim.slam.odometry.virtual_cameras import Facets
 
 
 @dataclass
@@ -90,5 +90,5 @@ def named(
         SettingError: there is none of that name, or it lacks features or a matcher, or they don't fit.
         UnavailableError: it can't run here.
     """
-    backend: Backend = backends.find(__name__, name, "slam.tracker")
+    backend: Backend = plugins.find(__name__, name, "slam.tracker")
     return backend.load(facets, mask, count, features, matcher)

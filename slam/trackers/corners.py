@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from scan2sim.pipeline.types import F32, F64, I64, U8
-from scan2sim.slam import exposure
-from scan2sim.slam.facets import Facets
-from scan2sim.slam.patches import Patches
+from scan2sim.pipeline.core.types import F32, F64, I64, U8
+from scan2sim.slam.odometry import exposure
+from scan2sim.slam.odometry.patch_alignment import Patches
+from scan2sim.slam.odometry.virtual_cameras import Facets
 from scan2sim.slam.trackers import Tracks
 
 WINDOW, FINE = 17, 9

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from scan2sim.pipeline.errors import SettingError
-from scan2sim.pipeline.types import F32, F64, I64, U8, Bools
-from scan2sim.slam import exposure
-from scan2sim.slam.facets import Facets
+from scan2sim.pipeline.core.errors import SettingError
+from scan2sim.pipeline.core.types import F32, F64, I64, U8, Bools
 from scan2sim.slam.features import Features, Found
 from scan2sim.slam.matchers import Matcher, check
+from scan2sim.slam.odometry import exposure
+from scan2sim.slam.odometry.virtual_cameras import Facets
 from scan2sim.slam.trackers import Tracker, Tracks
 from scan2sim.slam.trackers.corners import FINE, RETURN, SPACING, WINDOW, CornerTracker, flow
 

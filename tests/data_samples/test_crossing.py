@@ -13,7 +13,7 @@ from scan2sim.data_samples import crossing
 from scan2sim.data_samples.crossing_traffic import STANDS, STEP
 from scan2sim.data_samples.stage import View as Placed
 from scan2sim.data_samples.stage import turned
-from scan2sim.pipeline.types import Bools
+from scan2sim.pipeline.core.types import Bools
 
 
 @pytest.fixture(scope="module")

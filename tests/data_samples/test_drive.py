@@ -16,8 +16,8 @@ from scan2sim.data_samples.planner import PLOT
 from scan2sim.data_samples.scene import srgb
 from scan2sim.data_samples.town import Town, build
 from scan2sim.data_samples.traffic import Traffic
-from scan2sim.pipeline.errors import SettingError
-from scan2sim.pipeline.types import F64, Camera, Trajectory
+from scan2sim.pipeline.core.errors import SettingError
+from scan2sim.pipeline.core.types import F64, Camera, Trajectory
 
 H = 128
 CAMERA = Camera("equirectangular", 2 * H, H)

@@ -9,7 +9,7 @@ from scan2sim.data_samples.crossing import looking
 from scan2sim.data_samples.paints import ROAD, VEHICLE, Material, Paint
 from scan2sim.data_samples.shapes import box, join
 from scan2sim.data_samples.stage import Actor, Backdrop, Body, Light, Piece, Stage, middle, wider
-from scan2sim.pipeline.types import Camera
+from scan2sim.pipeline.core.types import Camera
 
 SIZE = (160, 120)
 CAMERA = Camera("pinhole", *SIZE, 200.0, 200.0, 79.5, 59.5)

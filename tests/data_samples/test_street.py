@@ -15,11 +15,11 @@ from scan2sim.data_samples.photos import Effects, directions
 from scan2sim.data_samples.scanner import plan_drive, scan
 from scan2sim.data_samples.scene import Scene
 from scan2sim.data_samples.street import generate
-from scan2sim.pipeline.classes import CODE
-from scan2sim.pipeline.errors import SettingError
+from scan2sim.pipeline.core.classes import CODE
+from scan2sim.pipeline.core.errors import SettingError
+from scan2sim.pipeline.core.types import Camera, Mesh, PointCloud, Tile
 from scan2sim.pipeline.io import clouds
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.pipeline.types import Camera, Mesh, PointCloud, Tile
 
 LENGTH, POINTS, PHOTOS, WIDTH = 10.0, 20_000, 4, 320
 

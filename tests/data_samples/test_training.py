@@ -13,10 +13,10 @@ from scan2sim.data_samples.layout import lay_out
 from scan2sim.data_samples.scene import Scene
 from scan2sim.data_samples.training import street
 from scan2sim.data_samples.variety import varied
-from scan2sim.pipeline.channels import FRACTION
-from scan2sim.pipeline.classes import CODE
-from scan2sim.segmentation.labelled import pairs, read_channels
+from scan2sim.pipeline.core.classes import CODE
 from scan2sim.segmentation.labels import CLASSES
+from scan2sim.segmentation.lidar_channels import FRACTION
+from scan2sim.segmentation.training.dataset import pairs, read_channels
 
 
 @pytest.fixture(scope="module")

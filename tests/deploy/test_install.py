@@ -11,8 +11,8 @@ from types import ModuleType
 
 import pytest
 
-from scan2sim.pipeline import libraries
-from scan2sim.pipeline.errors import UnavailableError
+from scan2sim.pipeline.core import system_libs
+from scan2sim.pipeline.core.errors import UnavailableError
 from tests.conftest import ROOT
 
 USB = {"libusb-1.0.so.0": "libusb-1.0-0"}
@@ -37,7 +37,7 @@ def commands(folder: Path, monkeypatch: pytest.MonkeyPatch, **scripts: str) -> N
 
 
 def lacking_usb(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(libraries, "loads", lambda name: name not in USB)
+    monkeypatch.setattr(system_libs, "loads", lambda name: name not in USB)
 
 
 def test_the_missing_library_and_its_package_are_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -45,16 +45,16 @@ def test_the_missing_library_and_its_package_are_named(monkeypatch: pytest.Monke
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
     commands(tmp_path, monkeypatch, **{"apt-get": ""})
     with pytest.raises(UnavailableError) as caught:
-        libraries.check()
+        system_libs.check()
     assert caught.value.where == "libusb-1.0.so.0"
     assert caught.value.remedy == "Run: sudo apt-get install --no-install-recommends libusb-1.0-0"
     (tmp_path / "apt-get").rename(tmp_path / "dnf")
-    assert libraries.command(USB) == "sudo dnf install 'libusb-1.0.so.0()(64bit)'"
+    assert system_libs.command(USB) == "sudo dnf install 'libusb-1.0.so.0()(64bit)'"
 
 
 def test_a_run_says_so_before_it_starts(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, small_street: Path) -> None:
     from scan2sim.flows.commands.run import run_tile
-    from scan2sim.flows.recipes.settings import Settings
+    from scan2sim.flows.pipelines.settings import Settings
 
     lacking_usb(monkeypatch)
     with pytest.raises(UnavailableError, match=r"libusb-1\.0\.so\.0"):
@@ -84,7 +84,7 @@ def test_what_may_be_installed_is_said_and_installed(
 ) -> None:
     requests = tmp_path / "asked"
     monkeypatch.setattr(os, "geteuid", lambda: 0 if root else 1000)
-    monkeypatch.setattr(libraries, "loads", lambda name: name not in USB or requests.exists())
+    monkeypatch.setattr(system_libs, "loads", lambda name: name not in USB or requests.exists())
     scripts = {"apt-get": f'echo "$@" >> {requests}', "env": 'shift; exec "$@"', "sudo": 'shift; "$@"'}
     commands(tmp_path, monkeypatch, **scripts)
     install.install_system_packages(USB)
@@ -119,12 +119,12 @@ def test_no_python_at_all_is_told() -> None:
 
 
 def test_packages_txt_holds_the_packages_of_all_libraries() -> None:
-    assert set((ROOT / "packages.txt").read_text(encoding="utf-8").split()) == set(libraries.PACKAGE_OF.values())
+    assert set((ROOT / "packages.txt").read_text(encoding="utf-8").split()) == set(system_libs.PACKAGE_OF.values())
 
 
 def test_every_shared_object_of_every_wheel_finds_its_libraries() -> None:
     pytest.importorskip("elftools")
-    from bench.libraries import needed, nowhere
+    from bench.packaging.libraries import needed, nowhere
 
     count, wanted = needed(Path(sys.prefix))
     assert count > 50 and "libusb-1.0.so.0" in wanted
@@ -132,7 +132,7 @@ def test_every_shared_object_of_every_wheel_finds_its_libraries() -> None:
 
 
 def test_a_library_of_this_machine_alone_is_noticed() -> None:
-    from bench.libraries import nowhere
+    from bench.packaging.libraries import nowhere
 
     wanted = {"libusb-1.0.so.0": ["a.so"], "libc.so.6": ["a.so"], "libpython3.so": ["a.so"], "libcuda.so.1": ["b.so"]}
     assert nowhere(wanted) == {"libpython3.so": ["a.so"]}

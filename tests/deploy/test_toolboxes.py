@@ -18,14 +18,14 @@ import pytest
 from packaging.utils import canonicalize_name
 from PIL import Image
 
-from bench.containers import FOLDER, entry_point, image, requirements, stages
-from bench.third_party import closure
-from scan2sim.services.toolboxes import boxes
+from bench.packaging.containers import FOLDER, entry_point, image, requirements, stages
+from bench.packaging.third_party import closure
+from scan2sim.services.toolboxes import tasks
 from tests.conftest import ROOT
-from tests.ports import free_port
+from tests.fakes.ports import free_port
 
 FILES = sorted(FOLDER.glob("*.Dockerfile"))
-BOXES = boxes.names()
+BOXES = tasks.names()
 TOKEN = "0123456789abcdef"
 SCAN2SIM = "import sys; from scan2sim.flows.cli import main; sys.argv[0] = 'scan2sim'; main()"
 
@@ -58,7 +58,7 @@ def running(packages: Path, *arguments: str) -> Iterator[subprocess.Popen[str]]:
 
 def healthy(address: str) -> int:
     """As an image's HEALTHCHECK asks, in a Python that has no packages."""
-    command = [sys.executable, "-S", "-m", "scan2sim.services.ready", address]
+    command = [sys.executable, "-S", "-m", "scan2sim.services.http.healthcheck", address]
     return subprocess.run(command, env={"PYTHONPATH": str(ROOT)}).returncode
 
 
@@ -98,7 +98,7 @@ def test_images_run_as_nobody_special_and_tell_their_health(box: str) -> None:
     parts = image(FOLDER / f"{box}.Dockerfile")
     users = [user for part in parts for user in part.said("USER")]
     assert users[-1] == "scan2sim" and any("useradd" in rest and users[-1] in rest for rest in parts[1].said("RUN"))
-    assert parts[-1].said("HEALTHCHECK")[0].endswith('CMD ["python", "-m", "scan2sim.services.ready"]')
+    assert parts[-1].said("HEALTHCHECK")[0].endswith('CMD ["python", "-m", "scan2sim.services.http.healthcheck"]')
     assert parts[0].base == parts[1].base == "python:3.11-slim" and parts[1].said("EXPOSE") == ["8080"]
     assert entry_point(FOLDER / f"{box}.Dockerfile")[:6] == ["scan2sim", "toolbox", "serve", box, "--host", "0.0.0.0"]
 
@@ -115,7 +115,7 @@ def test_requirements_are_pinned_and_light() -> None:
 def models(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """As the stage of `classify` makes it."""
     pytest.importorskip("efficientnet_lite_pytorch", reason="the extra toolboxes isn't installed")
-    from scan2sim.services.toolboxes.networks import imagenet
+    from scan2sim.services.toolboxes.detector import imagenet
 
     folder = tmp_path_factory.mktemp("models")
     imagenet.export(folder / "efficientnet-lite0.onnx")

@@ -16,15 +16,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bench.bus_broker import Broker
-from scan2sim.pipeline.classes import GROUPS, group_of
-from scan2sim.pipeline.io import geotiff
+from scan2sim.pipeline.core.classes import GROUPS, group_of
+from scan2sim.pipeline.core.types import Frame, Mesh, PointCloud
 from scan2sim.pipeline.io.clouds import las
+from scan2sim.pipeline.io.geodata import geotiff
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.pipeline.types import Frame, Mesh, PointCloud
 from scan2sim.services import kafka
 from tests.browser import chromium
 from tests.conftest import ROOT
+from tests.fakes.broker import Broker
 from tests.gazebo.checker import check_world
 
 SHOWN = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(true))))"

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.classes import CODE, GROUPS, group_of
-from scan2sim.pipeline.corridor import CutParams, cut_survey
+from scan2sim.pipeline.core.classes import CODE, GROUPS, group_of
+from scan2sim.pipeline.core.types import Bools
 from scan2sim.pipeline.io.survey import read_survey
-from scan2sim.pipeline.types import Bools
+from scan2sim.pipeline.tiling.cut_corridor import CutParams, cut_survey
 from tests.flows.tiny import COARSE, keep_points, loaded, points, scan2sim, tiny
 
 EVERYTHING = COARSE | {"split": {"vegetation": "both", "vehicles": "keep"}}

@@ -21,16 +21,16 @@ import pytest
 import scan2sim
 from scan2sim.flows.engine.dispatch import dispatch
 from scan2sim.flows.engine.execution import execute, run_to_world
-from scan2sim.flows.engine.frontier import Outcome
 from scan2sim.flows.engine.lock import locked
-from scan2sim.flows.engine.node import run_node
 from scan2sim.flows.engine.planning import Planned, Reason, plan
+from scan2sim.flows.engine.ready_queue import Outcome
+from scan2sim.flows.engine.run_task import run_node
 from scan2sim.flows.engine.versions import APART, check_version, versions
-from scan2sim.flows.recipes.graph import Node, NodeId, Output
-from scan2sim.pipeline.errors import BusyError, DataError, ScanError, StepError, UnavailableError
-from scan2sim.pipeline.extras import EXTRA_OF
-from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.store import Digests, Manifest, Store, _seal, digest
+from scan2sim.flows.pipelines.graph import Node, NodeId, Output
+from scan2sim.pipeline.core.cache import Digests, Manifest, Store, _seal, digest
+from scan2sim.pipeline.core.errors import BusyError, DataError, ScanError, StepError, UnavailableError
+from scan2sim.pipeline.core.optional_deps import EXTRA_OF
+from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from tests.conftest import ROOT
 from tests.flows.toy import chain
 
@@ -328,7 +328,7 @@ def test_a_bug_and_a_killed_process_become_step_errors(run: Run) -> None:
 def test_whatever_ends_a_run_nothing_but_its_message_is_shown(tmp_path: Path, source: Path, how: str) -> None:
     script = (
         "import sys; from pathlib import Path; from scan2sim.flows.engine.execution import *\n"
-        "from scan2sim.flows.engine.planning import *; from scan2sim.pipeline.errors import *\n"
+        "from scan2sim.flows.engine.planning import *; from scan2sim.pipeline.core.errors import *\n"
         "from tests.flows.toy import chain\n"
         f"p, does = Path({str(tmp_path)!r}), {'hang' if how == 'SIGINT' else how!r}\n"
         "store = Store(p / 'store')\n"

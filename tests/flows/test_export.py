@@ -11,10 +11,10 @@ from typer.testing import CliRunner
 
 from scan2sim.flows.cli import app
 from scan2sim.flows.commands.budget import parse
-from scan2sim.pipeline.errors import InputError, SettingError
-from scan2sim.pipeline.io import scenes
-from scan2sim.pipeline.types import Frame
-from tests.pipeline import made_up
+from scan2sim.pipeline.core.errors import InputError, SettingError
+from scan2sim.pipeline.core.types import Frame
+from scan2sim.pipeline.io import world_formats
+from tests.pipeline import synthetic
 from tests.pipeline.io.test_robots import driven
 
 
@@ -30,14 +30,14 @@ def files(folder: Path) -> dict[str, bytes]:
 
 
 def test_it_writes_what_the_pipeline_writes(tmp_path: Path) -> None:
-    world = made_up.world(tmp_path).files["world"]
+    world = synthetic.world(tmp_path).files["world"]
     run(world, "--to", "gazebo,glb", "--out", tmp_path / "out")
     own = {name: data for name, data in files(world).items() if not name.startswith("scene/")}
     assert files(tmp_path / "out") == own
 
 
 def test_what_is_there_is_never_destroyed(tmp_path: Path) -> None:
-    world = made_up.world(tmp_path).files["world"]
+    world = synthetic.world(tmp_path).files["world"]
     out = tmp_path / "out"
     out.mkdir()
     (out / "mine.txt").write_text("mine", encoding="utf-8")
@@ -51,18 +51,18 @@ def test_what_is_there_is_never_destroyed(tmp_path: Path) -> None:
 
 
 def test_formats_that_there_are_not_are_told_with_those_that_there_are(tmp_path: Path) -> None:
-    world = made_up.world(tmp_path).files["world"]
+    world = synthetic.world(tmp_path).files["world"]
     for to in ("unreal", "glb,unreal", ","):
         with pytest.raises(SettingError) as caught:
             run(world, "--to", to, "--out", tmp_path / "out")
-        assert all(name in caught.value.remedy for name in scenes.known())
+        assert all(name in caught.value.remedy for name in world_formats.known())
     assert not (tmp_path / "out").exists()
     with pytest.raises(InputError, match="holds no world"):
         run(tmp_path / "tile", "--to", "glb", "--out", tmp_path / "out")
 
 
 def test_a_world_without_a_crs_is_told_of(tmp_path: Path) -> None:
-    world = made_up.world(tmp_path, frame=Frame()).files["world"]
+    world = synthetic.world(tmp_path, frame=Frame()).files["world"]
     assert "has no CRS" in run(world, "--to", "glb", "--out", tmp_path / "out")
 
 
@@ -73,7 +73,7 @@ def test_budgets_that_are_none_are_told(tmp_path: Path, text: str) -> None:
 
 
 def test_a_world_is_written_within_a_budget(tmp_path: Path) -> None:
-    world = made_up.world(tmp_path).files["world"]
+    world = synthetic.world(tmp_path).files["world"]
     run(world, "--to", "glb", "--out", tmp_path / "out", "--budget", "triangles=1k,texture=0.1MP")
     groups = json.loads((tmp_path / "out" / "metadata.json").read_text(encoding="utf-8"))["groups"].values()
     assert 500 < sum(group["triangles"] for group in groups) <= 1050
@@ -83,21 +83,21 @@ def test_a_world_is_written_within_a_budget(tmp_path: Path) -> None:
 def test_a_world_whose_borders_need_more_than_its_budget_is_told_of(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(made_up, "ground", partial(made_up.ground, 300))  # 1,200 edges all around
-    world = made_up.world(tmp_path).files["world"]
+    monkeypatch.setattr(synthetic, "ground", partial(synthetic.ground, 300))  # 1,200 edges all around
+    world = synthetic.world(tmp_path).files["world"]
     said = run(world, "--to", "glb", "--out", tmp_path / "out", "--budget", "triangles=1k")
     assert "where its surfaces end they are kept" in said
 
 
 def test_a_robot_is_put_into_a_world_within_a_budget(tmp_path: Path) -> None:
-    driven(made_up.scene(tmp_path, tiles=1))
+    driven(synthetic.scene(tmp_path, tiles=1))
     run(tmp_path, "--to", "urdf", "--out", tmp_path / "out", "--robot", "--budget", "triangles=1k")
     assert json.loads((tmp_path / "out" / "metadata.json").read_text(encoding="utf-8"))["robot"]["on"] == "path"
     assert (tmp_path / "out" / "robot.urdf").is_file()
 
 
 def test_3d_tiles_come_in_levels_of_detail(tmp_path: Path) -> None:
-    world = made_up.world(tmp_path).files["world"]
+    world = synthetic.world(tmp_path).files["world"]
     run(world, "--to", "tiles3d", "--out", tmp_path / "out", "--levels", 2)
     tileset = json.loads((tmp_path / "out" / "tileset.json").read_text(encoding="utf-8"))
     coarse, (fine,) = tileset["root"], tileset["root"]["children"]

@@ -9,11 +9,11 @@ import pytest
 
 from scan2sim.flows.engine.execution import execute
 from scan2sim.flows.engine.planning import Reason, plan
-from scan2sim.flows.recipes.graph import Node, NodeId, Output, needed
-from scan2sim.flows.recipes.settings import Settings
-from scan2sim.flows.recipes.tile import STEPS, recipe
+from scan2sim.flows.pipelines.graph import Node, NodeId, Output, needed
+from scan2sim.flows.pipelines.settings import Settings
+from scan2sim.flows.pipelines.tile import STEPS, recipe
+from scan2sim.pipeline.core.cache import Store
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.pipeline.store import Store
 
 FILE = '''
 """Lift: the cloud, so many metres higher."""
@@ -22,8 +22,8 @@ from dataclasses import replace
 
 from pydantic import Field
 
-from scan2sim.pipeline.step import Done, Params, Step
-from scan2sim.pipeline.types import PointCloud
+from scan2sim.pipeline.core.step import Done, Params, Step
+from scan2sim.pipeline.core.types import PointCloud
 
 
 class LiftParams(Params):

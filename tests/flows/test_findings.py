@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from scan2sim.flows.commands.shown import WORST, show_findings
+from scan2sim.flows.commands.run_with_progress import WORST, show_findings
 from scan2sim.flows.reports.findings import findings
-from scan2sim.pipeline.store import Manifest
+from scan2sim.pipeline.core.cache import Manifest
 
 GOOD: dict[str, dict[str, Any]] = {
     "views": {"usable": 10},

@@ -15,8 +15,8 @@ import pytest
 from scan2sim.flows.engine.execution import execute
 from scan2sim.flows.engine.memory import parse, share
 from scan2sim.flows.engine.planning import plan
-from scan2sim.pipeline.errors import ScanError, SettingError
-from scan2sim.pipeline.store import Store
+from scan2sim.pipeline.core.cache import Store
+from scan2sim.pipeline.core.errors import ScanError, SettingError
 from tests.conftest import ROOT
 from tests.flows.toy import chain
 

@@ -18,8 +18,8 @@ from scan2sim.flows.commands.drive import PREPARED, plan_drive
 from scan2sim.flows.commands.drive import survey_of as made_of
 from scan2sim.flows.engine.execution import execute
 from scan2sim.flows.engine.lock import locked
-from scan2sim.flows.recipes.drive import Drive
-from scan2sim.pipeline.errors import BusyError, InputError, UnsureError
+from scan2sim.flows.pipelines.drive import Drive
+from scan2sim.pipeline.core.errors import BusyError, InputError, UnsureError
 from scan2sim.pipeline.io.survey import read_survey
 from scan2sim.pipeline.steps.cut import CUT
 from scan2sim.pipeline.steps.import_sweeps import IMPORT_SWEEPS
@@ -84,7 +84,7 @@ def test_steps_of_a_drive_are_done_again_by_newer_code_and_of_other_files(
     assert changed() == {"track", "place", "import_sweeps", "cut"} and changed() == set()
     for step in (CUT, IMPORT_SWEEPS):
         recipe = "drive" if step is CUT else "sweeps"
-        monkeypatch.setattr(f"scan2sim.flows.recipes.{recipe}.{step.name.upper()}", replace(step, version=1000))
+        monkeypatch.setattr(f"scan2sim.flows.pipelines.{recipe}.{step.name.upper()}", replace(step, version=1000))
         assert changed() == ({"cut"} if step is CUT else {"import_sweeps", "cut"})
     for name in ("camera.toml", "velodyne/0.bin", "image/0.png"):
         (tmp_path / name).write_text("another", encoding="utf-8")

@@ -10,20 +10,20 @@ from typing import Any
 
 import pytest
 
-from bench.bus_broker import Broker
 from scan2sim.flows.commands.log import Log
-from scan2sim.flows.commands.shown import execute_shown
+from scan2sim.flows.commands.run_with_progress import execute_shown
 from scan2sim.flows.engine import progress
 from scan2sim.flows.engine.dispatch import dispatch
 from scan2sim.flows.engine.execution import run_on_worker
 from scan2sim.flows.engine.planning import Planned, plan
 from scan2sim.flows.engine.progress import published
 from scan2sim.flows.engine.versions import versions
-from scan2sim.pipeline.errors import SettingError
-from scan2sim.pipeline.store import Store
+from scan2sim.pipeline.core.cache import Store
+from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.services import kafka
-from scan2sim.services.monitoring import outlets
-from scan2sim.services.monitoring.events import Event, RunState, StepState
+from scan2sim.services.monitoring.events.schema import Event, RunState, StepState
+from scan2sim.services.monitoring.export import event_publishers
+from tests.fakes.broker import Broker
 from tests.flows.toy import chain
 
 NOBODY = "127.0.0.1:9"
@@ -55,7 +55,7 @@ class Heard:
 def heard(monkeypatch: pytest.MonkeyPatch) -> Heard:
     """All that is told, instead of a bus."""
     outlet = Heard()
-    monkeypatch.setattr(outlets, "opened", lambda where: [outlet])
+    monkeypatch.setattr(event_publishers, "opened", lambda where: [outlet])
     return outlet
 
 
@@ -195,7 +195,7 @@ def test_kafka_gets_a_run(run: Run, broker: Broker) -> None:
     run(broker.servers)
     heard = Heard()
     end = time.monotonic() + 30
-    for body in kafka.read(broker.servers, outlets.TOPIC, group="test", from_start=True, wait=0.2):
+    for body in kafka.read(broker.servers, event_publishers.TOPIC, group="test", from_start=True, wait=0.2):
         if body is not None:
             heard.events.append(Event.model_validate_json(body))
         if time.monotonic() > end or (heard.runs() and heard.runs()[-1].state == "done"):
@@ -212,7 +212,7 @@ def test_what_no_broker_took_is_sent_by_the_next_run(run: Run, broker: Broker, t
     run(broker.servers)
     heard = Heard()
     end = time.monotonic() + 30
-    for body in kafka.read(broker.servers, outlets.TOPIC, group="test", from_start=True, wait=0.2):
+    for body in kafka.read(broker.servers, event_publishers.TOPIC, group="test", from_start=True, wait=0.2):
         if body is not None:
             heard.events.append(Event.model_validate_json(body))
         if time.monotonic() > end or {one.kept for one in heard.runs() if one.state == "done"} == {0, 4}:
@@ -227,7 +227,7 @@ def test_a_bus_that_breaks_breaks_no_run(
     def broken(*_: object) -> list[Any]:
         raise OSError("the disk is gone")
 
-    monkeypatch.setattr(outlets, "opened", broken)
+    monkeypatch.setattr(event_publishers, "opened", broken)
     run(NOBODY)
     assert "the bus isn't told of this run any more: OSError: the disk is gone" in caplog.text
 

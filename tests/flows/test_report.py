@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from scan2sim.flows.engine.planning import Planned
-from scan2sim.flows.recipes.graph import Node
+from scan2sim.flows.pipelines.graph import Node
 from scan2sim.flows.reports.tile import representative, write_report
-from scan2sim.pipeline.io import image
-from scan2sim.pipeline.step import Done, Params, Step
-from scan2sim.pipeline.store import Manifest, Store
-from scan2sim.pipeline.types import Frame, Tile
+from scan2sim.pipeline.core.cache import Manifest, Store
+from scan2sim.pipeline.core.step import Done, Params, Step
+from scan2sim.pipeline.core.types import Frame, Tile
+from scan2sim.pipeline.io.images import image
 
 PART = {"psnr_db": 20.12, "psnr_gain_db": 23.4, "ssim": 0.71, "pixels": 300}
 NOTHING = {"psnr_db": None, "psnr_gain_db": None, "ssim": None, "pixels": 0}

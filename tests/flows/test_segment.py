@@ -11,7 +11,7 @@ import pytest
 
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.segmentation.score import confusion
+from scan2sim.segmentation.metrics import confusion
 from tests.flows.test_cli import bad, good, scan2sim
 
 

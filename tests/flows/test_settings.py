@@ -9,32 +9,32 @@ import pytest
 from typer.testing import CliRunner
 
 from scan2sim.flows.cli import COMMANDS, app, loaded
-from scan2sim.flows.commands.numbers import Numbers
-from scan2sim.flows.recipes.settings import Settings
-from scan2sim.flows.recipes.steps import STEPS
+from scan2sim.flows.commands.option_ranges import Numbers
+from scan2sim.flows.pipelines.settings import Settings
+from scan2sim.flows.pipelines.steps import STEPS
 from scan2sim.flows.reports.view import ViewParams
-from scan2sim.pipeline.corridor import CutParams
-from scan2sim.pipeline.errors import SettingError
-from scan2sim.pipeline.io.scenes import SceneParams
-from scan2sim.pipeline.ranges import described
-from scan2sim.pipeline.step import Params
+from scan2sim.pipeline.core.errors import SettingError
+from scan2sim.pipeline.core.parameters import described
+from scan2sim.pipeline.core.step import Params
+from scan2sim.pipeline.io.world_formats import SceneParams
 from scan2sim.pipeline.steps.decimate import DECIMATE
 from scan2sim.pipeline.steps.import_sweeps import SweepsParams
 from scan2sim.pipeline.steps.split import SPLIT
 from scan2sim.pipeline.steps.trim import TRIM
-from scan2sim.services.monitoring.joined import ScaleParams
-from scan2sim.services.monitoring.kept import QueryParams
-from scan2sim.services.monitoring.shown import PageParams
-from scan2sim.services.monitoring.traffic import TrafficParams
-from scan2sim.services.monitoring.watched import DatasetParams, TalkerParams, TopicParams, WorkParams
+from scan2sim.pipeline.tiling.cut_corridor import CutParams
+from scan2sim.services.monitoring.autoscale.traffic_model import TrafficParams
+from scan2sim.services.monitoring.settings.archive import QueryParams
+from scan2sim.services.monitoring.settings.bus import ScaleParams
+from scan2sim.services.monitoring.settings.dashboard import PageParams
+from scan2sim.services.monitoring.settings.monitor import DatasetParams, TalkerParams, TopicParams, WorkParams
 from scan2sim.services.orchestration.settings import ApplyParams, ResizeParams
 from scan2sim.services.qos.encoding import ChoiceParams
 from scan2sim.services.qos.measure import MeasureParams
 from scan2sim.services.teleoperation.settings import DemoParams, VehicleParams
 from scan2sim.services.teleoperation.settings import MeasureParams as DrivenParams
-from scan2sim.services.teleoperation.translating import TranslateParams
-from scan2sim.services.toolboxes.boxes import classify, detect, movement, segment
+from scan2sim.services.teleoperation.vehicle.adapter import TranslateParams
 from scan2sim.services.toolboxes.settings import CameraParams, NodeParams, ServeParams
+from scan2sim.services.toolboxes.tasks import classify, detect, movement, segment
 from scan2sim.slam.steps.track import Filmed
 from scan2sim.texturing.unwrap import UnwrapParams, check_size
 from tests.conftest import ROOT

@@ -10,15 +10,16 @@ from typing import Any
 import pytest
 
 from scan2sim.flows.commands import run as run_command
-from scan2sim.flows.recipes.graph import Node, NodeId, Output
-from scan2sim.flows.recipes.settings import Settings
-from scan2sim.flows.recipes.survey import survey_recipe
-from scan2sim.flows.recipes.tile import STEPS, recipe
+from scan2sim.flows.pipelines.graph import Node, NodeId, Output
+from scan2sim.flows.pipelines.settings import Settings
+from scan2sim.flows.pipelines.survey import survey_recipe
+from scan2sim.flows.pipelines.tile import STEPS, recipe
 from scan2sim.flows.reports import finish
-from scan2sim.pipeline.corridor import CutParams, cut_survey
-from scan2sim.pipeline.io import stac, worlds
+from scan2sim.pipeline.io.geodata import stac
 from scan2sim.pipeline.io.survey import read_survey
 from scan2sim.pipeline.io.tile import read_tile
+from scan2sim.pipeline.io.worlds import merge
+from scan2sim.pipeline.tiling.cut_corridor import CutParams, cut_survey
 from tests.flows.tiny import COARSE, loaded, scan2sim, tiny
 
 SIDE = tuple(step.name for step in STEPS if step.side_product)
@@ -30,7 +31,7 @@ EARLY = ("finds", "furniture", "signs")
 AFTER: dict[str, tuple[Any, str]] = {
     "report": (finish, "write_survey_report"),
     "TILE/report": (finish, "write_report"),
-    "roads": (worlds, "add_roads"),
+    "roads": (merge, "add_roads"),
     "catalogue": (stac, "write"),
 }
 """What is written after a survey's tiles, and by which function."""

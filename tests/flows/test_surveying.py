@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from scan2sim.pipeline.classes import GROUPS, group_of
-from scan2sim.pipeline.corridor import CutParams, cut_survey
+from scan2sim.pipeline.core.classes import GROUPS, group_of
+from scan2sim.pipeline.core.types import Mesh
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.pipeline.types import Mesh
+from scan2sim.pipeline.tiling.cut_corridor import CutParams, cut_survey
 from tests.flows.test_cli import SMALL, bad, good, scan2sim
 from tests.gazebo.checker import check_world
 

@@ -14,13 +14,13 @@ from scan2sim.data_samples.layout import FRAME, lay_out
 from scan2sim.data_samples.scene import build
 from scan2sim.data_samples.street import generate
 from scan2sim.flows.cli import app
-from scan2sim.flows.recipes.settings import Settings
-from scan2sim.flows.recipes.tile import recipe
-from scan2sim.pipeline.classes import CODE
+from scan2sim.flows.pipelines.settings import Settings
+from scan2sim.flows.pipelines.tile import recipe
+from scan2sim.pipeline.core.classes import CODE
+from scan2sim.pipeline.core.step import silent
+from scan2sim.pipeline.core.types import Frame, Mesh, PointCloud
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.pipeline.step import silent
 from scan2sim.pipeline.steps.split import SPLIT, SplitParams
-from scan2sim.pipeline.types import Frame, Mesh, PointCloud
 from tests.conftest import ROOT
 
 KEEP = Settings({"split": {"vehicles": "keep"}})

@@ -15,13 +15,13 @@ from typer.testing import CliRunner
 from scan2sim.flows.cli import app
 from scan2sim.flows.reports.film import film, flight
 from scan2sim.flows.reports.view import Pages, server
-from scan2sim.pipeline.errors import SettingError
-from scan2sim.pipeline.io.scene import read_scene
-from scan2sim.pipeline.render import Image, Renderer
-from scan2sim.pipeline.step import silent
-from scan2sim.pipeline.types import F64, Camera
+from scan2sim.pipeline.camera.renderer import Image, Renderer
+from scan2sim.pipeline.core.errors import SettingError
+from scan2sim.pipeline.core.step import silent
+from scan2sim.pipeline.core.types import F64, Camera
+from scan2sim.pipeline.io.worlds.scene import read_scene
 from tests.browser import Page, chromium
-from tests.pipeline import made_up
+from tests.pipeline import synthetic
 
 HERE = "world.here.size >= world.about.tiles.length && !document.querySelector('[role=status]').textContent"
 DRAWN = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(true))))"
@@ -40,7 +40,7 @@ def seen(page: Page) -> np.ndarray:
 
 
 def test_all_tiles_are_shown_by_photos_classes_and_sources(tmp_path: Path) -> None:
-    made_up.scene(tmp_path)
+    synthetic.scene(tmp_path)
     run(tmp_path / "world", "--out", tmp_path / "page")
     with chromium(tmp_path) as page:
         page.open(tmp_path / "page" / "index.html")  # by a double click: no server
@@ -72,7 +72,7 @@ def test_all_tiles_are_shown_by_photos_classes_and_sources(tmp_path: Path) -> No
 
 
 def test_a_world_without_photos_is_walked_through_too(tmp_path: Path) -> None:
-    made_up.world(tmp_path)
+    synthetic.world(tmp_path)
     run(tmp_path / "export" / "world", "--out", tmp_path / "page")
     with chromium(tmp_path) as page:
         page.open(tmp_path / "page" / "index.html")
@@ -81,12 +81,12 @@ def test_a_world_without_photos_is_walked_through_too(tmp_path: Path) -> None:
         page.click("[data-to=walk]")
         assert np.abs(seen(page) - above).mean() > 10 and page.errors == []
         x, y, z = map(float, page.value("document.querySelector('output').value").split())
-        assert z == pytest.approx(float(made_up.height(np.array(x), np.array(y))) + 1.6, abs=0.1)
+        assert z == pytest.approx(float(synthetic.height(np.array(x), np.array(y))) + 1.6, abs=0.1)
         assert page.value("document.getElementById('photos').hidden")
 
 
 def test_a_page_that_lacks_a_tile_says_so(tmp_path: Path) -> None:
-    made_up.scene(tmp_path)
+    synthetic.scene(tmp_path)
     run(tmp_path / "world", "--out", tmp_path / "page")
     (tmp_path / "page" / "tiles" / "tile1.js").unlink()
     with chromium(tmp_path) as page:
@@ -95,7 +95,7 @@ def test_a_page_that_lacks_a_tile_says_so(tmp_path: Path) -> None:
 
 
 def test_tiles_are_made_when_they_are_asked_for_and_for_this_machine_alone(tmp_path: Path) -> None:
-    pages = Pages(made_up.scene(tmp_path), tmp_path / "page", 1.0)
+    pages = Pages(synthetic.scene(tmp_path), tmp_path / "page", 1.0)
     with server(pages, 0) as served:
         threading.Thread(target=served.serve_forever, daemon=True).start()
         address = f"http://127.0.0.1:{served.server_port}"
@@ -118,7 +118,7 @@ def test_tiles_are_made_when_they_are_asked_for_and_for_this_machine_alone(tmp_p
 
 def test_a_flight_is_a_video_of_the_world(tmp_path: Path) -> None:
     av = pytest.importorskip("av", reason="PyAV isn't installed")
-    made_up.scene(tmp_path)
+    synthetic.scene(tmp_path)
     run(tmp_path / "world", "--film", tmp_path / "flight.mp4", "--seconds", 0.25, "--width", 160)
     with av.open(str(tmp_path / "flight.mp4")) as video:
         frames = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
@@ -129,7 +129,7 @@ def test_a_flight_is_a_video_of_the_world(tmp_path: Path) -> None:
 
 def test_a_flight_that_fails_costs_itself_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("av", reason="PyAV isn't installed")
-    scene = made_up.scene(tmp_path)
+    scene = synthetic.scene(tmp_path)
     view = Renderer.view
 
     def failing(self: Renderer, camera: Camera, pose: F64, **how: Any) -> Image:
@@ -148,7 +148,7 @@ def test_a_flight_that_fails_costs_itself_alone(tmp_path: Path, monkeypatch: pyt
 
 
 def test_without_a_road_the_flight_circles_around_the_world(tmp_path: Path) -> None:
-    poses = np.array(flight(made_up.scene(tmp_path, tiles=1), 12))
+    poses = np.array(flight(synthetic.scene(tmp_path, tiles=1), 12))
     away = np.linalg.norm(poses[:, :2, 3], axis=1)
     assert np.ptp(away) < 1 and away.min() > 14 and (poses[:, 2, 3] > 5).all()
     assert (poses[:, :3, 2] * poses[:, :3, 3] < 1).all() and (poses[:, 2, 2] < 0).all()  # they look at its middle

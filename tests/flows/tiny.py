@@ -17,12 +17,12 @@ import numpy as np
 import pytest
 
 from scan2sim.flows import cli
-from scan2sim.flows.recipes import tile as tile_recipe
+from scan2sim.flows.pipelines import tile as tile_recipe
+from scan2sim.pipeline.core.step import Done, Inputs, Params, Report
+from scan2sim.pipeline.core.types import Bools, PointCloud
 from scan2sim.pipeline.io.clouds import las
-from scan2sim.pipeline.io.scene import Scene, read_scene
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.pipeline.step import Done, Inputs, Params, Report
-from scan2sim.pipeline.types import Bools, PointCloud
+from scan2sim.pipeline.io.worlds.scene import Scene, read_scene
 from tests.gazebo.checker import built, check_world
 
 COARSE: dict[str, dict[str, Any]] = {

@@ -10,9 +10,9 @@ import time
 from pathlib import Path
 from typing import Any, Literal
 
-from scan2sim.flows.recipes.graph import Node, NodeId, Output
-from scan2sim.pipeline.errors import DataError
-from scan2sim.pipeline.step import Done, Inputs, Params, Report, Step
+from scan2sim.flows.pipelines.graph import Node, NodeId, Output
+from scan2sim.pipeline.core.errors import DataError
+from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 
 
 class ToyParams(Params):

@@ -39,7 +39,7 @@ def main() -> None:
 
 def _outcome(error: BaseException) -> tuple[int, str]:
     """As the command's `main` tells it; an error that the table doesn't know with all that is known of it."""
-    from scan2sim.pipeline.errors import ScanError, exit_code, from_os_error
+    from scan2sim.pipeline.core.errors import ScanError, exit_code, from_os_error
 
     if isinstance(error, OSError):
         error = from_os_error(error, error.filename or "a file")

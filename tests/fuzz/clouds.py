@@ -8,9 +8,9 @@ from pathlib import Path
 from random import Random
 
 from scan2sim.flows.commands.inspect import inspect_path
+from scan2sim.pipeline.core.types import Frame
+from scan2sim.pipeline.importers.clouds_and_photos import import_las
 from scan2sim.pipeline.io import clouds
-from scan2sim.pipeline.io.las_csv import import_las
-from scan2sim.pipeline.types import Frame
 from tests.fuzz.damage import REAL, WHOLE
 from tests.pipeline.io.test_cloud_formats import Format, e57_changed
 from tests.pipeline.io.test_clouds import FRAME, made

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from random import Random
 
-from scan2sim.pipeline.errors import EXIT_CODES
+from scan2sim.pipeline.core.errors import EXIT_CODES
 from tests.fuzz.damage import damaged
 from tests.fuzz.kinds import KINDS
 

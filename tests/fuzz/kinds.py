@@ -16,9 +16,9 @@ from scan2sim.pipeline.io import gps as gps_io
 from scan2sim.pipeline.io.tile import read_tile
 from tests.fuzz import clouds, models, tables
 from tests.fuzz.damage import Damage
+from tests.pipeline.importers.test_photogrammetry import WRITERS
 from tests.pipeline.io import test_gps as gps
 from tests.pipeline.io.test_cloud_formats import FORMATS
-from tests.pipeline.io.test_model_imports import WRITERS
 
 
 @dataclass(frozen=True)

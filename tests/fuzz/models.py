@@ -10,21 +10,21 @@ import numpy as np
 
 from bench.images import write
 from scan2sim.flows.commands.inspect import inspect_path
-from scan2sim.pipeline.io import image
-from scan2sim.pipeline.io.import_model import import_model
-from scan2sim.pipeline.io.kitti import import_kitti_raw
-from scan2sim.pipeline.io.kitti_odometry import import_kitti_odometry
-from scan2sim.pipeline.io.merging import read_bin
-from scan2sim.pipeline.io.sweeps import Pictures, Placing, import_sweeps, read_sweep
+from scan2sim.pipeline.core.types import Camera, View
+from scan2sim.pipeline.importers.kitti_odometry import import_kitti_odometry
+from scan2sim.pipeline.importers.kitti_raw import import_kitti_raw
+from scan2sim.pipeline.importers.merge_sweeps import read_bin
+from scan2sim.pipeline.importers.photogrammetry import import_model
+from scan2sim.pipeline.importers.sweeps import Pictures, Placing, import_sweeps, read_sweep
+from scan2sim.pipeline.io.images import image
 from scan2sim.pipeline.steps.views import _problem
-from scan2sim.pipeline.types import Camera, View
 from scan2sim.slam.video import open_video
-from tests.pipeline import made_up
-from tests.pipeline import test_sweeps as sweeps
-from tests.pipeline.io.test_colmap_import import make_model
-from tests.pipeline.io.test_kitti_import import make_drive
-from tests.pipeline.io.test_kitti_odometry import make_sequence
-from tests.pipeline.io.test_model_imports import WRITERS, images
+from tests.pipeline import synthetic
+from tests.pipeline.importers import test_sweeps as sweeps
+from tests.pipeline.importers.test_colmap import make_model
+from tests.pipeline.importers.test_kitti_odometry import make_sequence
+from tests.pipeline.importers.test_kitti_raw import make_drive
+from tests.pipeline.importers.test_photogrammetry import WRITERS, images
 
 Make: TypeAlias = Callable[[Path], list[Path]]
 Read: TypeAlias = Callable[[Path], object]
@@ -140,7 +140,7 @@ def result(folder: Path) -> list[Path]:
 
 def world(folder: Path) -> list[Path]:
     """A world with its model, and a GLB."""
-    made_up.world(folder)
+    synthetic.world(folder)
     kinds = (".sdf", ".obj", ".dae", ".glb", ".json")
     return sorted(path for path in folder.rglob("*") if path.suffix in kinds)
 

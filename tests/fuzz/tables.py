@@ -11,20 +11,20 @@ import cv2
 import numpy as np
 import tomli_w
 
-from scan2sim.flows.recipes.drive import Drive
-from scan2sim.flows.recipes.settings import Settings
-from scan2sim.flows.recipes.steps import STEPS
+from scan2sim.flows.pipelines.drive import Drive
+from scan2sim.flows.pipelines.settings import Settings
+from scan2sim.flows.pipelines.steps import STEPS
+from scan2sim.pipeline.importers import sweeps
+from scan2sim.pipeline.importers.clouds_and_photos import import_las
 from scan2sim.pipeline.io import gps as gps_io
-from scan2sim.pipeline.io import sweeps
 from scan2sim.pipeline.io import trajectory as trajectory_io
-from scan2sim.pipeline.io.las_csv import import_las
 from scan2sim.pipeline.io.survey import read_survey, write_survey
 from scan2sim.pipeline.io.tile import read_tile
 from tests.fuzz.damage import TEXT
+from tests.pipeline.importers.test_clouds_and_photos import cloud
 from tests.pipeline.io import test_gps as gps
-from tests.pipeline.io.test_las_import import cloud
 from tests.pipeline.io.test_tile import body, save
-from tests.pipeline.test_trajectory_io import UTM, made_up
+from tests.pipeline.io.test_trajectory import UTM, made_up
 
 Make: TypeAlias = Callable[[Path], list[Path]]
 Read: TypeAlias = Callable[[Path], object]

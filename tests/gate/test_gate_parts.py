@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench import gate_drops, gate_pictures
 from bench.consumers import Fault
-from bench.gate_drive import Pose, drive
-from bench.gate_pictures import Photo
-from bench.gate_places import Places
-from scan2sim.pipeline.robot import ROBOT
-from scan2sim.pipeline.types import Camera
+from bench.gate import drops, renderings
+from bench.gate.drive import Pose, drive
+from bench.gate.places import Places
+from bench.gate.renderings import Photo
+from scan2sim.pipeline.core.types import Camera
+from scan2sim.pipeline.simulation.robot import ROBOT
 
 NOWHERE = np.zeros((0, 3))
 
@@ -63,11 +63,11 @@ def test_a_robot_that_gets_stuck_is_a_fault() -> None:
 
 def test_a_ball_that_lies_3_cm_too_low_is_a_fault() -> None:
     places = street()
-    lying = np.array([[1.0, 0.0, gate_drops.BALL + 0.005], [2.0, 0.0, gate_drops.BALL - 0.005]])
-    assert gate_drops.told(gate_drops.gaps(lying, places))["drop_max_m"] == pytest.approx(0.005)
-    for z in (gate_drops.BALL - 0.03, -50.0):
+    lying = np.array([[1.0, 0.0, drops.BALL + 0.005], [2.0, 0.0, drops.BALL - 0.005]])
+    assert drops.told(drops.gaps(lying, places))["drop_max_m"] == pytest.approx(0.005)
+    for z in (drops.BALL - 0.03, -50.0):
         with pytest.raises(Fault) as caught:
-            gate_drops.told(gate_drops.gaps(np.array([[1.0, 0.0, z]]), places))
+            drops.told(drops.gaps(np.array([[1.0, 0.0, z]]), places))
         assert caught.value.figures["fell_through"] == (z < -1)
 
 
@@ -77,9 +77,9 @@ def test_a_picture_from_beside_the_photos_place_is_a_fault(tmp_path: Path) -> No
     export = tmp_path / "exports" / "made"
     export.mkdir(parents=True)
     shown = np.ones((480, 600), bool)
-    good = gate_pictures.compare(export, "made", seen, seen.rgb // 2, shown)
+    good = renderings.compare(export, "made", seen, seen.rgb // 2, shown)
     assert good["picture_off_px"] < 0.1 and good["picture_ssim"] > 0.99  # half as bright, in the same place
     assert (tmp_path / "pictures" / "made.png").is_file()
     with pytest.raises(Fault) as caught:
-        gate_pictures.compare(export, "made", seen, scene[:, 40:], shown)
+        renderings.compare(export, "made", seen, scene[:, 40:], shown)
     assert caught.value.figures["picture_off_px"] == pytest.approx(20, abs=1)

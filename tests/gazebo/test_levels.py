@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from scan2sim.pipeline.io import crs
-from scan2sim.pipeline.io.worlds import TileWorld, assemble
+from scan2sim.pipeline.io.geodata import crs
+from scan2sim.pipeline.io.worlds.merge import TileWorld, assemble
 from tests.gazebo.checker import check_world
-from tests.pipeline import made_up
+from tests.pipeline import synthetic
 from tests.present import present
 
 BOX = 0.2  # half the edge of the dropped box, metres
@@ -20,10 +20,10 @@ EAST, DOWN = 25.0, 2.0  # metres from one tile to the next
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("survey")
-    x, y, z = made_up.UTM.origin
-    frames = [replace(made_up.UTM, origin=(x + EAST * i, y, z - DOWN * i)) for i in range(3)]
+    x, y, z = synthetic.UTM.origin
+    frames = [replace(synthetic.UTM, origin=(x + EAST * i, y, z - DOWN * i)) for i in range(3)]
     tiles = [
-        TileWorld(f"tile{i}", made_up.world(folder / f"tile{i}", frame, f"tile{i}").files["world"], frame)
+        TileWorld(f"tile{i}", synthetic.world(folder / f"tile{i}", frame, f"tile{i}").files["world"], frame)
         for i, frame in enumerate(frames)
     ]
     return assemble(folder, "town", tiles)
@@ -42,7 +42,7 @@ def test_every_tiles_meshes_and_textures_load(world: Path) -> None:
 
 @pytest.mark.parametrize("tile", [0, 2])  # the world's origin is the second tile's
 def test_a_box_comes_to_rest_on_the_roof_of_each_tile(world: Path, tile: int) -> None:
-    x, y = made_up.HOUSE[0] + 1.5 + EAST * (tile - 1), made_up.HOUSE[1] + 1
+    x, y = synthetic.HOUSE[0] + 1.5 + EAST * (tile - 1), synthetic.HOUSE[1] + 1
     roof = 4.5 - DOWN * (tile - 1)
     assert check_world(world, ("box", (x, y, roof + 1.5)))["bodies"][0]["rest"] == pytest.approx(
         [x, y, roof + BOX], abs=0.02
@@ -52,5 +52,5 @@ def test_a_box_comes_to_rest_on_the_roof_of_each_tile(world: Path, tile: int) ->
 def test_the_world_stands_where_its_middle_tile_does(world: Path) -> None:
     place = check_world(world)["spherical"]
     assert [place["latitude"], place["longitude"]] == pytest.approx(
-        present(crs.to_wgs84(made_up.UTM, (EAST, 0, 0)))[:2], abs=1e-8
+        present(crs.to_wgs84(synthetic.UTM, (EAST, 0, 0)))[:2], abs=1e-8
     )

@@ -7,13 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scan2sim.pipeline import backends, decimation
-from scan2sim.pipeline.errors import SettingError
-from scan2sim.pipeline.step import silent
+from scan2sim.pipeline import decimation
+from scan2sim.pipeline.core import plugins
+from scan2sim.pipeline.core.errors import SettingError
+from scan2sim.pipeline.core.step import silent
+from scan2sim.pipeline.core.types import Frame, Mesh
 from scan2sim.pipeline.steps.decimate import DECIMATE, DecimateParams
-from scan2sim.pipeline.types import Frame, Mesh
 
-NAMES = backends.names(decimation.__name__)
+NAMES = plugins.names(decimation.__name__)
 SIDE = 120
 
 
@@ -44,7 +45,7 @@ def off(small: Mesh) -> float:
 
 
 def simplified(mesh: Mesh, name: str, target: int, *, keep_border: bool) -> Mesh:
-    if lacking := backends.missing(decimation.__name__, name):
+    if lacking := plugins.missing(decimation.__name__, name):
         pytest.skip(f"needs {lacking}")
     return decimation.simplify(mesh, target, keep_border=keep_border, backend=name)
 
@@ -53,7 +54,7 @@ def simplified(mesh: Mesh, name: str, target: int, *, keep_border: bool) -> Mesh
 @pytest.mark.parametrize("keep_border", [True, False])
 def test_the_surface_stays_with_fewer_triangles(name: str, keep_border: bool) -> None:
     whole = hills()
-    if keep_border and not backends.module(decimation.__name__, name).KEEPS_BORDER:
+    if keep_border and not plugins.module(decimation.__name__, name).KEEPS_BORDER:
         with pytest.raises(SettingError, match=r"can't keep borders.*Choose .*pyfqmr"):
             simplified(whole, name, 4000, keep_border=True)
         return
@@ -77,7 +78,7 @@ def test_what_is_small_enough_stays(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_step_uses_the_library_that_is_set(tmp_path: Path, name: str) -> None:
-    if lacking := backends.missing(decimation.__name__, name):
+    if lacking := plugins.missing(decimation.__name__, name):
         pytest.skip(f"needs {lacking}")
     hills().save(tmp_path / "mesh.npz")
     (tmp_path / "out").mkdir()

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.channels import FRACTION
-from scan2sim.segmentation.augment import WITHOUT, augmented, degraded, photometric
+from scan2sim.segmentation.lidar_channels import FRACTION
+from scan2sim.segmentation.training.augment import WITHOUT, augmented, degraded, photometric
 
 CROP = (128, 192)
 

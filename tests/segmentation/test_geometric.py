@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.classes import CODE
+from scan2sim.pipeline.core.classes import CODE
+from scan2sim.pipeline.core.step import silent
+from scan2sim.pipeline.core.types import Frame, PointCloud
+from scan2sim.pipeline.importers.clouds_and_photos import import_las
 from scan2sim.pipeline.io import clouds
-from scan2sim.pipeline.io.las_csv import import_las
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.pipeline.step import silent
-from scan2sim.pipeline.types import Frame, PointCloud
 from scan2sim.segmentation.geometric import classify, split_ground
-from scan2sim.segmentation.segment import SEGMENT, SegmentParams, segment
+from scan2sim.segmentation.steps.segment import SEGMENT, SegmentParams, segment
 from tests.present import present
 
 GROUPS = {2: "ground", 3: "plant", 4: "plant", 5: "plant", 6: "building", 68: "building", 65: "pole", 66: "vehicle"}

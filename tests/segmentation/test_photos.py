@@ -7,8 +7,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.types import F32, U8, Camera
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.types import F32, U8, Camera
 from scan2sim.segmentation.backends import Facts
 from scan2sim.segmentation.labels import CLASSES, IGNORED, LABEL_SETS, code_of_index, index_of_code, mapped
 from scan2sim.segmentation.photos import OVERLAP, Classifier, class_map

@@ -9,18 +9,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scan2sim.pipeline import primitives
-from scan2sim.pipeline.cells import Cell
-from scan2sim.pipeline.classes import CODE
-from scan2sim.pipeline.furniture import sheet
-from scan2sim.pipeline.io import image
+from scan2sim.pipeline.core.classes import CODE
+from scan2sim.pipeline.core.step import Done, silent
+from scan2sim.pipeline.core.types import F32, F64, U8, Camera, Frame, Mesh, View
+from scan2sim.pipeline.furniture.classify import sheet
+from scan2sim.pipeline.furniture.sign_panels import Plate, inside
+from scan2sim.pipeline.geometry import primitives
 from scan2sim.pipeline.io import views as views_io
-from scan2sim.pipeline.plates import Plate, inside
-from scan2sim.pipeline.step import Done, silent
-from scan2sim.pipeline.types import F32, F64, U8, Camera, Frame, Mesh, View
-from scan2sim.segmentation.hanging import cleared
+from scan2sim.pipeline.io.images import image
+from scan2sim.pipeline.tiling.voronoi_cell import Cell
 from scan2sim.segmentation.labels import CLASSES
-from scan2sim.segmentation.signs import SIGNS, SignsParams
+from scan2sim.segmentation.sign_panels.attach import cleared
+from scan2sim.segmentation.steps.signs import SIGNS, SignsParams
 
 FRAME = Frame("EPSG:25832", (500_000.0, 5_400_000.0, 100.0))
 CAMERA = Camera("pinhole", 640, 240, 500, 500, 320, 120)
@@ -116,7 +116,7 @@ def _run(folder: Path, plates: list[Plate], known: list[Plate], theirs: bool = F
 
 def _hung(done: Done) -> list[F32]:
     """Corners of each plate in the mesh, that of the highest first."""
-    from scan2sim.segmentation.hanging import pieces
+    from scan2sim.segmentation.sign_panels.attach import pieces
 
     mesh = Mesh.load(done.files["building"])
     corners = [mesh.vertices[np.unique(mesh.faces[piece])] for piece in pieces(mesh, CODE["road_sign"])]

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.cameras import project
-from scan2sim.pipeline.render import look_at
-from scan2sim.pipeline.types import Camera, Frame, PointCloud, View
+from scan2sim.pipeline.camera.models import project
+from scan2sim.pipeline.camera.renderer import look_at
+from scan2sim.pipeline.core.types import Camera, Frame, PointCloud, View
 from scan2sim.segmentation.labels import CLASSES, SKY
 from scan2sim.segmentation.votes import NEAR, vote
 

@@ -8,17 +8,17 @@ import cv2
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.classes import CODE
-from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.core.classes import CODE
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.step import Done, silent
+from scan2sim.pipeline.core.types import U8, PointCloud
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.pipeline.step import Done, silent
-from scan2sim.pipeline.types import U8, PointCloud
-from scan2sim.segmentation.label import LABEL, LabelParams
 from scan2sim.segmentation.labels import CLASSES, index_of_code
-from scan2sim.segmentation.score import confusion
-from scan2sim.segmentation.segment import SEGMENT, SegmentParams
+from scan2sim.segmentation.metrics import confusion
+from scan2sim.segmentation.steps.label import LABEL, LabelParams
+from scan2sim.segmentation.steps.segment import SEGMENT, SegmentParams
 from tests.present import present
 
 

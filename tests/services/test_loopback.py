@@ -10,13 +10,13 @@ from typing import Any
 
 import pytest
 
-from scan2sim.pipeline.errors import SettingError
+from scan2sim.pipeline.core.errors import SettingError
+from scan2sim.services.http.settings import Served
 from scan2sim.services.loopback import is_loopback, require_protection
-from scan2sim.services.monitoring.shown import PageParams as MonitorPage
+from scan2sim.services.monitoring.settings.dashboard import PageParams as MonitorPage
 from scan2sim.services.orchestration.settings import PageParams as OrchestrationPage
-from scan2sim.services.served import Served
 from scan2sim.services.teleoperation.settings import GatewayParams, StationParams
-from scan2sim.services.teleoperation.translating import TranslateParams
+from scan2sim.services.teleoperation.vehicle.adapter import TranslateParams
 from scan2sim.services.toolboxes.settings import ServeParams
 from tests.conftest import ROOT
 
@@ -101,7 +101,7 @@ def test_vehicles_and_stations_are_listened_to_with_a_certificate_only(words: tu
 
 def test_figures_for_prometheus_stay_on_this_machine() -> None:
     pytest.importorskip("prometheus_client", reason="the extra bus isn't installed")
-    from scan2sim.services.monitoring.sinks import Prometheus
+    from scan2sim.services.monitoring.export.sinks import Prometheus
 
     shown = Prometheus(0)
     try:

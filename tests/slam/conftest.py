@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.cameras import pixel_rays
-from scan2sim.pipeline.io.video import Encoder
-from scan2sim.pipeline.types import Camera, Trajectory
+from scan2sim.pipeline.camera.models import pixel_rays
+from scan2sim.pipeline.core.types import Camera, Trajectory
+from scan2sim.pipeline.io.images.video import Encoder
 from scan2sim.slam.geometry import exp_so3
 from tests.present import present
 

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from scan2sim.pipeline.cameras import inside, project_exactly
-from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.types import Camera
-from scan2sim.slam.calibrate import calibrated, looked_for
-from scan2sim.slam.camera import Found, found
-from scan2sim.slam.lens import changed
-from scan2sim.slam.recording import Recording
+from scan2sim.pipeline.camera.models import inside, project_exactly
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.types import Camera
+from scan2sim.slam.calibration.calibrate import calibrated, looked_for
+from scan2sim.slam.calibration.camera import Found, found
+from scan2sim.slam.calibration.lens import changed
+from scan2sim.slam.odometry.track_log import Recording
 from scan2sim.slam.video import open_video
 from tests.present import present
-from tests.slam.made_up import LENS, drive, scatter
+from tests.slam.synthetic import LENS, drive, scatter
 
 
 def seen(camera: Camera, turn: float = 0.3) -> Recording:

@@ -15,18 +15,18 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-import scan2sim.slam.track as tracking
+import scan2sim.slam.odometry.video_odometry as tracking
 from scan2sim.flows.cli import app
 from scan2sim.flows.engine.planning import plan
-from scan2sim.flows.recipes.settings import Settings
-from scan2sim.flows.recipes.video import Video, recipe
-from scan2sim.pipeline.errors import InputError, ScanError, UnsureError, exit_code
+from scan2sim.flows.pipelines.settings import Settings
+from scan2sim.flows.pipelines.video import Video, recipe
+from scan2sim.pipeline.core.cache import Store
+from scan2sim.pipeline.core.errors import InputError, ScanError, UnsureError, exit_code
+from scan2sim.pipeline.core.types import U8
 from scan2sim.pipeline.io import trajectory as trajectory_io
-from scan2sim.pipeline.store import Store
-from scan2sim.pipeline.types import U8
-from scan2sim.slam.odometry import Odometry, OdometryParams
+from scan2sim.slam.odometry.odometry import Odometry, OdometryParams
+from scan2sim.slam.odometry.video_odometry import VERSION, track
 from scan2sim.slam.steps.track import TRACK, TrackParams, tracker_of
-from scan2sim.slam.track import VERSION, track
 from scan2sim.slam.video import open_video
 from tests.slam.conftest import Drive
 
@@ -185,7 +185,7 @@ def test_an_interrupted_run_goes_on_only_from_what_the_same_code_made_of_the_sam
     assert mark() != before
     video.write_bytes(b"one")
     assert mark() == before != mark(every=2)
-    monkeypatch.setattr("scan2sim.flows.recipes.video.TRACK", replace(TRACK, version=VERSION + 1))
+    monkeypatch.setattr("scan2sim.flows.pipelines.video.TRACK", replace(TRACK, version=VERSION + 1))
     assert mark() != before
 
 

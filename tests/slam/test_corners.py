@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.cameras import pixel_rays, project
-from scan2sim.pipeline.types import F32, F64, U8, Camera
-from scan2sim.slam import exposure
-from scan2sim.slam.facets import Facets
+from scan2sim.pipeline.camera.models import pixel_rays, project
+from scan2sim.pipeline.core.types import F32, F64, U8, Camera
 from scan2sim.slam.geometry import exp_so3, relative_pose, rigid
+from scan2sim.slam.odometry import exposure
+from scan2sim.slam.odometry.virtual_cameras import Facets
 from scan2sim.slam.trackers.corners import FINE, CornerTracker, flow
 
 CAMERA = Camera("equirectangular", 768, 384)

@@ -8,16 +8,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scan2sim.pipeline import backends
-from scan2sim.pipeline.cameras import pixel_rays, project
-from scan2sim.pipeline.errors import SettingError
-from scan2sim.pipeline.types import F64, U8, Camera
+from scan2sim.pipeline.camera.models import pixel_rays, project
+from scan2sim.pipeline.core import plugins
+from scan2sim.pipeline.core.errors import SettingError
+from scan2sim.pipeline.core.types import F64, U8, Camera
 from scan2sim.slam import features, matchers
-from scan2sim.slam.facets import Facets
 from scan2sim.slam.features import Found
 from scan2sim.slam.geometry import exp_so3
-from scan2sim.slam.state import load, save
-from scan2sim.slam.track import VALUES
+from scan2sim.slam.odometry.checkpoint import load, save
+from scan2sim.slam.odometry.video_odometry import VALUES
+from scan2sim.slam.odometry.virtual_cameras import Facets
 from scan2sim.slam.trackers.descriptors import DescriptorTracker
 
 SPHERE = Camera("equirectangular", 512, 256)
@@ -50,7 +50,7 @@ def tracker(
     bridge: bool = True,
     weights: Path | None = None,
 ) -> DescriptorTracker:
-    if missing_packages := backends.missing(features.__name__, name):
+    if missing_packages := plugins.missing(features.__name__, name):
         pytest.skip(f"{name} needs {missing_packages}")
     if weights is not None:
         import torch

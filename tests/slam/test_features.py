@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scan2sim.pipeline import backends
-from scan2sim.pipeline.errors import InputError, SettingError
-from scan2sim.pipeline.extras import missing
+from scan2sim.pipeline.core import plugins
+from scan2sim.pipeline.core.errors import InputError, SettingError
+from scan2sim.pipeline.core.optional_deps import missing
 from scan2sim.slam import features, matchers, weights
 from scan2sim.slam.features import Found
 
@@ -66,7 +66,7 @@ def saved(path: Path, model: weights.Model) -> Path:
 
 def with_random_weights(name: str, folder: Path) -> features.Features:
     """A backend that can run here; networks get random weights, of which no behaviour can be expected."""
-    if missing_packages := backends.missing(features.__name__, name):
+    if missing_packages := plugins.missing(features.__name__, name):
         pytest.skip(f"{name} needs {missing_packages}")
     if name not in PUBLISHED_WEIGHTS:
         return features.named(name, count=500)
@@ -78,7 +78,7 @@ def with_random_weights(name: str, folder: Path) -> features.Features:
 
 def with_published_weights(name: str, real_data: Path) -> features.Features:
     """A network with its published weights; the test is skipped where they are absent."""
-    if missing_packages := backends.missing(features.__name__, name):
+    if missing_packages := plugins.missing(features.__name__, name):
         pytest.skip(f"{name} needs {missing_packages}")
     file = real_data / "weights" / PUBLISHED_WEIGHTS[name]
     if not file.is_file():
@@ -113,7 +113,7 @@ def check_mask_and_flat_image(backend: features.Features) -> None:
     assert matchers.named("nearest").match(found, Found(*(x[:0] for x in found)), (SIZE, SIZE)).shape == (0, 2)
 
 
-@pytest.mark.parametrize("name", backends.names(features.__name__))
+@pytest.mark.parametrize("name", plugins.names(features.__name__))
 def test_every_backend_keeps_the_contract(name: str, tmp_path: Path) -> None:
     """Shapes, types, bounds, order and determinism hold for any weights."""
     backend = with_random_weights(name, tmp_path)
@@ -136,7 +136,7 @@ def test_every_backend_keeps_the_contract(name: str, tmp_path: Path) -> None:
     assert name in backend.describe().lower()
 
 
-@pytest.mark.parametrize("name", [n for n in backends.names(features.__name__) if n not in PUBLISHED_WEIGHTS])
+@pytest.mark.parametrize("name", [n for n in plugins.names(features.__name__) if n not in PUBLISHED_WEIGHTS])
 def test_keypoints_follow_the_image(name: str) -> None:
     check_keypoints_follow_translation(features.named(name, count=500))
 
@@ -146,7 +146,7 @@ def test_keypoints_of_networks_follow_the_image(name: str, real_data: Path) -> N
     check_keypoints_follow_translation(with_published_weights(name, real_data))
 
 
-@pytest.mark.parametrize("name", [n for n in backends.names(features.__name__) if n not in PUBLISHED_WEIGHTS])
+@pytest.mark.parametrize("name", [n for n in plugins.names(features.__name__) if n not in PUBLISHED_WEIGHTS])
 def test_masks_and_flat_images(name: str) -> None:
     check_mask_and_flat_image(features.named(name, count=500))
 

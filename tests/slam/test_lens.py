@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scan2sim.slam.lens import better, changed, told
+from scan2sim.slam.calibration.lens import better, changed, told
 from tests.present import present
-from tests.slam.made_up import LENS, mistaken
+from tests.slam.synthetic import LENS, mistaken
 
 
 @pytest.mark.parametrize(

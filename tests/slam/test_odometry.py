@@ -4,14 +4,14 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from scan2sim.pipeline.similarity import umeyama
-from scan2sim.pipeline.types import F64
-from scan2sim.slam.finish import finish
-from scan2sim.slam.mapped import Mapped
-from scan2sim.slam.odometry import Odometry, OdometryParams
+from scan2sim.pipeline.core.types import F64
+from scan2sim.pipeline.geometry.similarity import umeyama
+from scan2sim.slam.mapping.map_file import Mapped
+from scan2sim.slam.odometry.odometry import Odometry, OdometryParams
+from scan2sim.slam.trajectory.align import finish
 from tests.present import present
 from tests.slam.conftest import Drive
-from tests.slam.made_up import LENS, Follower, Narrow, drive, gps_of, run, scatter
+from tests.slam.synthetic import LENS, Follower, Narrow, drive, gps_of, run, scatter
 
 
 def positions(odometry: Odometry) -> F64:

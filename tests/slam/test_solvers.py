@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.backends import names
-from scan2sim.pipeline.types import F64
+from scan2sim.pipeline.core.plugins import names
+from scan2sim.pipeline.core.types import F64
 from scan2sim.slam import solvers
 from scan2sim.slam.geometry import exp_so3
-from scan2sim.slam.graph import Chord, Factor, Graph, Solution, errors
+from scan2sim.slam.mapping.factor_graph import Chord, Factor, Graph, Solution, errors
 from scan2sim.slam.solvers import lm
 
 

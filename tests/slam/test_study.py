@@ -14,13 +14,13 @@ import pytest
 from typer.testing import CliRunner
 
 from scan2sim.flows.cli import app
-from scan2sim.flows.recipes.study import segment_of
-from scan2sim.pipeline.errors import InputError, SettingError
+from scan2sim.flows.pipelines.study import segment_of
+from scan2sim.pipeline.core.errors import InputError, SettingError
+from scan2sim.pipeline.core.types import Camera, GpsTrack, Trajectory
 from scan2sim.pipeline.io import trajectory as trajectory_io
-from scan2sim.pipeline.types import Camera, GpsTrack, Trajectory
-from scan2sim.slam.encoding import encode, scaled
 from scan2sim.slam.steps.evaluate import lost
 from scan2sim.slam.video import open_video
+from scan2sim.slam.video_degradation import encode, scaled
 from tests.slam.conftest import Drive
 
 

@@ -10,16 +10,16 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from scan2sim.pipeline.camera.depth_map import depth_map, scene
+from scan2sim.pipeline.camera.renderer import Body, Renderer, look_at, pinhole
+from scan2sim.pipeline.core.step import Done, silent
+from scan2sim.pipeline.core.types import F64, U8, Camera, Frame, Mesh, PointCloud, View
 from scan2sim.pipeline.io import views as views_io
-from scan2sim.pipeline.render import Body, Renderer, look_at, pinhole
-from scan2sim.pipeline.step import Done, silent
-from scan2sim.pipeline.types import F64, U8, Camera, Frame, Mesh, PointCloud, View
-from scan2sim.pipeline.visibility import depth_map, scene
-from scan2sim.texturing.agreement import AGREEMENT
-from scan2sim.texturing.choose import CHOOSE
 from scan2sim.texturing.exposure import EXPOSURE
+from scan2sim.texturing.photo_consistency import AGREEMENT
 from scan2sim.texturing.texture import TextureParams, texture
 from scan2sim.texturing.unwrap import UnwrapParams, unwrap
+from scan2sim.texturing.view_selection.step import CHOOSE
 
 
 def grid(
@@ -64,7 +64,7 @@ def paint(xyz: npt.ArrayLike) -> F64:
 
 def photograph(camera: Camera, pose: F64, meshes: tuple[Mesh, ...] = (GROUND, BOX), gain: float = 1.0) -> U8:
     """(H, W, 3) uint8: the paint as a camera sees it."""
-    from scan2sim.pipeline.cameras import pixel_rays, ray_origins
+    from scan2sim.pipeline.camera.models import pixel_rays, ray_origins
 
     image = Renderer([Body(mesh) for mesh in meshes]).view(camera, pose)
     v, u = np.mgrid[: camera.height, : camera.width]

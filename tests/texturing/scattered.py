@@ -7,11 +7,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from scan2sim.pipeline.cameras import pixel_angle, unproject
-from scan2sim.pipeline.projection import eye
-from scan2sim.pipeline.types import F32, Camera
-from scan2sim.texturing import blend, texels
-from scan2sim.texturing.photos import low_frequencies, shrunk
+from scan2sim.pipeline.camera.models import pixel_angle, unproject
+from scan2sim.pipeline.camera.projection import eye
+from scan2sim.pipeline.core.types import F32, Camera
+from scan2sim.texturing.bake import blend_numba, texel_map
+from scan2sim.texturing.photo_cache import low_frequencies, shrunk
 
 CAMERAS = {
     "pinhole": Camera("pinhole", 97, 71, 60.0, 62.0, 47.0, 36.0),
@@ -24,7 +24,7 @@ CELL, CELLS = 12, 8
 """Texels of a square's side on the page, and squares of its side."""
 
 
-def scattered(rng: np.random.Generator, camera: Camera) -> blend.Laid:
+def scattered(rng: np.random.Generator, camera: Camera) -> blend_numba.Laid:
     """Squares about a camera at the origin, of all sizes, turned every way; each has a cell of the page to itself."""
     n = CELLS**2
     u, v = rng.uniform(-0.2, 1.2, n) * camera.width, rng.uniform(-0.1, 1.1, n) * camera.height
@@ -46,11 +46,11 @@ def scattered(rng: np.random.Generator, camera: Camera) -> blend.Laid:
     triangles = np.array([[0, 1, 2], [0, 2, 3]])
     on_page: F32 = flat[:, triangles].reshape(-1, 3, 2).astype(np.float32)
     in_space: F32 = corners.transpose(1, 0, 2)[:, triangles].reshape(-1, 3, 3).astype(np.float32)
-    owner = texels.owners(on_page, CELL * CELLS, CELL * CELLS)
-    return blend.Laid(owner, on_page, in_space, np.repeat(facing, 2, axis=0).astype(np.float32))
+    owner = texel_map.owners(on_page, CELL * CELLS, CELL * CELLS)
+    return blend_numba.Laid(owner, on_page, in_space, np.repeat(facing, 2, axis=0).astype(np.float32))
 
 
-def taken(rng: np.random.Generator, camera: Camera, band: int) -> blend.Source:
+def taken(rng: np.random.Generator, camera: Camera, band: int) -> blend_numba.Source:
     """A photo with all that can be about it: things before what it shows, a mask, a warp, exposure, white patches."""
 
     def patches(values: Any, size: int) -> Any:
@@ -62,10 +62,12 @@ def taken(rng: np.random.Generator, camera: Camera, band: int) -> blend.Source:
     half = shrunk(whole, 2)
     first = patches([np.inf, 9.0, 6.0, 4.0], 8)
     wider = camera.resized(first.shape[1], first.shape[0])
-    picture = blend.Picture(
+    picture = blend_numba.Picture(
         whole, half, shrunk(half, 2), low_frequencies(whole, max(1, band)),
         rng.choice([0, 255, 255, 255], (24, 33)).astype(np.uint8), rng.normal(0, 2, (5, 7, 2)).astype(np.float32),
         np.array([0.1, -0.05, 0.02, 0.3, 0.2]),
     )  # fmt: skip
     near, apart = (np.asarray(cv2.erode(first, np.ones((n, n)))) for n in (3, 7))
-    return blend.Source(picture, eye(camera, np.eye(4)), blend.Occlusion(first, pixel_angle(wider), near, apart, 3))
+    return blend_numba.Source(
+        picture, eye(camera, np.eye(4)), blend_numba.Occlusion(first, pixel_angle(wider), near, apart, 3)
+    )

@@ -7,13 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.cameras import pixel_angle, project
-from scan2sim.pipeline.projection import eye
-from scan2sim.pipeline.render import look_at
-from scan2sim.pipeline.types import U8, Camera
-from scan2sim.texturing import blend, texels
-from scan2sim.texturing.photos import OFFSET
-from tests.texturing import plain_blend
+from scan2sim.pipeline.camera.models import pixel_angle, project
+from scan2sim.pipeline.camera.projection import eye
+from scan2sim.pipeline.camera.renderer import look_at
+from scan2sim.pipeline.core.types import U8, Camera
+from scan2sim.texturing.bake import blend_numba
+from scan2sim.texturing.bake import texel_map as texels
+from scan2sim.texturing.photo_cache import OFFSET
+from tests.texturing import reference_blend
 from tests.texturing.scattered import CAMERAS, scattered, taken
 
 CAMERA = Camera("pinhole", 80, 60, 60.0, 62.0, 38.0, 31.0)
@@ -43,15 +44,17 @@ def test_texels_show_what_the_photo_shows_there(size: int, warp: tuple[float, fl
     assert (owner >= 0).all()
     gain, fall = np.array([0.1, -0.05, 0.0]), np.array([0.3, 0.2])
     everywhere = np.full((6, 8), np.inf, np.float32)
-    source = blend.Source(
-        blend.Picture(
+    source = blend_numba.Source(
+        blend_numba.Picture(
             whole, half, quarter, whole, np.zeros((0, 0), np.uint8), np.tile(np.array(warp, np.float32), (3, 4, 1)),
             np.concatenate([gain, fall]),
         ),
-        eye(CAMERA, POSE), blend.Occlusion(everywhere, pixel_angle(CAMERA), everywhere, everywhere, 1),
+        eye(CAMERA, POSE), blend_numba.Occlusion(everywhere, pixel_angle(CAMERA), everywhere, everywhere, 1),
     )  # fmt: skip
-    rows = blend.NumbaRows(blend.Laid(owner, flat, corners, np.tile(np.array([0, 0, 1], np.float32), (2, 1))))
-    weighing = blend.Weighing(bias=0.1, power=1.0, feather=4.0, min_cos=0.1, band=-1)
+    rows = blend_numba.NumbaRows(
+        blend_numba.Laid(owner, flat, corners, np.tile(np.array([0, 0, 1], np.float32), (2, 1)))
+    )
+    weighing = blend_numba.Weighing(bias=0.1, power=1.0, feather=4.0, min_cos=0.1, band=-1)
     rows.add(np.arange(2), np.zeros((2, 3), np.float32), source, weighing)
     rgb, seen = np.zeros((size, size, 3), np.uint8), np.zeros((size, size), np.uint8)
     rows.resolve(rgb, seen)
@@ -74,14 +77,14 @@ def test_photos_are_added_as_the_plain_words_have_it(name: str, band: int) -> No
     camera, rng = CAMERAS[name], np.random.default_rng(7)
     laid = scattered(rng, camera)
     count, shape = len(laid.flat), (*laid.owner.shape, 4)
-    fast, plain = (blend.Sums(*(np.zeros(shape, np.float32) for _ in range(2))) for _ in range(2))
-    weighing = blend.Weighing(bias=0.05, power=1.5, feather=9.0, min_cos=0.5, band=band)
+    fast, plain = (blend_numba.Sums(*(np.zeros(shape, np.float32) for _ in range(2))) for _ in range(2))
+    weighing = blend_numba.Weighing(bias=0.05, power=1.5, feather=9.0, min_cos=0.5, band=band)
     seen = 0
     for _ in range(2):
         source, faces = taken(rng, camera, band), rng.permutation(count)[: 3 * count // 4]
         share = (rng.uniform(size=(len(faces), 3)) * rng.choice([0, 1], (len(faces), 1))).astype(np.float32)
-        texels = plain_blend.accumulate(plain, laid, faces, share, source, weighing, camera)
-        assert blend.accumulate(fast, laid, faces, share, *source, weighing) == len(texels)
+        texels = reference_blend.accumulate(plain, laid, faces, share, source, weighing, camera)
+        assert blend_numba.accumulate(fast, laid, faces, share, *source, weighing) == len(texels)
         seen += len(texels)
     assert 0.1 < seen / (2 * (laid.owner >= 0).sum()) < 0.6  # many are seen, many are not
     for mine, theirs in zip(fast, plain, strict=True):

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.errors import SettingError
-from scan2sim.pipeline.io import image
-from scan2sim.texturing import blend
+from scan2sim.pipeline.core.errors import SettingError
+from scan2sim.pipeline.io.images import image
+from scan2sim.texturing.bake import blend_numba
 from tests.texturing import scattered
 from tests.texturing.corner import CAMERAS, POSES, Street, photograph, points
 
@@ -41,15 +41,15 @@ def test_torch_paints_the_same(street: Street, name: str, band: int) -> None:
 @pytest.mark.parametrize("band", [2, 0, -1])
 @pytest.mark.parametrize("name", scattered.CAMERAS)
 def test_torch_adds_the_same(name: str, band: int) -> None:
-    from scan2sim.texturing.blend_torch import TorchRows
+    from scan2sim.texturing.bake.blend_torch import TorchRows
 
     camera, rng = scattered.CAMERAS[name], np.random.default_rng(7)
     laid = scattered.scattered(rng, camera)
     source, faces = scattered.taken(rng, camera, band), np.arange(len(laid.flat))
     share = rng.choice([0, 1], (len(faces), 3)).astype(np.float32)
-    weighing = blend.Weighing(bias=0.05, power=1.5, feather=9.0, min_cos=0.5, band=band)
+    weighing = blend_numba.Weighing(bias=0.05, power=1.5, feather=9.0, min_cos=0.5, band=band)
     pages = []
-    for rows in (blend.NumbaRows(laid), TorchRows(laid, "cpu")):
+    for rows in (blend_numba.NumbaRows(laid), TorchRows(laid, "cpu")):
         rgb, seen = np.zeros((*laid.owner.shape, 3), np.uint8), np.zeros(laid.owner.shape, np.uint8)
         texels = rows.add(faces, share, source, weighing)
         rows.resolve(rgb, seen)

@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from scan2sim.pipeline.render import Image, pinhole
-from scan2sim.pipeline.types import U8, View
+from scan2sim.pipeline.camera.renderer import Image, pinhole
+from scan2sim.pipeline.core.types import U8, View
 from scan2sim.texturing.evaluate import BAND_NAMES, BANDS, HeldOut, error_picture, errors, figures, psnr, score, tally
 
 

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.camera.depth_map import depth_map, scene
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.step import silent
+from scan2sim.pipeline.core.types import F64, U8
 from scan2sim.pipeline.io import views as views_io
-from scan2sim.pipeline.step import silent
-from scan2sim.pipeline.types import F64, U8
-from scan2sim.pipeline.visibility import depth_map, scene
 from scan2sim.texturing.exposure import ExposureParams, exposure
-from scan2sim.texturing.photos import Exposures, camera_of
+from scan2sim.texturing.photo_cache import Exposures, camera_of
 from tests.texturing.corner import CAMERAS, POSES, Street, photograph
 
 STOPS = [0.5, -0.7, 0.2, 0.0]

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.types import F32, I32
-from scan2sim.texturing.mrf import adjacent, costs, detail_views, solve
+from scan2sim.pipeline.core.types import F32, I32
+from scan2sim.texturing.view_selection.mrf import adjacent, costs, detail_views, solve
 
 
 def energy(chosen: Sequence[int] | I32, view: I32, cost: F32, pairs: I32, price: F32) -> float:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from scan2sim.pipeline.types import I32, Mesh
+from scan2sim.pipeline.core.types import I32, Mesh
 from scan2sim.texturing import photo_charts
 from tests.texturing.corner import BOX, GROUND, join
 

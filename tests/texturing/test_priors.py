@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from scan2sim.pipeline.types import Camera, View
-from scan2sim.texturing.bundle import Corrections, Priors, _prior
+from scan2sim.pipeline.core.types import Camera, View
 from scan2sim.texturing.exposure import OUTLIER, ExposureParams
 from scan2sim.texturing.exposure import _prior as exposure_prior
-from scan2sim.texturing.photos import GAMMA, Exposures
+from scan2sim.texturing.photo_cache import GAMMA, Exposures
+from scan2sim.texturing.pose_refinement.bundle_adjustment import Corrections, Priors, _prior
 
 
 def test_exposures_differ_by_spread_and_tints_by_tint(tmp_path: Path) -> None:

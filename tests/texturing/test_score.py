@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.io import image
+from scan2sim.pipeline.camera.renderer import look_at
+from scan2sim.pipeline.core.step import Done, silent
+from scan2sim.pipeline.core.types import Frame, PointCloud
 from scan2sim.pipeline.io.clouds import las
-from scan2sim.pipeline.render import look_at
-from scan2sim.pipeline.step import Done, silent
-from scan2sim.pipeline.types import Frame, PointCloud
+from scan2sim.pipeline.io.images import image
 from scan2sim.texturing.score import ScoreParams, score
 from tests.texturing.corner import CAMERAS, POSES, Street, paint, points
 

@@ -10,9 +10,9 @@ import numpy.typing as npt
 import pytest
 from PIL import Image
 
+from scan2sim.pipeline.camera.renderer import Renderer, look_at, textured
+from scan2sim.pipeline.core.types import F64, U8, Camera, Frame, Mesh
 from scan2sim.pipeline.io import views as views_io
-from scan2sim.pipeline.render import Renderer, look_at, textured
-from scan2sim.pipeline.types import F64, U8, Camera, Frame, Mesh
 from tests.present import present
 from tests.texturing.corner import BOX, CAMERAS, GROUND, POSES, Street, paint, photograph, points
 

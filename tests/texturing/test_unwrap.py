@@ -8,13 +8,13 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from scan2sim.pipeline.core.step import Done, silent
+from scan2sim.pipeline.core.types import Camera, Frame, Mesh, View
 from scan2sim.pipeline.io import views as views_io
-from scan2sim.pipeline.step import Done, silent
-from scan2sim.pipeline.types import Camera, Frame, Mesh, View
 from scan2sim.texturing import unwrap as unwrap_module
 from scan2sim.texturing.atlas import Backend, manifold
-from scan2sim.texturing.choose import Choice
 from scan2sim.texturing.unwrap import UNWRAP, UnwrapParams, unwrap
+from scan2sim.texturing.view_selection.step import Choice
 from tests.present import present
 
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from scan2sim.pipeline.borders.grid import GRID, world
-from scan2sim.pipeline.types import F32, F64, I64, Mesh
+from scan2sim.pipeline.core.types import F32, F64, I64, Mesh
+from scan2sim.pipeline.tiling.borders.grid import GRID, world
 
 SPACING = 0.015
 """Metres between the places of an edge where colours are compared: texels span a centimetre or more."""

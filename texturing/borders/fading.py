@@ -11,10 +11,10 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit, prange
 
-from scan2sim.pipeline.sampling import page_taps
-from scan2sim.pipeline.types import F32, F64, I32, I64, U8, Bools
+from scan2sim.pipeline.camera.image_sampling import page_taps
+from scan2sim.pipeline.core.types import F32, F64, I32, I64, U8, Bools
+from scan2sim.texturing.bake.texel_map import box, frame
 from scan2sim.texturing.borders.correspondences import SOFT
-from scan2sim.texturing.texels import box, frame
 
 LEAF = 8
 """Places of a tree's leaf, at most."""

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from scan2sim.pipeline.cells import Cell
-from scan2sim.pipeline.classes import SURFACES
-from scan2sim.pipeline.step import Done, Inputs, Report, Step
+from scan2sim.pipeline.core.classes import SURFACES
+from scan2sim.pipeline.core.step import Done, Inputs, Report, Step
+from scan2sim.pipeline.core.types import Mesh
 from scan2sim.pipeline.steps.clip import CellParams
-from scan2sim.pipeline.types import Mesh
+from scan2sim.pipeline.tiling.voronoi_cell import Cell
 
 if TYPE_CHECKING:
-    from scan2sim.pipeline.io.textured import Textured
+    from scan2sim.pipeline.io.worlds.textured_mesh import Textured
 
 SPACING = 0.01
 """Metres between the places of an edge where colours are compared: other places than those that are levelled."""
@@ -28,7 +28,7 @@ def borders(inputs: Inputs, params: CellParams, out: Path, report: Report) -> Do
     doesn't; `shared`, of 1, the border edges that are the very same in both; `overlap_m` beyond the border;
     `colour_step` and its 95th percentile, grey levels. Street furniture has no border.
     """
-    from scan2sim.pipeline.io import textured
+    from scan2sim.pipeline.io.worlds import textured_mesh
 
     names = sorted({name.split(".", 2)[2] for name in inputs if name.count(".") == 2})
     found: dict[str, dict[str, dict[str, float]]] = {}
@@ -36,14 +36,16 @@ def borders(inputs: Inputs, params: CellParams, out: Path, report: Report) -> Do
         report(i / len(names), name)
         for group in SURFACES:
             if f"textured.{group}.{name}" in inputs:
-                own, other = (textured.read(inputs[key]) for key in (f"textured.{group}", f"textured.{group}.{name}"))
+                own, other = (
+                    textured_mesh.read(inputs[key]) for key in (f"textured.{group}", f"textured.{group}.{name}")
+                )
                 if own is not None and other is not None:
                     found.setdefault(name, {})[group] = _measured(own, other, params.cell, name)
     return Done({}, {"neighbours": found})
 
 
 def _measured(own: Textured, other: Textured, cell: Cell, name: str) -> dict[str, float]:
-    from scan2sim.pipeline.borders.gap import gap
+    from scan2sim.pipeline.tiling.borders.gap import gap
 
     between, (step, p95, _) = gap(_surface(own.mesh), _surface(other.mesh), cell, name), colour_step(own, other)
     values = {

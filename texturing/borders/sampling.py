@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from scan2sim.pipeline.io import image
-from scan2sim.pipeline.sampling import page_colours
-from scan2sim.pipeline.types import F32, F64, I64
+from scan2sim.pipeline.camera.image_sampling import page_colours
+from scan2sim.pipeline.core.types import F32, F64, I64
+from scan2sim.pipeline.io.images import image
 from scan2sim.texturing.borders.correspondences import SOFT, Samples
 
 BLUR = 0.1

@@ -1,4 +1,4 @@
-"""Point cloud files: a file a format (`pipeline.backends`), found by the file's suffix.
+"""Point cloud files: a file a format (`pipeline.core.plugins`), found by the file's suffix.
 
 A format's module has `SUFFIXES`, `read_header(path) -> (count, low, high, crs[, notes])`, `read(path, frame)` and
 `chunks(path, frame, size)`, and, where classes have names in the file, `class_names(path) -> (ours, names)`.
@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from scan2sim.pipeline import backends, classes
-from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.extras import need
-from scan2sim.pipeline.io import files
-from scan2sim.pipeline.types import F64, U8, Frame, PointCloud
+from scan2sim.pipeline.core import classes, plugins
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.optional_deps import need
+from scan2sim.pipeline.core.types import F64, U8, Frame, PointCloud
+from scan2sim.pipeline.io import file_checks
 
 CHUNK = 2_000_000
 AS_THEY_ARE = (".las", ".laz", ".ply")
@@ -62,7 +62,7 @@ class Format(Protocol):
 
 def formats() -> dict[str, str]:
     """Suffixes of cloud files, and one name, to the formats that read them."""
-    return backends.by_suffix(__name__)
+    return plugins.by_suffix(__name__)
 
 
 def known(path: Path) -> bool:
@@ -75,9 +75,9 @@ def _reader(path: Path) -> Any:
     name = found.get(path.name) or found.get(path.suffix.lower())
     if name is None:
         raise InputError(path, f"is no known cloud format ({path.suffix or 'no suffix'})", f"Use {KNOWN}")
-    files.check(path)
-    reader = backends.module(__name__, name)
-    need(str(path), *backends.needs(reader))
+    file_checks.check(path)
+    reader = plugins.module(__name__, name)
+    need(str(path), *plugins.needs(reader))
     return reader
 
 
@@ -101,7 +101,7 @@ def read(path: Path, frame: Frame) -> PointCloud:
 
 
 def meanings(path: Path, given: Mapping[int, int]) -> U8:
-    """Lookup table (256,) of what a cloud's class codes are here; `given` is the user's word (`pipeline.classes`).
+    """Lookup table (256,) of what a cloud's class codes are here; `given` is the user's word (`pipeline.core.classes`).
 
     Raises:
         InputError: as `read`.

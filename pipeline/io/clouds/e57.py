@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.io import points
-from scan2sim.pipeline.io.points import PART, Points
-from scan2sim.pipeline.types import F64, Frame, PointCloud
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.types import F64, Frame, PointCloud
+from scan2sim.pipeline.io import point_chunks
+from scan2sim.pipeline.io.point_chunks import PART, Points
 
 SUFFIXES = (".e57",)
 NEEDS = ("pye57",)
@@ -33,18 +33,18 @@ OTHERS = ("intensity", "timeStamp", "classification")
 
 def read_header(path: Path) -> tuple[int, F64, F64, str | None]:
     """Number of valid points of all scans, low and high corner, CRS as WKT or None."""
-    found = points.summary(path, _parts(path))
+    found = point_chunks.summary(path, _parts(path))
     return found.count, found.low, found.high, _crs(path)
 
 
 def read(path: Path, frame: Frame) -> PointCloud:
     """All scans' points in local coordinates."""
-    return points.whole(path, _parts(path), frame)
+    return point_chunks.whole(path, _parts(path), frame)
 
 
 def chunks(path: Path, frame: Frame, size: int) -> Iterator[PointCloud]:
     """The points in their order, `size` at a time at most."""
-    return points.local(path, _parts(path), points.summary(path, _parts(path)), frame, size)
+    return point_chunks.local(path, _parts(path), point_chunks.summary(path, _parts(path)), frame, size)
 
 
 def _parts(path: Path) -> Iterator[Points]:

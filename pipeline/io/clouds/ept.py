@@ -18,12 +18,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.extras import need
-from scan2sim.pipeline.io import files, points
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.optional_deps import need
+from scan2sim.pipeline.core.types import F64, Frame, PointCloud
+from scan2sim.pipeline.io import file_checks, point_chunks
 from scan2sim.pipeline.io.clouds import las
-from scan2sim.pipeline.io.points import PART, Points
-from scan2sim.pipeline.types import F64, Frame, PointCloud
+from scan2sim.pipeline.io.point_chunks import PART, Points
 
 Schema = tuple[np.dtype[Any], dict[str, tuple[float, float]]]
 """A packed point, and scale and offset of each of its dimensions."""
@@ -38,18 +38,18 @@ KEY = re.compile(r"\d{1,3}-\d{1,10}-\d{1,10}-\d{1,10}")
 
 def read_header(path: Path) -> tuple[int, F64, F64, str | None]:
     """Number of points, low and high corner, of the points themselves; CRS as WKT or None."""
-    found = points.summary(path, _parts(path))
+    found = point_chunks.summary(path, _parts(path))
     return found.count, found.low, found.high, _crs(path, _json(path))
 
 
 def read(path: Path, frame: Frame) -> PointCloud:
     """All nodes' points in local coordinates."""
-    return points.whole(path, _parts(path), frame)
+    return point_chunks.whole(path, _parts(path), frame)
 
 
 def chunks(path: Path, frame: Frame, size: int) -> Iterator[PointCloud]:
     """The points, coarse nodes first, `size` at a time at most."""
-    return points.local(path, _parts(path), points.summary(path, _parts(path)), frame, size)
+    return point_chunks.local(path, _parts(path), point_chunks.summary(path, _parts(path)), frame, size)
 
 
 def _parts(path: Path) -> Iterator[Points]:
@@ -160,7 +160,7 @@ def _schema(path: Path, info: dict[str, Any]) -> Schema:
 
 
 def _json(path: Path) -> dict[str, Any]:
-    files.check(path, REMEDY)
+    file_checks.check(path, REMEDY)
     try:
         if path.stat().st_size > LARGEST:
             raise ValueError(f"{path.stat().st_size:,} bytes")

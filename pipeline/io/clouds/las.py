@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from scan2sim.pipeline.errors import DataError, InputError
-from scan2sim.pipeline.io import files, las_header
+from scan2sim.pipeline.core.errors import DataError, InputError
+from scan2sim.pipeline.core.types import F64, Frame, PointCloud
+from scan2sim.pipeline.io import file_checks, las_header
 from scan2sim.pipeline.io.las_header import truncated
-from scan2sim.pipeline.types import F64, Frame, PointCloud
 
 SUFFIXES = (".las", ".laz")
 CHUNK = 2_000_000
@@ -30,13 +30,13 @@ SLACK = 0.1
 WIDE = 100.0
 """CRS units by which bounds may be more than twice as wide as a sample of the points."""
 SOFTWARE = "scan2sim"
-"""Who wrote a file, in its header: codes of 64 and up are of `pipeline.classes` then."""
+"""Who wrote a file, in its header: codes of 64 and up are of `pipeline.core.classes` then."""
 
 
 def _open(path: Path, **options: Any) -> Any:
     import laspy
 
-    las_header.check(files.check(path))
+    las_header.check(file_checks.check(path))
     try:
         return laspy.open(path, **options)
     except Exception as error:  # laspy's and the decompressors' parsers raise whatever the damage leads to

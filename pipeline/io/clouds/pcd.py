@@ -19,10 +19,10 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.io import points, text
-from scan2sim.pipeline.io.points import PART, Points
-from scan2sim.pipeline.types import F64, U8, Frame, PointCloud
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.types import F64, U8, Frame, PointCloud
+from scan2sim.pipeline.io import number_text, point_chunks
+from scan2sim.pipeline.io.point_chunks import PART, Points
 
 SUFFIXES = (".pcd",)
 REMEDY = "Copy it again, or write it as binary PCD or LAZ"
@@ -46,18 +46,18 @@ class _Header:
 
 def read_header(path: Path) -> tuple[int, F64, F64, str | None]:
     """Number of points that are finite, low and high corner; PCD has no CRS."""
-    found = points.summary(path, _parts(path))
+    found = point_chunks.summary(path, _parts(path))
     return found.count, found.low, found.high, None
 
 
 def read(path: Path, frame: Frame) -> PointCloud:
     """All points in local coordinates, with `rgb`, `intensity`, a class and times where there are fields of them."""
-    return points.whole(path, _parts(path), frame)
+    return point_chunks.whole(path, _parts(path), frame)
 
 
 def chunks(path: Path, frame: Frame, size: int) -> Iterator[PointCloud]:
     """The points in their order, `size` at a time at most."""
-    return points.local(path, _parts(path), points.summary(path, _parts(path)), frame, size)
+    return point_chunks.local(path, _parts(path), point_chunks.summary(path, _parts(path)), frame, size)
 
 
 def _parts(path: Path) -> Iterator[Points]:
@@ -123,8 +123,8 @@ def _header(path: Path, file: BinaryIO) -> _Header:
 def _ascii(path: Path, file: BinaryIO, header: _Header) -> Iterator[npt.NDArray[Any]]:
     wide = sum(int(np.prod(header.row[name].shape)) for name in header.row.names or ())
     done = 0
-    for block in text.blocks(path, file):
-        values = text.numbers(block, None, wide)
+    for block in number_text.blocks(path, file):
+        values = number_text.numbers(block, None, wide)
         yield _records(values, header.row)
         done += len(values)
     if done < header.count:

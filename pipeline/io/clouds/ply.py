@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.io import files, points, text
-from scan2sim.pipeline.io.points import PART, Points
-from scan2sim.pipeline.types import F64, Frame, PointCloud
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.types import F64, Frame, PointCloud
+from scan2sim.pipeline.io import file_checks, number_text, point_chunks
+from scan2sim.pipeline.io.point_chunks import PART, Points
 
 SUFFIXES = (".ply",)
 AGAIN = "Export it again, or as LAZ"
@@ -57,7 +57,7 @@ class Layout:
 
 def read_header(path: Path) -> tuple[int, F64, F64, str | None, tuple[str, ...]]:
     """Number of points that are finite, low and high corner (CRS units), no CRS, and how many aren't finite."""
-    found = points.summary(path, _parts(path))
+    found = point_chunks.summary(path, _parts(path))
     lost = layout(path).count - found.count
     notes = (f"{lost:,} points with NaN coordinates left out",) if lost else ()
     return found.count, found.low, found.high, None, notes
@@ -65,12 +65,12 @@ def read_header(path: Path) -> tuple[int, F64, F64, str | None, tuple[str, ...]]
 
 def read(path: Path, frame: Frame) -> PointCloud:
     """All points in local coordinates, with colours, intensities and a class (`CLASSES`) where they have them."""
-    return points.whole(path, _parts(path), frame)
+    return point_chunks.whole(path, _parts(path), frame)
 
 
 def chunks(path: Path, frame: Frame, size: int) -> Iterator[PointCloud]:
     """The points in their order, `size` at a time at most, each part in a frame with its origin near its points."""
-    return points.local(path, _parts(path), points.summary(path, _parts(path)), frame, size)
+    return point_chunks.local(path, _parts(path), point_chunks.summary(path, _parts(path)), frame, size)
 
 
 def layout(path: Path) -> Layout:
@@ -79,7 +79,7 @@ def layout(path: Path) -> Layout:
     Raises:
         InputError: it is none, has no vertices with x, y and z, or ones of varying length.
     """
-    with files.check(path).open("rb") as file:
+    with file_checks.check(path).open("rb") as file:
         head, found, _ = file.read(LONGEST).partition(b"end_header")
         lines = [line.split() for line in head.decode("latin-1").splitlines()]
         if not head.startswith(b"ply") or not found:
@@ -160,14 +160,14 @@ def _of_text(path: Path, header: Layout) -> Iterator[npt.NDArray[Any]]:
     skip, at, names = header.before, 0, header.row.names or ()
     with path.open("rb") as file:
         file.seek(header.start)
-        for block in text.blocks(path, file):
+        for block in number_text.blocks(path, file):
             lines = block[skip:]
             skip = max(0, skip - len(block))
             if header.last and at + len(lines) > header.count:
                 raise _other_count(path, header.count, at + len(lines))
             lines = lines[: header.count - at]
             try:
-                table = text.numbers(lines, None, len(names))
+                table = number_text.numbers(lines, None, len(names))
             except ValueError as error:
                 if lines and len(lines[-1].split()) < len(names):  # the last line of a broken copy
                     raise _other_count(path, header.count, at + len(lines) - 1) from None

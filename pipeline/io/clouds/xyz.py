@@ -24,10 +24,10 @@ from pathlib import Path
 
 import numpy as np
 
-from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.io import points, text
-from scan2sim.pipeline.io.points import Points
-from scan2sim.pipeline.types import F64, Frame, PointCloud
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.types import F64, Frame, PointCloud
+from scan2sim.pipeline.io import number_text, point_chunks
+from scan2sim.pipeline.io.point_chunks import Points
 
 SUFFIXES = (".xyz", ".csv", ".txt", ".asc")
 COMMENTS = ("#", "//")
@@ -64,25 +64,25 @@ class _Form:
 
 def read_header(path: Path) -> tuple[int, F64, F64, str | None, tuple[str, ...]]:
     """Number of points, low and high corner, no CRS, and what was assumed of the columns."""
-    found = points.summary(path, _parts(path))
+    found = point_chunks.summary(path, _parts(path))
     return found.count, found.low, found.high, None, (_form(path).note,)
 
 
 def read(path: Path, frame: Frame) -> PointCloud:
     """All points in local coordinates, with what their columns hold."""
-    return points.whole(path, _parts(path), frame)
+    return point_chunks.whole(path, _parts(path), frame)
 
 
 def chunks(path: Path, frame: Frame, size: int) -> Iterator[PointCloud]:
     """The points in their order, `size` at a time at most."""
-    return points.local(path, _parts(path), points.summary(path, _parts(path)), frame, size)
+    return point_chunks.local(path, _parts(path), point_chunks.summary(path, _parts(path)), frame, size)
 
 
 def _parts(path: Path) -> Iterator[Points]:
     form = _form(path)
     heading = form.heading
     with open(path, "rb") as file:
-        for block in text.blocks(path, file):
+        for block in number_text.blocks(path, file):
             if heading:
                 at = next((i for i, line in enumerate(block) if not _comment(line)), len(block))
                 heading = at == len(block)  # comments alone: the heading is yet to come
@@ -91,7 +91,7 @@ def _parts(path: Path) -> Iterator[Points]:
             if not rows:
                 continue
             try:
-                values = text.numbers(rows, form.delimiter, len(form.columns))
+                values = number_text.numbers(rows, form.delimiter, len(form.columns))
             except ValueError as error:
                 cause = f"is no cloud of {len(form.columns)} columns a line ({error})"
                 raise InputError(path, cause, "Export it again, a point a line") from None

@@ -1,4 +1,4 @@
-"""GPS tracks: a file a format (`pipeline.backends`), found by the track's suffix.
+"""GPS tracks: a file a format (`pipeline.core.plugins`), found by the track's suffix.
 
 A format's module has `SUFFIXES` and `read(path) -> GpsTrack`.
 """
@@ -8,11 +8,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Protocol
 
-from scan2sim.pipeline import backends
-from scan2sim.pipeline.errors import InputError, from_os_error
-from scan2sim.pipeline.extras import need
-from scan2sim.pipeline.io import files
-from scan2sim.pipeline.types import GpsTrack
+from scan2sim.pipeline.core import plugins
+from scan2sim.pipeline.core.errors import InputError, from_os_error
+from scan2sim.pipeline.core.optional_deps import need
+from scan2sim.pipeline.core.types import GpsTrack
+from scan2sim.pipeline.io import file_checks
 
 
 class Format(Protocol):
@@ -51,11 +51,11 @@ def reader(path: Path) -> Format:
         InputError: there is no such file, or its suffix is unknown.
         UnavailableError: a video, and PyAV isn't installed.
     """
-    formats = backends.by_suffix(__name__)
+    formats = plugins.by_suffix(__name__)
     name = formats.get(path.suffix.lower())
     if name is None:
         raise InputError(path, "is no known GPS format", f"Give one of {', '.join(formats)}")
-    files.check(path)
-    found: Format = backends.module(__name__, name)
-    need(str(path), *backends.needs(found))
+    file_checks.check(path)
+    found: Format = plugins.module(__name__, name)
+    need(str(path), *plugins.needs(found))
     return found

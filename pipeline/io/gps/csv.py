@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.io.fixes import located, number, seconds, sigma_of, tidy
-from scan2sim.pipeline.types import Frame, GpsTrack
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.types import Frame, GpsTrack
+from scan2sim.pipeline.io.gps_fixes import located, number, seconds, sigma_of, tidy
 
 SUFFIXES = (".csv",)
 

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.extras import need
-from scan2sim.pipeline.io.fixes import MAX_DOP, RANGE_ERROR, located
-from scan2sim.pipeline.types import F64, GpsTrack
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.optional_deps import need
+from scan2sim.pipeline.core.types import F64, GpsTrack
+from scan2sim.pipeline.io.gps_fixes import MAX_DOP, RANGE_ERROR, located
 
 SUFFIXES = (".mp4", ".mov", ".360", ".lrv")
 NEEDS = ("av",)

@@ -6,10 +6,10 @@ import math
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
-from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.types import GpsTrack
 from scan2sim.pipeline.io import xml
-from scan2sim.pipeline.io.fixes import located, number, seconds, sigma_of
-from scan2sim.pipeline.types import GpsTrack
+from scan2sim.pipeline.io.gps_fixes import located, number, seconds, sigma_of
 
 SUFFIXES = (".gpx",)
 

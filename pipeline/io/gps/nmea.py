@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.io.fixes import RANGE_ERROR, located, number, sigma_of
-from scan2sim.pipeline.types import GpsTrack
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.types import GpsTrack
+from scan2sim.pipeline.io.gps_fixes import RANGE_ERROR, located, number, sigma_of
 
 SUFFIXES = (".nmea", ".txt", ".log")
 QUALITY_ERROR = {2: 0.8, 4: 0.02, 5: 0.3}

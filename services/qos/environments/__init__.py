@@ -6,11 +6,11 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.step import Params
 from scan2sim.pipeline.io import toml
-from scan2sim.pipeline.step import Params
+from scan2sim.services.qos.link_profile import Shape
 from scan2sim.services.qos.requirements import Environment
-from scan2sim.services.qos.shape import Shape
 
 FOLDER = Path(__file__).parent
 

@@ -1,4 +1,4 @@
-"""What shapes a link: a file each, found by its name (`pipeline.backends`)."""
+"""What shapes a link: a file each, found by its name (`pipeline.core.plugins`)."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import shutil
 from pathlib import Path
 from typing import Protocol
 
-from scan2sim.pipeline import backends
-from scan2sim.pipeline.backends import Lacking
+from scan2sim.pipeline.core import plugins
+from scan2sim.pipeline.core.plugins import Lacking
+from scan2sim.services.qos.link_profile import Shape
 from scan2sim.services.qos.namespaces import WHAT, Namespace
-from scan2sim.services.qos.shape import Shape
 
 
 class Wire(Protocol):
@@ -42,7 +42,7 @@ def find(name: str | None = None) -> Backend:
         SettingError: there is none of that name.
         UnavailableError: it can't run here, or none can.
     """
-    found: Backend = backends.best(__name__, name, "link", WHAT)
+    found: Backend = plugins.best(__name__, name, "link", WHAT)
     return found
 
 

@@ -8,11 +8,11 @@ from __future__ import annotations
 import subprocess
 from pathlib import Path
 
-from scan2sim.pipeline.backends import Lacking
-from scan2sim.pipeline.errors import UnavailableError
+from scan2sim.pipeline.core.errors import UnavailableError
+from scan2sim.pipeline.core.plugins import Lacking
+from scan2sim.services.qos.link_profile import Shape
 from scan2sim.services.qos.links import programs
 from scan2sim.services.qos.namespaces import WHAT, Namespace, ip
-from scan2sim.services.qos.shape import Shape
 
 RANK = 1
 LARGEST = 1514

@@ -10,11 +10,11 @@ import socket
 import time
 from pathlib import Path
 
-from scan2sim.pipeline.backends import Lacking
-from scan2sim.pipeline.errors import UnavailableError
+from scan2sim.pipeline.core.errors import UnavailableError
+from scan2sim.pipeline.core.plugins import Lacking
+from scan2sim.services.qos.link_profile import Shape
 from scan2sim.services.qos.links import programs
 from scan2sim.services.qos.namespaces import WHAT, Namespace
-from scan2sim.services.qos.shape import Shape
 
 RANK = 2
 PROMPT = b"VDEwf$ "

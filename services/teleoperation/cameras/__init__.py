@@ -9,10 +9,10 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from scan2sim.pipeline import backends
-from scan2sim.pipeline.types import F64, U8
+from scan2sim.pipeline.core import plugins
+from scan2sim.pipeline.core.types import F64, U8
 from scan2sim.services.credentials import redacted
-from scan2sim.services.teleoperation import marks
+from scan2sim.services.teleoperation.video import timecode
 
 SILENT = 1.0
 """Seconds without a picture after which a camera counts as gone."""
@@ -88,10 +88,10 @@ def pictures(source: str, view: View) -> Iterator[Picture]:
         SettingError: there is no such file.
         UnavailableError: it can't run here.
     """
-    backend: Backend = backends.find(__name__, source, "camera")
+    backend: Backend = plugins.find(__name__, source, "camera")
     for picture in backend.pictures(view):
         if view.marked:
-            marks.mark(picture.image, picture.captured)
+            timecode.mark(picture.image, picture.captured)
         yield picture
 
 

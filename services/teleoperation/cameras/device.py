@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.core.errors import InputError
 from scan2sim.services.credentials import redacted
 from scan2sim.services.teleoperation.cameras import Picture, View
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from scan2sim.pipeline.types import U8
+from scan2sim.pipeline.core.types import U8
 from scan2sim.services.teleoperation.cameras import Picture, View, ticks
 
 BARS = ((235, 235, 235), (235, 235, 16), (16, 235, 235), (16, 235, 16), (235, 16, 235), (235, 16, 16), (16, 16, 235))

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.types import U8
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.types import U8
 from scan2sim.services.credentials import redacted
 from scan2sim.services.teleoperation.cameras import Picture, View, ticks
 

@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from scan2sim.pipeline.io.scene import read_scene
-from scan2sim.pipeline.render import pinhole
-from scan2sim.pipeline.types import F64
+from scan2sim.pipeline.camera.renderer import pinhole
+from scan2sim.pipeline.core.types import F64
+from scan2sim.pipeline.io.worlds.scene import read_scene
 from scan2sim.services.teleoperation.cameras import Mount, Picture, View, ticks
-from scan2sim.services.teleoperation.rasteriser import Eye, World, world
+from scan2sim.services.teleoperation.sim.world_renderer import Eye, World, world
 
 _worlds: dict[Path, World] = {}
 _loading = threading.Lock()

@@ -22,7 +22,7 @@ import pytest
 from _pytest.mark import ParameterSet
 
 from tests.conftest import ROOT
-from tests.ports import free_port
+from tests.fakes.ports import free_port
 
 pytest.importorskip("prefect")
 

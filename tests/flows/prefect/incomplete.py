@@ -12,7 +12,7 @@ from scan2sim.flows import cli
 from scan2sim.flows.deployed.reprocess import reprocess
 from scan2sim.flows.deployed.survey import survey
 from scan2sim.flows.deployed.tile import tile
-from scan2sim.pipeline.errors import IncompleteError
+from scan2sim.pipeline.core.errors import IncompleteError
 
 
 def made(*_: object, **__: object) -> Path:

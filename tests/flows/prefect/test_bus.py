@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from bench.bus_broker import Broker
 from scan2sim.services import kafka
-from scan2sim.services.monitoring.events import Event
-from scan2sim.services.monitoring.noticed import Noticed
+from scan2sim.services.monitoring.dashboard.state import Noticed
+from scan2sim.services.monitoring.events.schema import Event
+from tests.fakes.broker import Broker
 from tests.flows.prefect.conftest import Server, on
 from tests.flows.prefect.test_kills import SCRIPT, TILES
 from tests.flows.prefect.toy_steps import STEPS

@@ -14,11 +14,11 @@ from pathlib import Path
 import pytest
 
 from scan2sim.flows.engine.versions import check_version, versions
-from scan2sim.pipeline.errors import UnavailableError, exit_code
+from scan2sim.pipeline.core.errors import UnavailableError, exit_code
 from tests.conftest import ROOT
+from tests.fakes.ports import free_port
 from tests.flows.prefect.conftest import Server, kill, on, processes, serving, wait_for
 from tests.flows.prefect.toy_steps import planned
-from tests.ports import free_port
 
 DEPLOYED = ["reprocess", "survey", "tile"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from scan2sim.pipeline.errors import IncompleteError, exit_code
+from scan2sim.pipeline.core.errors import IncompleteError, exit_code
 from tests.flows.prefect.conftest import Server, on
 
 

@@ -16,8 +16,8 @@ import pytest
 from scan2sim.flows.engine.dispatch import dispatch
 from scan2sim.flows.engine.execution import run_apart
 from scan2sim.flows.engine.planning import Planned
-from scan2sim.flows.recipes.graph import NodeId
-from scan2sim.pipeline.store import Store
+from scan2sim.flows.pipelines.graph import NodeId
+from scan2sim.pipeline.core.cache import Store
 from tests.conftest import ROOT
 from tests.flows.prefect.conftest import Server, environment, kill, on, processes, wait_for
 from tests.flows.prefect.toy_steps import STEPS, planned

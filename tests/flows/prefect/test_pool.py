@@ -13,10 +13,10 @@ from tests.flows.prefect.conftest import Server, on, processes, wait_for
 MARK = "SCAN2SIM_TEST_POOL"
 ASK = """
 import sys, time
-from scan2sim.services.monitoring.bus import Bus
-from scan2sim.services.monitoring.events import WorkersWanted
-from scan2sim.services.monitoring.joined import BusParams
-from scan2sim.services.monitoring.monitor import ros
+from scan2sim.services.monitoring.events.bus import Bus
+from scan2sim.services.monitoring.events.schema import WorkersWanted
+from scan2sim.services.monitoring.settings.bus import BusParams
+from scan2sim.services.monitoring.node.monitor import ros
 ros.init()
 node = ros.Node("asks")
 bus = Bus(node, BusParams())

@@ -15,8 +15,8 @@ from scan2sim.flows.deployed.tile import by_tasks
 from scan2sim.flows.engine.lock import locked
 from scan2sim.flows.engine.progress import published
 from scan2sim.flows.engine.versions import versions
-from scan2sim.pipeline.errors import BusyError
-from scan2sim.pipeline.store import Store
+from scan2sim.pipeline.core.cache import Store
+from scan2sim.pipeline.core.errors import BusyError
 from tests.flows.prefect.toy_steps import STEPS, planned
 
 

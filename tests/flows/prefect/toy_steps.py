@@ -8,9 +8,9 @@ import time
 from pathlib import Path
 
 from scan2sim.flows.engine.planning import Planned, plan
-from scan2sim.flows.recipes.graph import Node, Output
-from scan2sim.pipeline.step import Done, Inputs, Report, Step
-from scan2sim.pipeline.store import Store
+from scan2sim.flows.pipelines.graph import Node, Output
+from scan2sim.pipeline.core.cache import Store
+from scan2sim.pipeline.core.step import Done, Inputs, Report, Step
 from tests.flows.toy import ToyParams, toy
 
 STEPS = ("first", "second", "third")

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.io.scene import Scene
-from tests.pipeline import made_up
+from scan2sim.pipeline.io.worlds.scene import Scene
+from tests.pipeline import synthetic
 
 
 @dataclass(frozen=True)
@@ -199,7 +199,7 @@ READERS: dict[str, Reader] = {
 def surveyed_off(folder: Path, scene: Scene, name: str) -> float:
     """Metres between a corner of the made-up scene's last house, as surveyed, and where a format's reader finds it."""
     about = json.loads((folder / "metadata.json").read_text(encoding="utf-8"))
-    x, y = made_up.HOUSE
+    x, y = synthetic.HOUSE
     surveyed = scene.tiles[-1].frame.to_crs((x, y, 4.5))  # of the roof
     shown = np.concatenate([one.corners.reshape(-1, 3) for one in READERS[name](folder, scene)])
     found = (shown + about["world_origin_m"]) / about["unit_m"]

@@ -12,15 +12,16 @@ import numpy as np
 import pytest
 
 from scan2sim.flows.commands.inspect import inspect_path
-from scan2sim.pipeline.errors import DataError, InputError
-from scan2sim.pipeline.io import clouds, image
+from scan2sim.pipeline.core.cache import digest
+from scan2sim.pipeline.core.errors import DataError, InputError
+from scan2sim.pipeline.core.step import silent
+from scan2sim.pipeline.core.types import Camera, Frame, PointCloud, View
+from scan2sim.pipeline.io import clouds
 from scan2sim.pipeline.io.clouds import las
+from scan2sim.pipeline.io.images import image
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.pipeline.step import silent
 from scan2sim.pipeline.steps.ingest import IngestParams, ingest
 from scan2sim.pipeline.steps.views import _problem
-from scan2sim.pipeline.store import digest
-from scan2sim.pipeline.types import Camera, Frame, PointCloud, View
 
 FRAME = Frame("local", (700_000.0, 5_400_000.0, 100.0))
 SIZES = {"bounds": "<6d", "count": "<Q", "vlrs": "<I", "extended": "<QI", "scale": "<d"}

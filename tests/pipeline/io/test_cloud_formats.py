@@ -14,12 +14,12 @@ import pytest
 from typer.testing import CliRunner
 
 from scan2sim.flows.cli import app
-from scan2sim.pipeline.errors import InputError, ScanError, UnavailableError
+from scan2sim.pipeline.core.errors import InputError, ScanError, UnavailableError
+from scan2sim.pipeline.core.types import Frame, PointCloud
+from scan2sim.pipeline.importers.clouds_and_photos import import_las
 from scan2sim.pipeline.io import clouds
 from scan2sim.pipeline.io.clouds import las
-from scan2sim.pipeline.io.las_csv import import_las
 from scan2sim.pipeline.io.tile import read_tile, write_tile
-from scan2sim.pipeline.types import Frame, PointCloud
 from tests.pipeline.io.test_clouds import FRAME, made, write_ply
 from tests.present import present
 
@@ -336,7 +336,7 @@ def test_a_cut_file_is_refused(written: tuple[Format, Path, PointCloud]) -> None
 
 
 def test_a_file_whose_reader_is_missing_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr("scan2sim.pipeline.extras.importlib.util.find_spec", lambda name: None)
+    monkeypatch.setattr("scan2sim.pipeline.core.optional_deps.importlib.util.find_spec", lambda name: None)
     (tmp_path / "c.e57").write_bytes(b"")
     with pytest.raises(UnavailableError, match=r"c\.e57: needs pye57.*pip install 'scan2sim\[e57\]'"):
         clouds.read_header(tmp_path / "c.e57")
@@ -444,7 +444,7 @@ def test_a_text_that_is_no_cloud_is_refused(tmp_path: Path, lines: str, cause: s
 
 
 def test_a_line_that_never_ends_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("scan2sim.pipeline.io.text.BLOCK", 1 << 10)
+    monkeypatch.setattr("scan2sim.pipeline.io.number_text.BLOCK", 1 << 10)
     (tmp_path / "c.xyz").write_text("1 2 " + "3" * 5000, encoding="utf-8")
     with pytest.raises(InputError, match="line of more than|is no cloud"):
         clouds.read(tmp_path / "c.xyz", Frame())

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.types import Frame, PointCloud
 from scan2sim.pipeline.io import clouds
 from scan2sim.pipeline.io.clouds import las
-from scan2sim.pipeline.types import Frame, PointCloud
 from tests.present import present
 
 FRAME = Frame("EPSG:32632", (458_852.0, 5_428_637.0, 100.0))

@@ -8,24 +8,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.io import textured
-from scan2sim.pipeline.io.meshes import PageNames
-from scan2sim.pipeline.io.meshes import collada as dae
-from scan2sim.pipeline.types import Mesh
-from tests.pipeline import made_up
+from scan2sim.pipeline.core.types import Mesh
+from scan2sim.pipeline.io.mesh_formats import PageNames
+from scan2sim.pipeline.io.mesh_formats import collada as dae
+from scan2sim.pipeline.io.worlds import textured_mesh
+from tests.pipeline import synthetic
 from tests.present import present
 
 
-@pytest.mark.parametrize("make", [made_up.ground, made_up.house])
+@pytest.mark.parametrize("make", [synthetic.ground, synthetic.house])
 def test_triangles_uv_and_pages_survive(tmp_path: Path, make: Callable[[], Mesh]) -> None:
     import collada
 
     mesh = make()
-    surface = present(textured.read(made_up.textured(tmp_path / "in", mesh)))
+    surface = present(textured_mesh.read(synthetic.textured(tmp_path / "in", mesh)))
     dae.write(tmp_path / "a.dae", surface, PageNames("a", ("m_0", "m_1"), ("m_0.png", "m_1.png"), (0, 1)))
     read = collada.Collada(str(tmp_path / "a.dae"))
     assert read.assetInfo.upaxis == "Z_UP" and read.assetInfo.unitmeter == 1.0
-    for page, (corners, uv) in made_up.by_page(mesh).items():
+    for page, (corners, uv) in synthetic.by_page(mesh).items():
         (triangles,) = next(g for g in read.geometries if g.name == f"m_{page}").primitives
         np.testing.assert_allclose(triangles.vertex[triangles.vertex_index], corners, atol=1e-4)
         np.testing.assert_allclose(triangles.texcoordset[0][triangles.texcoord_indexset[0]], uv, atol=1e-6)

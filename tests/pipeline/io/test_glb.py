@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from scan2sim.pipeline.errors import SettingError, UnavailableError
-from scan2sim.pipeline.io import glb, provenance, textured
-from scan2sim.pipeline.io.glb import GlbParams
-from scan2sim.pipeline.io.scene import Surface, whole
-from scan2sim.pipeline.types import Camera, View
-from tests.pipeline import made_up
+from scan2sim.pipeline.core.errors import SettingError, UnavailableError
+from scan2sim.pipeline.core.types import Camera, View
+from scan2sim.pipeline.io.worlds import glb, provenance, textured_mesh
+from scan2sim.pipeline.io.worlds.glb import GlbParams
+from scan2sim.pipeline.io.worlds.scene import Surface, whole
+from tests.pipeline import synthetic
 from tests.present import present
 
-GROUPS = {"terrain": made_up.ground(), "building": made_up.house()}
+GROUPS = {"terrain": synthetic.ground(), "building": synthetic.house()}
 DTYPE: dict[int, Any] = {5120: np.int8, 5121: np.uint8, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 COLUMNS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3}
 EXTENSION = {"meshopt": "EXT_meshopt_compression", "draco": "KHR_draco_mesh_compression"}
@@ -29,7 +29,8 @@ EXTENSION = {"meshopt": "EXT_meshopt_compression", "draco": "KHR_draco_mesh_comp
 
 def surfaces(folder: Path) -> list[Surface]:
     return [
-        whole(group, present(textured.read(made_up.textured(folder / group, mesh)))) for group, mesh in GROUPS.items()
+        whole(group, present(textured_mesh.read(synthetic.textured(folder / group, mesh))))
+        for group, mesh in GROUPS.items()
     ]
 
 
@@ -99,7 +100,7 @@ def test_a_reader_gets_all_triangles_y_up(tmp_path: Path) -> None:
     assert set(scene.geometry) == {"terrain_0", "terrain_1", "building_0", "building_1"}
     np.testing.assert_allclose(scene.bounds, [[-10, -0.5, -10], [10, 4.5, 10]], atol=1e-4)
     for group, mesh in GROUPS.items():
-        for page, (corners, uv) in made_up.by_page(mesh).items():
+        for page, (corners, uv) in synthetic.by_page(mesh).items():
             part = scene.geometry[f"{group}_{page}"]
             y_up = np.stack([corners[..., 0], corners[..., 2], -corners[..., 1]], axis=-1)
             np.testing.assert_allclose(part.vertices[part.faces], y_up, atol=1e-5)
@@ -117,7 +118,7 @@ def test_packed_geometry_is_the_same_to_a_millimetre(tmp_path: Path, codec: str)
         "plain": [], "meshopt": [EXTENSION["meshopt"], "KHR_mesh_quantization"], "draco": [EXTENSION["draco"]],
     }[codec]  # fmt: skip
     for group, mesh in GROUPS.items():
-        for page, (corners, uv) in made_up.by_page(mesh).items():
+        for page, (corners, uv) in synthetic.by_page(mesh).items():
             part = file.mesh(f"{group}_{page}")
             y_up = np.stack([corners[..., 0], corners[..., 2], -corners[..., 1]], axis=-1)
             wanted = np.concatenate([y_up, uv[..., :1], 1 - uv[..., 1:]], axis=-1)

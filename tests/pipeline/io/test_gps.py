@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from pyproj import Geod, Transformer
 
-from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.types import Frame, GpsTrack
 from scan2sim.pipeline.io import gps
-from scan2sim.pipeline.io.fixes import without_jumps
 from scan2sim.pipeline.io.gps.gopro import GPS_YEAR_2000, gpmf_fixes
-from scan2sim.pipeline.types import Frame, GpsTrack
+from scan2sim.pipeline.io.gps_fixes import without_jumps
 from tests.present import present
 
 START = datetime(2023, 6, 1, 23, 59, 58, tzinfo=UTC).timestamp()  # midnight comes after two seconds

@@ -12,12 +12,12 @@ import pytest
 from laspy.vlrs.known import ExtraBytesStruct
 from pyproj import CRS
 
-from scan2sim.pipeline.classes import CLASSES
-from scan2sim.pipeline.errors import DataError, InputError, SpaceError, UnavailableError
+from scan2sim.pipeline.core.classes import CLASSES
+from scan2sim.pipeline.core.errors import DataError, InputError, SpaceError, UnavailableError
+from scan2sim.pipeline.core.types import U8, Frame
 from scan2sim.pipeline.io import las_classes
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.las_classes import write_classified
-from scan2sim.pipeline.types import U8, Frame
 
 N = 1000
 FRAME = Frame("EPSG:25832", (500_000.0, 5_400_000.0, 100.0))

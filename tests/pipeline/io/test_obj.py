@@ -8,26 +8,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.io import textured
-from scan2sim.pipeline.io.meshes import PageNames, obj
-from scan2sim.pipeline.types import Mesh
-from tests.pipeline import made_up
+from scan2sim.pipeline.core.types import Mesh
+from scan2sim.pipeline.io.mesh_formats import PageNames, obj
+from scan2sim.pipeline.io.worlds import textured_mesh
+from tests.pipeline import synthetic
 from tests.present import present
 
 NAMES = PageNames("a", ("m_0", "m_1"), ("m_0.png", "m_1.png"), (0, 1))
 
 
-@pytest.mark.parametrize("make", [made_up.ground, made_up.house])
+@pytest.mark.parametrize("make", [synthetic.ground, synthetic.house])
 def test_triangles_uv_and_pages_survive(tmp_path: Path, make: Callable[[], Mesh]) -> None:
     import trimesh
 
     mesh = make()
-    surface = present(textured.read(made_up.textured(tmp_path / "in", mesh)))
+    surface = present(textured_mesh.read(synthetic.textured(tmp_path / "in", mesh)))
     obj.write(tmp_path / "a.obj", surface, NAMES)
     for page in (0, 1):
         (tmp_path / f"m_{page}.png").write_bytes(surface.pages[page].read_bytes())
     read = trimesh.load_scene(tmp_path / "a.obj", process=False)
-    for page, (corners, uv) in made_up.by_page(mesh).items():
+    for page, (corners, uv) in synthetic.by_page(mesh).items():
         part = next(g for g in read.geometry.values() if g.visual.material.name == f"m_{page}")
         np.testing.assert_allclose(part.vertices[part.faces], corners, atol=1e-4)
         np.testing.assert_allclose(part.visual.uv[part.faces], uv, atol=1e-6)
@@ -35,7 +35,7 @@ def test_triangles_uv_and_pages_survive(tmp_path: Path, make: Callable[[], Mesh]
 
 
 def test_texture_coordinates_are_said_once_and_v_goes_up(tmp_path: Path) -> None:
-    surface = present(textured.read(made_up.textured(tmp_path / "in", made_up.house())))
+    surface = present(textured_mesh.read(synthetic.textured(tmp_path / "in", synthetic.house())))
     obj.write(tmp_path / "a.obj", surface, NAMES)
     lines = (tmp_path / "a.obj").read_text(encoding="utf-8").splitlines()
     vt = [line for line in lines if line.startswith("vt ")]
@@ -48,14 +48,14 @@ def test_texture_coordinates_are_said_once_and_v_goes_up(tmp_path: Path) -> None
 
 
 def test_normals_point_outwards(tmp_path: Path) -> None:
-    surface = present(textured.read(made_up.textured(tmp_path / "in", made_up.ground())))
+    surface = present(textured_mesh.read(synthetic.textured(tmp_path / "in", synthetic.ground())))
     assert surface.normal[:, 2].min() > 0.9
     np.testing.assert_allclose(np.linalg.norm(surface.normal, axis=1), 1, atol=1e-5)
 
 
 def test_parts_are_small_and_lose_nothing(tmp_path: Path) -> None:
-    mesh = made_up.ground()
-    parts = present(textured.read(made_up.textured(tmp_path / "in", mesh))).parts(1000)
+    mesh = synthetic.ground()
+    parts = present(textured_mesh.read(synthetic.textured(tmp_path / "in", mesh))).parts(1000)
     assert max(map(len, parts)) <= 1000
     assert sum(map(len, parts)) == len(mesh)
     assert sum(part.mesh.face_area.sum() for part in parts) == pytest.approx(mesh.face_area.sum(), rel=1e-5)

@@ -10,11 +10,11 @@ import numpy.typing as npt
 import pytest
 from PIL import Image, TiffImagePlugin
 
-from scan2sim.pipeline.cameras import project, ray_origins, unproject
-from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.io import image
-from scan2sim.pipeline.io.orthophoto import read_view
-from scan2sim.pipeline.types import F32, Frame, View
+from scan2sim.pipeline.camera.models import project, ray_origins, unproject
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.types import F32, Frame, View
+from scan2sim.pipeline.io.geodata.orthophoto import read_view
+from scan2sim.pipeline.io.images import image
 
 FEET = Frame("local", (300.0, 600.0, 10.0), 0.3048)
 UTM = Frame("EPSG:32633", (500000.0, 5400000.0, 200.0))

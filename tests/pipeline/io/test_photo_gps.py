@@ -14,12 +14,13 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from scan2sim.flows.cli import app
-from scan2sim.pipeline.errors import DataError, SettingError
-from scan2sim.pipeline.io import clouds, exif
-from scan2sim.pipeline.io.import_model import import_model
-from scan2sim.pipeline.io.photo_gps import by_photos
+from scan2sim.pipeline.core.errors import DataError, SettingError
+from scan2sim.pipeline.core.types import F64
+from scan2sim.pipeline.importers.georeference import by_photos
+from scan2sim.pipeline.importers.photogrammetry import import_model
+from scan2sim.pipeline.io import clouds
+from scan2sim.pipeline.io.images import exif
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.pipeline.types import F64
 from tests.present import present
 
 CRS = "EPSG:32633"

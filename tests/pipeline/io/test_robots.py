@@ -12,16 +12,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scan2sim.pipeline import backends
-from scan2sim.pipeline.errors import DataError, SettingError
-from scan2sim.pipeline.io import robots, scenes
-from scan2sim.pipeline.io.scene import PATH, Scene
-from scan2sim.pipeline.io.scenes import SceneParams
-from scan2sim.pipeline.io.start import find
-from scan2sim.pipeline.robot import ROBOT
-from scan2sim.pipeline.step import silent
-from scan2sim.pipeline.types import Trajectory
-from tests.pipeline import made_up
+from scan2sim.pipeline.core import plugins
+from scan2sim.pipeline.core.errors import DataError, SettingError
+from scan2sim.pipeline.core.step import silent
+from scan2sim.pipeline.core.types import Trajectory
+from scan2sim.pipeline.io import robot_formats, world_formats
+from scan2sim.pipeline.io.world_formats import SceneParams
+from scan2sim.pipeline.io.worlds.scene import PATH, Scene
+from scan2sim.pipeline.simulation.robot import ROBOT
+from scan2sim.pipeline.simulation.spawn import find
+from tests.pipeline import synthetic
 
 MASS = sum(link.mass for link in ROBOT.links)
 FIRST, LAST = (-8.0, -7.0), (8.0, -7.0)
@@ -31,32 +31,32 @@ FIRST, LAST = (-8.0, -7.0), (8.0, -7.0)
 def driven(scene: Scene) -> Scene:
     """The same scene, with the path of a scanner 2 m above the ground."""
     x = np.linspace(FIRST[0], LAST[0], 33)
-    places = np.column_stack([x, np.full(33, FIRST[1]), made_up.height(x, np.full(33, FIRST[1])) + 2])
+    places = np.column_stack([x, np.full(33, FIRST[1]), synthetic.height(x, np.full(33, FIRST[1])) + 2])
     Trajectory(np.arange(33.0), places).save(scene.tiles[0].folder / PATH)
     return scene
 
 
 @pytest.fixture(scope="module")
 def town(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return driven(made_up.scene(tmp_path_factory.mktemp("town")))
+    return driven(synthetic.scene(tmp_path_factory.mktemp("town")))
 
 
 @pytest.fixture(scope="module")
 def exported(town: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("exported")
-    scenes.write(town, ["gazebo", "mujoco", "urdf"], folder, SceneParams(), silent, robot=True)
+    world_formats.write(town, ["gazebo", "mujoco", "urdf"], folder, SceneParams(), silent, robot=True)
     return folder
 
 
 def test_every_robot_has_a_world() -> None:
-    assert set(backends.names(robots.PACKAGE)) <= set(scenes.known())
+    assert set(plugins.names(robot_formats.PACKAGE)) <= set(world_formats.known())
 
 
 def test_it_starts_on_the_ground_at_the_ways_beginning_and_faces_along_it(town: Scene, exported: Path) -> None:
     start = find(town)
     x, y, z = start.position
     assert start.by == "path" and (x, y) == pytest.approx(FIRST, abs=0.6)
-    assert z == pytest.approx(float(made_up.height(np.array(x), np.array(y))), abs=0.06)
+    assert z == pytest.approx(float(synthetic.height(np.array(x), np.array(y))), abs=0.06)
     roll, pitch, yaw = start.angles
     assert yaw == pytest.approx(0, abs=0.05) and abs(roll) < 0.15 and abs(pitch) < 0.15
     told = json.loads((exported / "metadata.json").read_text(encoding="utf-8"))["robot"]
@@ -64,7 +64,7 @@ def test_it_starts_on_the_ground_at_the_ways_beginning_and_faces_along_it(town: 
 
 
 def test_it_keeps_away_from_what_stands_beside_the_way(tmp_path: Path) -> None:
-    scene = made_up.scene(tmp_path, tiles=1)
+    scene = synthetic.scene(tmp_path, tiles=1)
     x = np.linspace(-7.0, 9.0, 33)
     Trajectory(np.arange(33.0), np.column_stack([x, np.full(33, -5.3), np.full(33, 3.0)])).save(
         scene.tiles[0].folder / PATH
@@ -73,9 +73,9 @@ def test_it_keeps_away_from_what_stands_beside_the_way(tmp_path: Path) -> None:
 
 
 def test_without_a_road_or_a_path_there_is_no_robot(tmp_path: Path) -> None:
-    scene = made_up.scene(tmp_path, tiles=1)
+    scene = synthetic.scene(tmp_path, tiles=1)
     with pytest.raises(DataError, match="neither a road nor"):
-        scenes.write(scene, ["mujoco"], tmp_path / "out", SceneParams(), silent, robot=True)
+        world_formats.write(scene, ["mujoco"], tmp_path / "out", SceneParams(), silent, robot=True)
     Trajectory(np.arange(9.0), np.column_stack([np.linspace(50, 60, 9), np.zeros(9), np.zeros(9)])).save(
         scene.tiles[0].folder / PATH
     )
@@ -86,9 +86,11 @@ def test_without_a_road_or_a_path_there_is_no_robot(tmp_path: Path) -> None:
 
 def test_formats_that_hold_no_robot_are_told(town: Scene, tmp_path: Path) -> None:
     with pytest.raises(SettingError, match=r"none of glb, usd\. Name one of: gazebo, mujoco, urdf"):
-        scenes.check(["glb", "usd"], SceneParams(), "--to", robot=True)
+        world_formats.check(["glb", "usd"], SceneParams(), "--to", robot=True)
     with pytest.raises(DataError, match="robot"):
-        scenes.write(replace(town, name="robot"), ["mujoco"], tmp_path / "out", SceneParams(), silent, robot=True)
+        world_formats.write(
+            replace(town, name="robot"), ["mujoco"], tmp_path / "out", SceneParams(), silent, robot=True
+        )
 
 
 def of_sdf(folder: Path) -> Iterator[tuple[str, float, Any]]:

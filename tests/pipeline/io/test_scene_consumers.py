@@ -10,15 +10,18 @@ import pytest
 
 from bench.consumers import gltf_validator, omniverse, usd
 from scan2sim.flows.reports import film
-from scan2sim.pipeline import backends, render
-from scan2sim.pipeline.errors import UnavailableError
-from scan2sim.pipeline.io import crs, glb, scenes
-from scan2sim.pipeline.io.scene import Scene
-from scan2sim.pipeline.io.scenes import SceneParams
-from scan2sim.pipeline.step import silent
-from scan2sim.texturing.levels import detailed
+from scan2sim.pipeline.camera import renderer
+from scan2sim.pipeline.core import plugins
+from scan2sim.pipeline.core.errors import UnavailableError
+from scan2sim.pipeline.core.step import silent
+from scan2sim.pipeline.io import world_formats
+from scan2sim.pipeline.io.geodata import crs
+from scan2sim.pipeline.io.world_formats import SceneParams
+from scan2sim.pipeline.io.worlds import glb
+from scan2sim.pipeline.io.worlds.scene import Scene
+from scan2sim.texturing.levels_of_detail import detailed
 from tests import cesium, threejs
-from tests.pipeline import made_up
+from tests.pipeline import synthetic
 from tests.present import present
 
 RADIUS = 0.2  # of the ball that is dropped, metres
@@ -28,7 +31,7 @@ PLACES = [(-4.7, 0.3), (3.0, -6.0), (12.6, 1.0), (25.0, 8.0), (31.0, -4.0)]
 
 @pytest.fixture(scope="module")
 def town(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return made_up.scene(tmp_path_factory.mktemp("town"))
+    return synthetic.scene(tmp_path_factory.mktemp("town"))
 
 
 def module(name: str) -> Any:
@@ -36,14 +39,14 @@ def module(name: str) -> Any:
 
 
 def export(scene: Scene, name: str, folder: Path, **params: Any) -> Path:
-    scenes.write(scene, [name], folder, SceneParams(**params), silent)
+    world_formats.write(scene, [name], folder, SceneParams(**params), silent)
     return folder
 
 
 def ground(x: float, y: float) -> float:
     """Height of the made-up scene's ground, which is of squares of 2 m."""
     tile = 0 if x < 12.5 else 1
-    return float(made_up.height(np.array(x - 25 * tile), np.array(y - 3 * tile))) - tile
+    return float(synthetic.height(np.array(x - 25 * tile), np.array(y - 3 * tile))) - tile
 
 
 def test_a_ball_rests_on_mujocos_ground_and_none_falls_through(town: Scene, tmp_path: Path) -> None:
@@ -73,7 +76,7 @@ def test_mujocos_walls_and_poles_are_solid_where_they_stand(town: Scene, tmp_pat
     def reach(start: tuple[float, float, float], along: tuple[float, float, float]) -> float:
         return float(mujoco.mj_ray(model, data, np.array(start), np.array(along), solid, 1, -1, hit))
 
-    x, y = made_up.HOUSE
+    x, y = synthetic.HOUSE
     assert reach((x - 3, y + 1, 2), (1, 0, 0)) == pytest.approx(3, abs=0.25)  # the west wall
     assert reach((x + 1.5, y + 1, 8), (0, 0, -1)) == pytest.approx(3.5, abs=0.3)  # the roof
     assert reach((-7, -5, 2), (1, 0, 0)) == pytest.approx(1.9, abs=0.01)  # the pole
@@ -98,7 +101,7 @@ def test_a_ball_rests_on_pybullets_ground_and_its_camera_tells_classes(town: Sce
         for ball in balls:
             x, y, z = bullet.getBasePositionAndOrientation(ball)[0]
             assert z == pytest.approx(ground(x, y) + RADIUS, abs=0.12)
-        x, y = made_up.HOUSE
+        x, y = synthetic.HOUSE
         view = bullet.computeViewMatrix([x - 4, y + 1, 2], [x, y + 1, 2], [0, 0, 1])
         lens = bullet.computeProjectionMatrixFOV(60, 1, 0.1, 100)
         flag = bullet.ER_SEGMENTATION_MASK_OBJECT_AND_LINKINDEX
@@ -127,7 +130,7 @@ def test_usd_has_no_fault(town: Scene, tmp_path: Path) -> None:
     for prim in solids:
         assert prim.HasAPI(UsdPhysics.CollisionAPI) and UsdGeom.Imageable(prim).ComputePurpose() == "guide"
     place = bare.GetDefaultPrim().GetCustomDataByKey("scan2sim")
-    assert place["crs"] == "EPSG:32632" and tuple(place["worldOriginMetres"]) == made_up.UTM.origin
+    assert place["crs"] == "EPSG:32632" and tuple(place["worldOriginMetres"]) == synthetic.UTM.origin
 
 
 def test_usd_tiles_have_their_coarser_levels_as_variants(town: Scene, tmp_path: Path) -> None:
@@ -163,7 +166,7 @@ PACKED = [{}, {"glb_lit": True}, {"glb_texture": "webp"}, {"glb_mesh": "meshopt"
 @pytest.mark.parametrize("params", PACKED, ids=lambda params: "_".join(map(str, params.values())) or "plain")
 def test_khronos_validator_finds_nothing_in_glbs(town: Scene, tmp_path: Path, params: dict[str, Any]) -> None:
     why = gltf_validator.missing()
-    lacking = backends.missing("scan2sim.pipeline.io.gltf.geometry", params.get("glb_mesh", "plain"))
+    lacking = plugins.missing("scan2sim.pipeline.io.worlds.gltf.geometry", params.get("glb_mesh", "plain"))
     if why or lacking:
         pytest.skip(why or f"{lacking} is not installed (pip install 'scan2sim[gltf]')")
     for path in export(town, "glb", tmp_path, **params).glob("*.glb"):
@@ -181,7 +184,7 @@ def test_three_js_shows_all_tiles_as_the_projects_renderer_does(town: Scene, tmp
     assert page.told == {"triangles": sum(len(surface.shape) for tile in town.tiles for surface in tile.surfaces()),
                          "textures": 8, "features": 8}  # fmt: skip
     bodies = [film.placed(tile.folder / group, tile.offset) for tile in town.tiles for group in tile.groups]
-    own = render.Renderer(bodies).view(view.camera, view.T_world_cam, background=threejs.SKY, samples=2)
+    own = renderer.Renderer(bodies).view(view.camera, view.T_world_cam, background=threejs.SKY, samples=2)
     both = own.hit & (picture != threejs.SKY).any(axis=2)
     assert both.sum() > 0.98 * own.hit.sum() > 0.3 * own.hit.size
     assert np.abs(picture[both].astype(int) - own.rgb[both]).mean() < 6

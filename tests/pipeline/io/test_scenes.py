@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scan2sim.pipeline import backends
-from scan2sim.pipeline.classes import CODE
-from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.io import scenes
-from scan2sim.pipeline.io.scene import Level, Scene, read_scene
-from scan2sim.pipeline.io.scenes import SceneParams
-from scan2sim.pipeline.step import silent
-from scan2sim.pipeline.types import Frame
-from tests.pipeline import made_up
+from scan2sim.pipeline.core import plugins
+from scan2sim.pipeline.core.classes import CODE
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.step import silent
+from scan2sim.pipeline.core.types import Frame
+from scan2sim.pipeline.io import world_formats
+from scan2sim.pipeline.io.world_formats import SceneParams
+from scan2sim.pipeline.io.worlds.scene import Level, Scene, read_scene
+from tests.pipeline import synthetic
 from tests.pipeline.io.scene_readers import READERS, Shown, fbx, image, surveyed_off
 
 WITHOUT_MESHES = {"opendrive"}
@@ -28,24 +28,24 @@ LABELS = {"terrain": 2, "building": 6, "road_sign": 64}
 
 @pytest.fixture(scope="module")
 def town(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return made_up.scene(tmp_path_factory.mktemp("town"))
+    return synthetic.scene(tmp_path_factory.mktemp("town"))
 
 
 @pytest.fixture(scope="module")
 def exported(town: Scene, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    return {name: tmp_path_factory.mktemp(name) for name in scenes.known()}
+    return {name: tmp_path_factory.mktemp(name) for name in world_formats.known()}
 
 
 def test_every_format_has_a_reader() -> None:
-    assert set(scenes.known()) == READERS.keys() | WITHOUT_MESHES
+    assert set(world_formats.known()) == READERS.keys() | WITHOUT_MESHES
 
 
 def written(scene: Scene, name: str, folder: Path, **params: Any) -> Path:
     """An export; the test is skipped where it can't be written here."""
-    lacking = backends.missing(scenes.PACKAGE, name)
+    lacking = plugins.missing(world_formats.PACKAGE, name)
     if lacking:
         pytest.skip(f"{lacking} is not installed")
-    scenes.write(scene, [name], folder, SceneParams(**params), silent)
+    world_formats.write(scene, [name], folder, SceneParams(**params), silent)
     return folder
 
 
@@ -93,7 +93,7 @@ def test_everything_is_shown_in_its_place_and_colours(town: Scene, exported: dic
 
 @each
 def test_a_scene_without_a_crs_has_no_georeference(tmp_path: Path, name: str) -> None:
-    scene = made_up.scene(tmp_path, Frame(), tiles=1)
+    scene = synthetic.scene(tmp_path, Frame(), tiles=1)
     written(scene, name, tmp_path / "out")
     assert faces(list(READERS[name](tmp_path / "out", scene))).shape == faces(expected(scene)).shape
     assert json.loads((tmp_path / "out" / "metadata.json").read_text(encoding="utf-8"))["wgs84"] is None
@@ -101,7 +101,7 @@ def test_a_scene_without_a_crs_has_no_georeference(tmp_path: Path, name: str) ->
 
 @each
 def test_a_scene_without_ground_shows_all_else(tmp_path: Path, name: str) -> None:
-    scene = made_up.scene(tmp_path, tiles=1)
+    scene = synthetic.scene(tmp_path, tiles=1)
     (tile,) = scene.tiles
     solid = tile.solid()
     assert solid.classification is not None
@@ -113,14 +113,14 @@ def test_a_scene_without_ground_shows_all_else(tmp_path: Path, name: str) -> Non
 
 @each
 def test_surveyed_points_are_where_they_were_surveyed_5_km_away(tmp_path: Path, name: str) -> None:
-    scene = made_up.scene(tmp_path, tiles=2, apart=5000.0)
+    scene = synthetic.scene(tmp_path, tiles=2, apart=5000.0)
     folder = written(scene, name, tmp_path / "out")
     assert json.loads((folder / "metadata.json").read_text(encoding="utf-8"))["crs"] == "EPSG:32632"
     assert surveyed_off(folder, scene, name) < 0.01
 
 
 def test_a_scene_is_read_from_a_run_or_its_world(tmp_path: Path) -> None:
-    scene = made_up.scene(tmp_path)
+    scene = synthetic.scene(tmp_path)
     assert read_scene(tmp_path) == read_scene(tmp_path / "world") == scene
     assert [tile.offset for tile in scene.tiles] == [(0, 0, 0), (25, 3, -1)]
     assert {surface.label for surface in scene.tiles[0].surfaces()} == set(LABELS)
@@ -129,7 +129,7 @@ def test_a_scene_is_read_from_a_run_or_its_world(tmp_path: Path) -> None:
 def test_worlds_that_keep_no_scene_are_told_of(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="holds no world"):
         read_scene(tmp_path)
-    world = made_up.world(tmp_path).files["world"]
+    world = synthetic.world(tmp_path).files["world"]
     about = world / "scene" / "scene.json"
     about.write_text(about.read_text(encoding="utf-8").replace('"version": 1', '"version": 9'), encoding="utf-8")
     with pytest.raises(InputError, match=r"version 9.*run.*again"):
@@ -145,7 +145,7 @@ def test_worlds_that_keep_no_scene_are_told_of(tmp_path: Path) -> None:
 def test_boxes_of_levels_hold_what_they_show_and_finer_ones(tmp_path: Path) -> None:
     import trimesh
 
-    town = made_up.scene(tmp_path)
+    town = synthetic.scene(tmp_path)
     fine = tuple(Level(tile) for tile in town.tiles)
     written(replace(town, coarse=Level(town.tiles[0], 1, 0.5, 0.1, fine)), "tiles3d", tmp_path / "out")
     root = json.loads((tmp_path / "out" / "tileset.json").read_text(encoding="utf-8"))["root"]
@@ -167,7 +167,7 @@ def test_boxes_of_levels_hold_what_they_show_and_finer_ones(tmp_path: Path) -> N
 
 
 def test_carla_tells_road_from_terrain_and_all_else_by_its_tag(tmp_path: Path) -> None:
-    town = made_up.scene(tmp_path, tiles=1)
+    town = synthetic.scene(tmp_path, tiles=1)
     solid = town.tiles[0].solid()
     assert solid.classification is not None
     east = (solid.classification == CODE["terrain"]) & (solid.corners.mean(axis=1)[:, 0] > 0)
@@ -184,7 +184,7 @@ def test_carla_tells_road_from_terrain_and_all_else_by_its_tag(tmp_path: Path) -
 
 
 def test_ground_too_long_for_a_carla_map_comes_in_squares_from_the_north_west(tmp_path: Path) -> None:
-    town = made_up.scene(tmp_path, apart=3000.0)
+    town = synthetic.scene(tmp_path, apart=3000.0)
     written(town, "carla", tmp_path / "out")
     (about,) = json.loads((tmp_path / "out" / "carla" / "town.json").read_text(encoding="utf-8"))["maps"]
     assert about["tiles"] == ["./town/town_Tile_0_0.fbx", "./town/town_Tile_1_0.fbx"]
@@ -212,7 +212,7 @@ def test_usd_tells_of_each_face_its_photo_and_how_far_that_was(town: Scene, expo
 
 @each
 def test_folders_may_have_any_name_and_tiles_may_lack_a_class(tmp_path: Path, name: str) -> None:
-    scene = made_up.scene(tmp_path / "Straße mit Bäumen")
+    scene = synthetic.scene(tmp_path / "Straße mit Bäumen")
     bare = replace(scene.tiles[1], groups={"terrain": scene.tiles[1].groups["terrain"]})
     scene = replace(scene, tiles=(scene.tiles[0], bare))
     written(scene, name, tmp_path / "out")

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from scan2sim.pipeline.io import sdf
-from scan2sim.pipeline.types import Frame
-from tests.pipeline import made_up
+from scan2sim.pipeline.core.types import Frame
+from scan2sim.pipeline.io.worlds import sdf
+from tests.pipeline import synthetic
 from tests.present import present
 
 
@@ -26,8 +26,8 @@ def _world(
 def test_spherical_coordinates_are_those_of_the_origin(tmp_path: Path) -> None:
     from pyproj import Transformer
 
-    world = _world(tmp_path / "a.sdf", sdf.Georeference.of(made_up.UTM))
-    x, y, z = made_up.UTM.origin
+    world = _world(tmp_path / "a.sdf", sdf.Georeference.of(synthetic.UTM))
+    x, y, z = synthetic.UTM.origin
     lon, lat = Transformer.from_crs("EPSG:32632", "EPSG:4326", always_xy=True).transform(x, y)
     place = present(world.find("spherical_coordinates"))
     assert float(place.findtext("latitude_deg", "")) == pytest.approx(lat, abs=1e-8)
@@ -40,8 +40,8 @@ def test_spherical_coordinates_are_those_of_the_origin(tmp_path: Path) -> None:
 def test_heading_is_minus_the_convergence(tmp_path: Path) -> None:
     # east of the central meridian, north of the equator, grid north lies east of true north:
     # the world is turned clockwise, which SDF counts as negative
-    assert present(sdf.Georeference.of(made_up.UTM)).heading == pytest.approx(-1.90, abs=0.01)
-    west = replace(made_up.UTM, origin=(310_000.0, 5_335_000.0, 500.0))
+    assert present(sdf.Georeference.of(synthetic.UTM)).heading == pytest.approx(-1.90, abs=0.01)
+    west = replace(synthetic.UTM, origin=(310_000.0, 5_335_000.0, 500.0))
     assert present(sdf.Georeference.of(west)).heading == pytest.approx(1.90, abs=0.01)
 
 

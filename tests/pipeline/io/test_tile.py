@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import tomli_w
 
-from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.types import Camera, Frame, PointCloud
 from scan2sim.pipeline.io import clouds
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.tile import read_tile, write_tile
-from scan2sim.pipeline.types import Camera, Frame, PointCloud
 
 FT_CRS = "EPSG:2994"  # Oregon Lambert, international feet
 

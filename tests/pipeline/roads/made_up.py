@@ -8,8 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from scan2sim.pipeline.classes import CODE
-from scan2sim.pipeline.types import F64, Frame, Mesh, PointCloud, Trajectory
+from scan2sim.pipeline.core.classes import CODE
+from scan2sim.pipeline.core.types import F64, Frame, Mesh, PointCloud, Trajectory
 
 UTM = Frame("EPSG:32632", (690_000.0, 5_335_000.0, 500.0))
 PIXEL = 0.03

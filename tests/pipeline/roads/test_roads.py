@@ -11,20 +11,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.classes import CODE
-from scan2sim.pipeline.errors import DataError
-from scan2sim.pipeline.io import opendrive, scenes
-from scan2sim.pipeline.io.scene import ROADS as SEEN
-from scan2sim.pipeline.io.scenes import SceneParams
-from scan2sim.pipeline.io.scenes import opendrive as opendrive_of_scenes
+from scan2sim.pipeline.core.classes import CODE
+from scan2sim.pipeline.core.errors import DataError
+from scan2sim.pipeline.core.step import Done, silent
+from scan2sim.pipeline.core.types import Frame
+from scan2sim.pipeline.io import world_formats
+from scan2sim.pipeline.io.geodata import opendrive
+from scan2sim.pipeline.io.world_formats import SceneParams
+from scan2sim.pipeline.io.world_formats import opendrive as opendrive_of_scenes
+from scan2sim.pipeline.io.worlds.scene import ROADS as SEEN
 from scan2sim.pipeline.roads import listed, model, observed, profile
 from scan2sim.pipeline.roads.course import course
 from scan2sim.pipeline.roads.lanes import sections
 from scan2sim.pipeline.roads.model import Road
-from scan2sim.pipeline.step import Done, silent
 from scan2sim.pipeline.steps.roads import ROADS, RoadsParams
-from scan2sim.pipeline.types import Frame
-from tests.pipeline import made_up as worlds
+from tests.pipeline import synthetic as worlds
 from tests.pipeline.roads.made_up import FALL, KERB, Street
 
 STREET = Street()
@@ -233,7 +234,7 @@ def test_a_road_over_two_tiles_is_one(tmp_path: Path) -> None:
         assert length == pytest.approx(STREET.length / 2, abs=3)
         (tile.folder / SEEN).write_bytes(half.files["seen"].read_bytes())
         halves.append(half)
-    scenes.write(scene, ["opendrive"], tmp_path / "export", SceneParams(), silent)
+    world_formats.write(scene, ["opendrive"], tmp_path / "export", SceneParams(), silent)
     root = ET.parse(tmp_path / "export" / "town.xodr").getroot()
     (road,) = root.findall("road")
     assert float(road.attrib["length"]) == pytest.approx(STREET.length, abs=3)
@@ -246,7 +247,7 @@ def test_a_road_over_two_tiles_is_one(tmp_path: Path) -> None:
 
 def test_a_world_without_lanes_has_no_opendrive(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no road's lanes"):
-        scenes.write(worlds.scene(tmp_path), ["opendrive"], tmp_path / "export", SceneParams(), silent)
+        world_formats.write(worlds.scene(tmp_path), ["opendrive"], tmp_path / "export", SceneParams(), silent)
 
 
 def test_notes_name_what_is_missing(done: Done) -> None:

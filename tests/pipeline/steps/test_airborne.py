@@ -12,21 +12,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scan2sim.flows.recipes.settings import Settings
-from scan2sim.flows.recipes.tile import recipe
-from scan2sim.pipeline.classes import CODE
-from scan2sim.pipeline.errors import DataError, InputError
-from scan2sim.pipeline.heightfield import Raster
-from scan2sim.pipeline.io import footprints
+from scan2sim.flows.pipelines.settings import Settings
+from scan2sim.flows.pipelines.tile import recipe
+from scan2sim.pipeline.core.classes import CODE
+from scan2sim.pipeline.core.errors import DataError, InputError
+from scan2sim.pipeline.core.step import Done, Step, silent
+from scan2sim.pipeline.core.types import Frame, Mesh, PointCloud
+from scan2sim.pipeline.geometry.height_map import Raster
+from scan2sim.pipeline.io.geodata import footprints
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.pipeline.step import Done, Step, silent
 from scan2sim.pipeline.steps.geometry import GEOMETRY, distances
 from scan2sim.pipeline.steps.ground import GROUND, GroundParams, united
 from scan2sim.pipeline.steps.poisson import POISSON
 from scan2sim.pipeline.steps.trim import TRIM
 from scan2sim.pipeline.steps.voxel import VOXEL
 from scan2sim.pipeline.steps.walls import WALLS
-from scan2sim.pipeline.types import Frame, Mesh, PointCloud
 
 FRAME = Frame("EPSG:32633", (500000.0, 5400000.0, 200.0))
 HOUSE, ANNEX = (-6.0, -4.0, 4.0, 4.0, 6.0), (4.0, -4.0, 9.0, 4.0, 3.0)  # x0, y0, x1, y1, height of the roof

@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scan2sim.pipeline import isolate
-from scan2sim.pipeline.classes import CODE
+from scan2sim.pipeline.core import sandbox
+from scan2sim.pipeline.core.classes import CODE
+from scan2sim.pipeline.core.errors import DataError, StepError
+from scan2sim.pipeline.core.step import Done, Step, silent
+from scan2sim.pipeline.core.types import Frame, Mesh, PointCloud, Trajectory
 from scan2sim.pipeline.decimation import simplify
-from scan2sim.pipeline.errors import DataError, StepError
 from scan2sim.pipeline.io.clouds import las
-from scan2sim.pipeline.step import Done, Step, silent
 from scan2sim.pipeline.steps.decimate import DECIMATE
 from scan2sim.pipeline.steps.geometry import distances
 from scan2sim.pipeline.steps.ingest import INGEST
@@ -24,7 +25,6 @@ from scan2sim.pipeline.steps.poisson import POISSON, octree
 from scan2sim.pipeline.steps.split import SPLIT
 from scan2sim.pipeline.steps.trim import TRIM
 from scan2sim.pipeline.steps.voxel import VOXEL, sample
-from scan2sim.pipeline.types import Frame, Mesh, PointCloud, Trajectory
 
 FRAME = Frame("EPSG:32633", (500000.0, 5400000.0, 200.0))
 
@@ -156,7 +156,7 @@ def test_poisson_falls_back_when_the_child_dies(
     ground: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls = []
-    real = isolate.call
+    real = sandbox.call
 
     def flaky(*args: Any, **kwargs: Any) -> Any:
         calls.append(args[3])
@@ -164,7 +164,7 @@ def test_poisson_falls_back_when_the_child_dies(
             raise StepError("poisson", "crashed (exit status -11)", "")
         return real(*args, **kwargs)
 
-    monkeypatch.setattr(isolate, "call", flaky)
+    monkeypatch.setattr(sandbox, "call", flaky)
     done = go(POISSON, tmp_path, {"cloud": ground["cloud"]}, depth=8)
     assert calls == [8, 8, 7]
     assert done.facts["depth"] == 7 and len(done.warnings) == 2

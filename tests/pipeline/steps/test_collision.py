@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.classes import CODE
-from scan2sim.pipeline.errors import DataError
-from scan2sim.pipeline.step import Done, silent
+from scan2sim.pipeline.core.classes import CODE
+from scan2sim.pipeline.core.errors import DataError
+from scan2sim.pipeline.core.step import Done, silent
+from scan2sim.pipeline.core.types import Mesh, PointCloud
 from scan2sim.pipeline.steps.collision import COLLISION, CollisionParams
-from scan2sim.pipeline.types import Mesh, PointCloud
-from tests.pipeline import made_up
+from tests.pipeline import synthetic
 
-NONE = Mesh(made_up.UTM, np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
+NONE = Mesh(synthetic.UTM, np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
 
 
 def _run(folder: Path, meshes: dict[str, Mesh], **params: object) -> tuple[Mesh, Done]:
@@ -27,38 +27,38 @@ def _run(folder: Path, meshes: dict[str, Mesh], **params: object) -> tuple[Mesh,
 
 
 def test_the_budget_holds_and_the_deviation_is_told(tmp_path: Path) -> None:
-    ground = made_up.ground(100)
-    mesh, done = _run(tmp_path, {"terrain": ground, "building": made_up.house()}, triangles=1000)
-    assert len(mesh) <= 1000 and mesh.uv is None and mesh.frame == made_up.UTM
+    ground = synthetic.ground(100)
+    mesh, done = _run(tmp_path, {"terrain": ground, "building": synthetic.house()}, triangles=1000)
+    assert len(mesh) <= 1000 and mesh.uv is None and mesh.frame == synthetic.UTM
     deviation = done.facts["deviation_m"]
     assert 0 < deviation["mean"] <= deviation["p95"] <= deviation["max"] < 0.05
     # the reported figure bears a check by the surface's formula
-    gap = np.abs(mesh.vertices[:, 2] - made_up.height(mesh.vertices[:, 0], mesh.vertices[:, 1]))
+    gap = np.abs(mesh.vertices[:, 2] - synthetic.height(mesh.vertices[:, 0], mesh.vertices[:, 1]))
     on_ground = (mesh.vertices[:, 2] < 0.4) & ~_in_house(mesh.vertices)
     assert np.percentile(gap[on_ground], 95) < 0.03
 
 
 def test_the_house_keeps_its_shape(tmp_path: Path) -> None:
-    mesh, _ = _run(tmp_path, {"terrain": made_up.ground(100), "building": made_up.house()}, triangles=500)
+    mesh, _ = _run(tmp_path, {"terrain": synthetic.ground(100), "building": synthetic.house()}, triangles=500)
     inside = _in_house(mesh.vertices)
     assert mesh.vertices[inside, 2].max() == pytest.approx(4.5, abs=0.01)
 
 
 def test_a_surface_in_crumbs_keeps_to_the_budget_too(tmp_path: Path) -> None:
-    ground = made_up.ground(40)
+    ground = synthetic.ground(40)
     patches = ground.keep(np.arange(len(ground)) % 3 == 0)  # nearly all of its edges are open
     mesh, done = _run(tmp_path, {"terrain": patches}, triangles=300)
     assert 100 < len(mesh) <= 300 and not done.warnings
 
 
 def test_plants_are_solid_only_when_asked(tmp_path: Path) -> None:
-    meshes = {"terrain": made_up.ground(10), "vegetation": made_up.house()}
+    meshes = {"terrain": synthetic.ground(10), "vegetation": synthetic.house()}
     assert _run(tmp_path, meshes)[0].vertices[:, 2].max() < 1
     assert _run(tmp_path, meshes, vegetation=True)[0].vertices[:, 2].max() > 4
 
 
 def test_plants_are_solid_where_nothing_else_is(tmp_path: Path) -> None:
-    mesh, done = _run(tmp_path, {"terrain": NONE, "building": NONE, "vegetation": made_up.house()})
+    mesh, done = _run(tmp_path, {"terrain": NONE, "building": NONE, "vegetation": synthetic.house()})
     assert mesh.vertices[:, 2].max() > 4 and "plants are solid" in done.warnings[0]
     assert mesh.classification is not None and set(mesh.classification.tolist()) == {CODE["high_vegetation"]}
 
@@ -69,15 +69,17 @@ def test_nothing_solid_is_refused(tmp_path: Path) -> None:
 
 
 def test_points_of_the_ground_that_make_no_surface_do_no_harm(tmp_path: Path) -> None:
-    few = made_up.ground(3).vertices
-    PointCloud(made_up.UTM, few, classification=np.full(len(few), CODE["road"], np.uint8)).save(tmp_path / "cloud.npz")
+    few = synthetic.ground(3).vertices
+    PointCloud(synthetic.UTM, few, classification=np.full(len(few), CODE["road"], np.uint8)).save(
+        tmp_path / "cloud.npz"
+    )
     inputs = {"terrain": tmp_path / "terrain.npz", "building": tmp_path / "building.npz"}
     NONE.save(inputs["terrain"])
-    made_up.house().save(inputs["building"])
+    synthetic.house().save(inputs["building"])
     done = COLLISION.run({**inputs, "cloud": tmp_path / "cloud.npz"}, CollisionParams(), tmp_path, silent)
     assert done.facts["ground_triangles"] == 0 and done.facts["ground_m2"] == {} and done.facts["triangles"] > 0
 
 
 def _in_house(xyz: np.ndarray) -> np.ndarray:
-    x, y = made_up.HOUSE
+    x, y = synthetic.HOUSE
     return (abs(xyz[:, 0] - x - 1.5) <= 1.501) & (abs(xyz[:, 1] - y - 1) <= 1.001)

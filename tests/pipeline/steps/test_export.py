@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from scan2sim.pipeline.errors import DataError, InputError, SettingError
-from scan2sim.pipeline.step import silent
+from scan2sim.pipeline.core.errors import DataError, InputError, SettingError
+from scan2sim.pipeline.core.step import silent
+from scan2sim.pipeline.core.types import Frame, Mesh
 from scan2sim.pipeline.steps.export import EXPORT, ExportParams
-from scan2sim.pipeline.types import Frame, Mesh
-from tests.pipeline import made_up
+from tests.pipeline import synthetic
 from tests.present import present
 
 
@@ -25,12 +25,12 @@ def _files(world: Path) -> set[str]:
 
 def _inputs(folder: Path, **meshes: Mesh) -> dict[str, Path]:
     solid = folder / "collision.npz"
-    Mesh(made_up.UTM, made_up.house().vertices, made_up.house().faces).save(solid)
-    return {group: made_up.textured(folder / group, mesh) for group, mesh in meshes.items()} | {"collision": solid}
+    Mesh(synthetic.UTM, synthetic.house().vertices, synthetic.house().faces).save(solid)
+    return {group: synthetic.textured(folder / group, mesh) for group, mesh in meshes.items()} | {"collision": solid}
 
 
 def test_layout(tmp_path: Path) -> None:
-    world = made_up.world(tmp_path).files["world"]
+    world = synthetic.world(tmp_path).files["world"]
     meshes = "models/street/meshes"
     groups = {
         f"{meshes}/{group}{end}"
@@ -54,7 +54,7 @@ def test_layout(tmp_path: Path) -> None:
 
 
 def test_model_names_files_that_exist(tmp_path: Path) -> None:
-    world = made_up.world(tmp_path, friction=0.7).files["world"]
+    world = synthetic.world(tmp_path, friction=0.7).files["world"]
     model = present(ET.parse(world / "models/street/model.sdf").getroot().find("model"))
     assert model.findtext("static") == "true"
     uris = [present(uri.text) for uri in model.iter("uri")]
@@ -70,7 +70,7 @@ def test_model_names_files_that_exist(tmp_path: Path) -> None:
 
 
 def test_a_large_group_is_split_and_nothing_is_lost(tmp_path: Path) -> None:
-    world = made_up.world(tmp_path, max_visual_triangles=1000).files["world"]
+    world = synthetic.world(tmp_path, max_visual_triangles=1000).files["world"]
     counts = json.loads((world / "metadata.json").read_text(encoding="utf-8"))["triangles_by_file"]
     for suffix in (".obj", ".dae"):
         parts = [n for file, n in counts.items() if "terrain_part" in file and file.endswith(suffix)]
@@ -82,10 +82,10 @@ def test_a_large_group_is_split_and_nothing_is_lost(tmp_path: Path) -> None:
 
 
 def test_metadata_puts_the_tile_on_the_map(tmp_path: Path) -> None:
-    world = made_up.world(tmp_path).files["world"]
+    world = synthetic.world(tmp_path).files["world"]
     metadata = json.loads((world / "metadata.json").read_text(encoding="utf-8"))
     assert metadata["crs"] == "EPSG:32632" and metadata["unit_m"] == 1.0
-    assert metadata["origin_m"] == list(made_up.UTM.origin)
+    assert metadata["origin_m"] == list(synthetic.UTM.origin)
     assert metadata["wgs84"]["latitude_deg"] == pytest.approx(48.13986, abs=1e-5)
     assert metadata["wgs84"]["longitude_deg"] == pytest.approx(11.55407, abs=1e-5)
     assert metadata["groups"]["terrain"]["triangles"] == 3200
@@ -93,9 +93,9 @@ def test_metadata_puts_the_tile_on_the_map(tmp_path: Path) -> None:
 
 
 def test_tiles_share_a_georeference_through_the_pose_alone(tmp_path: Path) -> None:
-    x, y, z = made_up.UTM.origin
-    alone = made_up.world(tmp_path / "a").files["world"]
-    placed = made_up.world(tmp_path / "b", world_origin=(x - 100, y + 50, z)).files["world"]
+    x, y, z = synthetic.UTM.origin
+    alone = synthetic.world(tmp_path / "a").files["world"]
+    placed = synthetic.world(tmp_path / "b", world_origin=(x - 100, y + 50, z)).files["world"]
     assert ET.parse(placed / "street.sdf").getroot().findtext("world/include/pose") == "100 -50 0 0 0 0"
     meshes = "models/street/meshes"
     assert (alone / meshes / "terrain.obj").read_bytes() == (placed / meshes / "terrain.obj").read_bytes()
@@ -107,14 +107,14 @@ def test_tiles_share_a_georeference_through_the_pose_alone(tmp_path: Path) -> No
 
 
 def test_a_local_tile_has_no_georeference(tmp_path: Path) -> None:
-    world = made_up.world(tmp_path, frame=Frame()).files["world"]
+    world = synthetic.world(tmp_path, frame=Frame()).files["world"]
     assert "spherical_coordinates" not in (world / "street.sdf").read_text(encoding="utf-8")
     metadata = json.loads((world / "metadata.json").read_text(encoding="utf-8"))
     assert metadata["crs"] == "local" and metadata["wgs84"] is None
 
 
 def test_formats_are_chosen(tmp_path: Path) -> None:
-    world = made_up.world(tmp_path, formats=("gazebo",), meshes=("collada",)).files["world"]
+    world = synthetic.world(tmp_path, formats=("gazebo",), meshes=("collada",)).files["world"]
     assert not list(world.rglob("*.glb")) and all(p.name.startswith("collision_") for p in world.rglob("*.obj"))
     assert "terrain.dae" in (world / "models/street/model.sdf").read_text(encoding="utf-8")
     with pytest.raises(SettingError, match=r"export.meshes: has nothing that Gazebo shows"):
@@ -122,7 +122,7 @@ def test_formats_are_chosen(tmp_path: Path) -> None:
 
 
 def test_an_empty_group_is_left_out_and_nothing_at_all_is_refused(tmp_path: Path) -> None:
-    house = made_up.house()
+    house = synthetic.house()
     none = replace(house, faces=house.faces[:0], uv=None, page=None)
     inputs = _inputs(tmp_path, terrain=none, building=house)
     done = EXPORT.run(inputs, ExportParams(), tmp_path / "out", silent)
@@ -133,7 +133,7 @@ def test_an_empty_group_is_left_out_and_nothing_at_all_is_refused(tmp_path: Path
 
 
 def test_lists_of_plants_are_put_beside_the_world(tmp_path: Path) -> None:
-    inputs = _inputs(tmp_path, building=made_up.house())
+    inputs = _inputs(tmp_path, building=synthetic.house())
     for key, file in {"plants": "a.geojson", "plants_csv": "b.csv"}.items():
         inputs[key] = tmp_path / file
         inputs[key].write_text(key, encoding="utf-8")
@@ -143,27 +143,27 @@ def test_lists_of_plants_are_put_beside_the_world(tmp_path: Path) -> None:
 
 
 def test_what_does_not_fit_together_is_refused(tmp_path: Path) -> None:
-    inputs = _inputs(tmp_path, building=made_up.house(Frame("EPSG:32632", (1.0, 2.0, 3.0))))
+    inputs = _inputs(tmp_path, building=synthetic.house(Frame("EPSG:32632", (1.0, 2.0, 3.0))))
     with pytest.raises(InputError, match="origin"):
         EXPORT.run(inputs, ExportParams(), tmp_path / "a", silent)
-    inputs = _inputs(tmp_path, terrain=made_up.ground())
+    inputs = _inputs(tmp_path, terrain=synthetic.ground())
     (inputs["terrain"] / "page_1.png").unlink()
     with pytest.raises(InputError, match=r"page_1.png: is missing"):
         EXPORT.run(inputs, ExportParams(), tmp_path / "b", silent)
-    bare = replace(made_up.house(), uv=None, page=None)
+    bare = replace(synthetic.house(), uv=None, page=None)
     bare.save(inputs["terrain"] / "mesh.npz")
     with pytest.raises(InputError, match="no texture coordinates"):
         EXPORT.run(inputs, ExportParams(), tmp_path / "c", silent)
 
 
 def test_the_same_input_gives_the_same_bytes(tmp_path: Path) -> None:
-    a, b = (made_up.world(tmp_path / name).files["world"] for name in "ab")
+    a, b = (synthetic.world(tmp_path / name).files["world"] for name in "ab")
     for file in _files(a) - {f for f in _files(a) if f.endswith(".dae")}:  # Collada says when it was written
         assert (a / file).read_bytes() == (b / file).read_bytes(), file
 
 
 def test_pictures_are_copied_as_they_are(tmp_path: Path) -> None:
-    world = made_up.world(tmp_path).files["world"]
+    world = synthetic.world(tmp_path).files["world"]
     for page in (0, 1):
         copy = world / f"models/street/meshes/terrain_{page}.png"
         assert copy.read_bytes() == (tmp_path / f"terrain/page_{page}.png").read_bytes()
@@ -171,7 +171,7 @@ def test_pictures_are_copied_as_they_are(tmp_path: Path) -> None:
 
 
 def test_pages_as_jpeg(tmp_path: Path) -> None:
-    world = made_up.world(tmp_path, pages="jpeg").files["world"]
+    world = synthetic.world(tmp_path, pages="jpeg").files["world"]
     meshes = world / "models/street/meshes"
     assert not list(meshes.glob("*.png"))
     assert "terrain_0.jpg" in (meshes / "terrain.mtl").read_text(encoding="utf-8") and "terrain_0.jpg" in (
@@ -182,7 +182,7 @@ def test_pages_as_jpeg(tmp_path: Path) -> None:
 
 
 def test_normals_and_uv_have_no_nan(tmp_path: Path) -> None:
-    house = made_up.house()
+    house = synthetic.house()
     faces, uv = np.concatenate([house.faces, [[0, 0, 1]]]).astype(np.int32), present(house.uv)
     flat = replace(
         house, faces=faces, uv=np.concatenate([uv, uv[:1]]), page=np.append(present(house.page), np.int16(0))

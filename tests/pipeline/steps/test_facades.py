@@ -9,17 +9,17 @@ import cv2
 import numpy as np
 import pytest
 
-from scan2sim.flows.recipes.settings import Settings
-from scan2sim.flows.recipes.tile import recipe
-from scan2sim.pipeline.cameras import unproject
-from scan2sim.pipeline.classes import CODE
-from scan2sim.pipeline.facades import Rays
+from scan2sim.flows.pipelines.settings import Settings
+from scan2sim.flows.pipelines.tile import recipe
+from scan2sim.pipeline.buildings.facade_completion import Rays
+from scan2sim.pipeline.camera.models import unproject
+from scan2sim.pipeline.core.classes import CODE
+from scan2sim.pipeline.core.step import Done, silent
+from scan2sim.pipeline.core.types import F64, Camera, Frame, PointCloud, Tile, Trajectory, View
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.pipeline.step import Done, silent
 from scan2sim.pipeline.steps.facades import FACADES
 from scan2sim.pipeline.steps.voxel import VOXEL
-from scan2sim.pipeline.types import F64, Camera, Frame, PointCloud, Tile, Trajectory, View
 
 SAMPLE = Path(__file__).resolve().parents[3] / "data_samples" / "tile"
 FRAME = Frame("local", (100.0, 200.0, 30.0))

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.cameras import project
-from scan2sim.pipeline.render import pinhole
+from scan2sim.pipeline.camera.models import project
+from scan2sim.pipeline.camera.renderer import pinhole
 from scan2sim.pipeline.steps.pictures import whole_pose
 
 

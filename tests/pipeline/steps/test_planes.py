@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from scan2sim.pipeline.step import Done, Step, silent
+from scan2sim.pipeline.core.step import Done, Step, silent
+from scan2sim.pipeline.core.types import F64, Frame, Mesh, PointCloud, Trajectory
 from scan2sim.pipeline.steps.islands import ISLANDS
 from scan2sim.pipeline.steps.planes import PLANES
 from scan2sim.pipeline.steps.poisson import POISSON
 from scan2sim.pipeline.steps.trim import TRIM
 from scan2sim.pipeline.steps.voxel import VOXEL
-from scan2sim.pipeline.types import F64, Frame, Mesh, PointCloud, Trajectory
 
 NOISE = 0.01
 PATH = Trajectory(np.array([0.0, 1.0]), np.array([[-8.0, -8.0, 2.0], [-7.0, -9.0, 2.0]]))

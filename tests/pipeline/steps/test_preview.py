@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 import trimesh
 
-from scan2sim.pipeline.step import Done, silent
+from scan2sim.pipeline.core.step import Done, silent
 from scan2sim.pipeline.steps.preview import CALL, PREVIEW, PreviewParams
-from tests.pipeline import made_up
+from tests.pipeline import synthetic
 
 
 @pytest.fixture
 def made(tmp_path: Path) -> Any:
     """Make the preview of the made-up tile, whose four pages are of 256 x 256 texels."""
-    meshes = {"terrain": made_up.ground(), "building": made_up.house()}
-    inputs = {group: made_up.textured(tmp_path / group, mesh) for group, mesh in meshes.items()}
+    meshes = {"terrain": synthetic.ground(), "building": synthetic.house()}
+    inputs = {group: synthetic.textured(tmp_path / group, mesh) for group, mesh in meshes.items()}
 
     def make(**params: Any) -> Done:
         out = tmp_path / "out"
@@ -52,7 +52,7 @@ def test_it_is_the_world_with_pages_within_bounds(made: Any, megapixels: float, 
 def test_one_starts_on_the_ground_and_above_it(made: Any) -> None:
     facts = made().facts
     (x, y, z), target = facts["walk"]
-    assert z - made_up.height(np.array(x), np.array(y)) == pytest.approx(1.6, abs=0.3)
+    assert z - synthetic.height(np.array(x), np.array(y)) == pytest.approx(1.6, abs=0.3)
     assert np.linalg.norm(np.subtract(target, (x, y, z))) > 5 and facts["turn"][0][2] > 5
     assert facts["start"] == "turn"  # nobody drove there
 

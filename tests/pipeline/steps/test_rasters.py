@@ -7,21 +7,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.errors import SettingError
-from scan2sim.pipeline.io import geotiff
-from scan2sim.pipeline.step import Done, silent
+from scan2sim.pipeline.core.errors import SettingError
+from scan2sim.pipeline.core.step import Done, silent
+from scan2sim.pipeline.core.types import Frame, Mesh
+from scan2sim.pipeline.io.geodata import geotiff
 from scan2sim.pipeline.steps.rasters import RASTERS, RastersParams
-from scan2sim.pipeline.types import Frame, Mesh
-from tests.pipeline import made_up
+from tests.pipeline import synthetic
 
 rasterio = pytest.importorskip("rasterio", reason="rasterio isn't installed")
 FEET = Frame("EPSG:2263", (300_000.0, 60_000.0, 10.0), 1200 / 3937)
 
 
-def made(folder: Path, frame: Frame = made_up.UTM, **params: object) -> Done:
+def made(folder: Path, frame: Frame = synthetic.UTM, **params: object) -> Done:
     """Rasters of the made-up tile."""
-    meshes = {"terrain": made_up.ground(frame=frame), "building": made_up.house(frame)}
-    inputs = {group: made_up.textured(folder / group, mesh) for group, mesh in meshes.items()}
+    meshes = {"terrain": synthetic.ground(frame=frame), "building": synthetic.house(frame)}
+    inputs = {group: synthetic.textured(folder / group, mesh) for group, mesh in meshes.items()}
     (folder / "out").mkdir()
     return RASTERS.run(inputs, RastersParams(name="street", pixel=0.1, **params), folder / "out", silent)
 
@@ -33,15 +33,15 @@ def at(file: Path, frame: Frame, x: float, y: float) -> np.ndarray:
         return next(iter(raster.sample([(e, n)], masked=True)))
 
 
-@pytest.mark.parametrize("frame", [made_up.UTM, FEET, Frame("local", (5.0, 6.0, 7.0))])
+@pytest.mark.parametrize("frame", [synthetic.UTM, FEET, Frame("local", (5.0, 6.0, 7.0))])
 def test_heights_and_places_are_the_meshs_own(tmp_path: Path, frame: Frame) -> None:
     done = made(tmp_path, frame)
     files = geotiff.find(done.files["rasters"], "street")
     assert set(files) == set(geotiff.KINDS)
     roof = (4.5 + frame.origin[2]) / frame.unit
-    x0, y0 = made_up.HOUSE
+    x0, y0 = synthetic.HOUSE
     for x, y in [(-7.3, 4.2), (3.1, -8.8), (9.8, 9.8)]:
-        ground = (float(made_up.height(np.array(x), np.array(y))) + frame.origin[2]) / frame.unit
+        ground = (float(synthetic.height(np.array(x), np.array(y))) + frame.origin[2]) / frame.unit
         for kind in ("dsm", "dtm"):
             assert abs(float(at(files[kind], frame, x, y)[0]) - ground) < 0.02 / frame.unit
     inside, outside = (x0 + 0.06, y0 + 0.06), (x0 - 0.06, y0 - 0.06)  # of the roof's corner, by half a pixel
@@ -66,9 +66,9 @@ def test_gdal_reads_them_as_cloud_optimised(tmp_path: Path) -> None:
 
 
 def test_where_nothing_is_they_say_so(tmp_path: Path) -> None:
-    ground = made_up.ground()
+    ground = synthetic.ground()
     hole = np.abs(ground.corners.mean(axis=1)[:, :2]).max(axis=1) > 4
-    inputs = {"terrain": made_up.textured(tmp_path / "terrain", ground.keep(hole))}
+    inputs = {"terrain": synthetic.textured(tmp_path / "terrain", ground.keep(hole))}
     (tmp_path / "out").mkdir()
     done = RASTERS.run(inputs, RastersParams(pixel=0.1), tmp_path / "out", silent)
     for file in geotiff.find(done.files["rasters"], "tile").values():
@@ -78,7 +78,7 @@ def test_where_nothing_is_they_say_so(tmp_path: Path) -> None:
 
 
 def test_neighbours_fit_together_in_one_virtual_raster(tmp_path: Path) -> None:
-    east = Frame(made_up.UTM.crs, (690_019.97, 5_335_000.0, 510.0))  # its westernmost pixels are the other's, too
+    east = Frame(synthetic.UTM.crs, (690_019.97, 5_335_000.0, 510.0))  # its westernmost pixels are the other's, too
     one, two = made(tmp_path / "one"), made(tmp_path / "two", east)
     for kind in geotiff.KINDS:
         files = [geotiff.find(done.files["rasters"], "street")[kind] for done in (one, two)]
@@ -87,7 +87,7 @@ def test_neighbours_fit_together_in_one_virtual_raster(tmp_path: Path) -> None:
             with rasterio.open(tmp_path / f"{kind}.vrt") as raster:
                 assert raster.width == 400 and raster.crs.to_epsg() == 32632
                 assert (raster.dataset_mask()[1:-1, :-1] > 0).all()
-            for frame, file in zip((made_up.UTM, east), files, strict=True):
+            for frame, file in zip((synthetic.UTM, east), files, strict=True):
                 whole = at(tmp_path / f"{kind}.vrt", frame, 3.33, 4.44)
                 np.testing.assert_array_equal(whole, at(file, frame, 3.33, 4.44))
 
@@ -95,6 +95,6 @@ def test_neighbours_fit_together_in_one_virtual_raster(tmp_path: Path) -> None:
 def test_a_raster_beyond_bounds_is_refused_with_the_size_that_fits(tmp_path: Path) -> None:
     corners = np.array([[0, 0, 0], [9e4, 0, 0], [0, 9e4, 0]], np.float32)
     uv, page = np.zeros((1, 3, 2), np.float32), np.zeros(1, np.int16)
-    far = Mesh(made_up.UTM, corners, np.array([[0, 1, 2]], np.int32), uv=uv, page=page)
+    far = Mesh(synthetic.UTM, corners, np.array([[0, 1, 2]], np.int32), uv=uv, page=page)
     with pytest.raises(SettingError, match=r"export.rasters=3\.1 or more"):
-        RASTERS.run({"terrain": made_up.textured(tmp_path / "t", far)}, RastersParams(pixel=0.1), tmp_path, silent)
+        RASTERS.run({"terrain": synthetic.textured(tmp_path / "t", far)}, RastersParams(pixel=0.1), tmp_path, silent)

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scan2sim.flows.recipes.settings import Settings
-from scan2sim.flows.recipes.survey import survey_recipe
-from scan2sim.flows.recipes.tile import recipe
-from scan2sim.pipeline.cells import Cell
-from scan2sim.pipeline.classes import CODE
+from scan2sim.flows.pipelines.settings import Settings
+from scan2sim.flows.pipelines.survey import survey_recipe
+from scan2sim.flows.pipelines.tile import recipe
+from scan2sim.pipeline.core.classes import CODE
+from scan2sim.pipeline.core.step import Done, silent
+from scan2sim.pipeline.core.types import F32, Camera, Frame, PointCloud, Tile, Trajectory, View
 from scan2sim.pipeline.io import views as views_io
-from scan2sim.pipeline.step import Done, silent
 from scan2sim.pipeline.steps.reach import CELL, LANES, REACH
-from scan2sim.pipeline.types import F32, Camera, Frame, PointCloud, Tile, Trajectory, View
+from scan2sim.pipeline.tiling.voronoi_cell import Cell
 
 CAMERA = Camera("pinhole", 1200, 400, 700.0, 700.0, 600.0, 200.0)
 

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scan2sim.flows.recipes.settings import Settings
-from scan2sim.flows.recipes.tile import recipe
-from scan2sim.pipeline.classes import CODE
+from scan2sim.flows.pipelines.settings import Settings
+from scan2sim.flows.pipelines.tile import recipe
+from scan2sim.pipeline.core.classes import CODE
+from scan2sim.pipeline.core.step import silent
+from scan2sim.pipeline.core.types import UNCOLOURED, Frame, PointCloud
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.pipeline.step import silent
 from scan2sim.pipeline.steps.ground import GROUND, GroundParams
-from scan2sim.pipeline.types import UNCOLOURED, Frame, PointCloud
 
 FRAME = Frame("local", (100.0, 200.0, 30.0))
 CAR, SHADOW, COURT, EDGE = (0, 0, 4, 2), (-8, -3, -2, -1), (6, 6, 16, 16), (-20, 10, -12, 20)

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from scan2sim.pipeline.step import silent
+from scan2sim.pipeline.core.step import silent
+from scan2sim.pipeline.core.types import F32, Frame, Mesh, PointCloud
 from scan2sim.pipeline.steps.trim import TrimParams, trim
-from scan2sim.pipeline.types import F32, Frame, Mesh, PointCloud
 
 CORNERS = np.array([[0, 0, 0], [0.15, 0, 0], [0, 0.15, 0]], np.float32)
 

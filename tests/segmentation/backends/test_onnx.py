@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.errors import InputError, SettingError
+from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.segmentation.backends import load
 
 pytest.importorskip("onnxruntime", reason="runs the networks")

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.errors import InputError, SettingError
+from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.segmentation.backends import load
 from scan2sim.segmentation.labels import CLASSES, mapped
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.errors import DataError, InputError
-from scan2sim.pipeline.types import U8
+from scan2sim.pipeline.core.errors import DataError, InputError
+from scan2sim.pipeline.core.types import U8
 
 torch = pytest.importorskip("torch", reason="torch is not installed (pip install 'scan2sim[segmentation]')")
 safetensors = pytest.importorskip("safetensors.torch", reason="safetensors is not installed")
@@ -130,7 +130,7 @@ def colourful(folder: Path, n: int = 6) -> Path:
 
 @pytest.mark.slow
 def test_training_learns_and_repeats(tmp_path: Path) -> None:
-    from scan2sim.segmentation.train import Recipe, train
+    from scan2sim.segmentation.training.train import Recipe, train
 
     folder = colourful(tmp_path / "set")
     recipe = Recipe(steps=60, batch=4, crop=(64, 96), held_out=0.2, rate=5e-3)
@@ -142,7 +142,7 @@ def test_training_learns_and_repeats(tmp_path: Path) -> None:
 
 
 def test_training_goes_on_from_weights_that_took_colours_alone(tmp_path: Path, weights: Path) -> None:
-    from scan2sim.segmentation.train import Recipe, train
+    from scan2sim.segmentation.training.train import Recipe, train
 
     state = safetensors.load_file(weights)
     state["stem.0.weight"] = state["stem.0.weight"][:, :3].contiguous()
@@ -154,7 +154,7 @@ def test_training_goes_on_from_weights_that_took_colours_alone(tmp_path: Path, w
 
 
 def test_a_folder_without_labels_is_named(tmp_path: Path) -> None:
-    from scan2sim.segmentation.train import Recipe, train
+    from scan2sim.segmentation.training.train import Recipe, train
 
     with pytest.raises(DataError, match="images"):
         train(tmp_path, Recipe(steps=1))

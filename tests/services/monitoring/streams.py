@@ -6,7 +6,7 @@ import sys
 import time
 from typing import Any
 
-from scan2sim.services.monitoring.monitor import Monitor, ros
+from scan2sim.services.monitoring.node.monitor import Monitor, ros
 from scan2sim.services.transport import QoS
 
 LARGE = 100_000

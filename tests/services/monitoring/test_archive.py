@@ -13,14 +13,14 @@ import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
 
-from bench.bus_broker import Broker
 from scan2sim.flows.cli import app
-from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.core.errors import InputError
 from scan2sim.services import kafka
-from scan2sim.services.monitoring.archive import Archive, keep, query
-from scan2sim.services.monitoring.kept import ArchiveParams, QueryParams
-from scan2sim.services.monitoring.record import Record, TopicFlow
-from scan2sim.services.records import Kept
+from scan2sim.services.monitoring.export.archive import Archive, keep, query
+from scan2sim.services.monitoring.node.record import Record, TopicFlow
+from scan2sim.services.monitoring.settings.archive import ArchiveParams, QueryParams
+from scan2sim.services.outbox import Kept
+from tests.fakes.broker import Broker
 
 NOON = 1_700_000_000 // 3600 * 3600
 

@@ -11,20 +11,20 @@ from typing import Any
 
 import pytest
 
-from scan2sim.pipeline.errors import SettingError
+from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.services import kafka
-from scan2sim.services.monitoring.events import Events
-from scan2sim.services.monitoring.watched import TopicParams, Watched
-from scan2sim.services.records import Kept
+from scan2sim.services.monitoring.events.schema import Events
+from scan2sim.services.monitoring.settings.monitor import TopicParams, Watched
+from scan2sim.services.outbox import Kept
 from tests.services.conftest import Start
 
 STREAMS = Path(__file__).with_name("streams.py")
 TOPIC = ("-m", "scan2sim.flows.cli", "monitor", "topic")
 WATCH = """
 import sys, time
-from scan2sim.services.monitoring.monitor import ros
-from scan2sim.services.monitoring.topic_monitor import TopicMonitor
-from scan2sim.services.monitoring.watched import TopicParams
+from scan2sim.services.monitoring.node.monitor import ros
+from scan2sim.services.monitoring.node.topic_monitor import TopicMonitor
+from scan2sim.services.monitoring.settings.monitor import TopicParams
 ros.init()
 node = TopicMonitor(TopicParams(topics=sys.argv[2:], log_file=sys.argv[1], period=0.5))
 node.find(20)
@@ -97,7 +97,7 @@ import sys, time
 ahead, real, real_ns, began = [0], time.time, time.time_ns, time.monotonic()
 time.time = lambda: real() + ahead[0]
 time.time_ns = lambda: real_ns() + ahead[0] * 10**9
-from scan2sim.services.monitoring.monitor import Monitor, ros
+from scan2sim.services.monitoring.node.monitor import Monitor, ros
 from scan2sim.services.transport import QoS
 String = ros.message_type("std_msgs/msg/String")
 ros.init()

@@ -5,16 +5,16 @@ from __future__ import annotations
 import json
 import subprocess
 
-from bench.bus_broker import Broker
-from tests.ports import free_dds_domain
+from tests.fakes.broker import Broker
+from tests.fakes.ports import free_dds_domain
 from tests.services.conftest import Start
 
 PROGRAM = """
 import sys, time
-from scan2sim.services.monitoring.bus import Bus
-from scan2sim.services.monitoring.events import Body
-from scan2sim.services.monitoring.joined import BusParams
-from scan2sim.services.monitoring.monitor import ros
+from scan2sim.services.monitoring.events.bus import Bus
+from scan2sim.services.monitoring.events.schema import Body
+from scan2sim.services.monitoring.settings.bus import BusParams
+from scan2sim.services.monitoring.node.monitor import ros
 
 class Count(Body):
     vehicles: int

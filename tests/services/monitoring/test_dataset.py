@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from scan2sim.pipeline.errors import InputError
-from scan2sim.services.monitoring.nodes.dataset_talker import read_events
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.services.monitoring.example_nodes.dataset_talker import read_events
 
 
 def test_events_are_read_in_order(tmp_path: Path) -> None:

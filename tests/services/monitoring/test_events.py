@@ -6,8 +6,8 @@ import logging
 
 import pytest
 
-from scan2sim.pipeline.errors import SettingError
-from scan2sim.services.monitoring.events import Alarm, Body, Event, Events
+from scan2sim.pipeline.core.errors import SettingError
+from scan2sim.services.monitoring.events.schema import Alarm, Body, Event, Events
 
 
 class Count(Body):

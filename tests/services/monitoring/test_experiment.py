@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from scan2sim.services.monitoring.nodes import worker
+from scan2sim.services.monitoring.example_nodes import worker
 from tests.services.conftest import Start
 
 CLI = ("cyclone", "-m", "scan2sim.flows.cli", "monitor")

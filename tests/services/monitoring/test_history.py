@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scan2sim.services.monitoring import history as module
-from scan2sim.services.monitoring.history import COLUMNS, HELD, POINTS, History, buckets, grid
-from tests.services.monitoring.telling import body, record
+from scan2sim.services.monitoring.dashboard import history as module
+from scan2sim.services.monitoring.dashboard.history import COLUMNS, HELD, POINTS, History, buckets, grid
+from tests.services.monitoring.sample_records import body, record
 
 START = 1_700_000_000.0
 

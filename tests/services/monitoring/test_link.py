@@ -7,10 +7,10 @@ from statistics import median
 
 import pytest
 
-from bench import bus_link
+from bench.bus import link as bus_link
 from scan2sim.services.qos.counters import Counter
-from scan2sim.services.qos.link import Link
-from scan2sim.services.qos.shape import Shape
+from scan2sim.services.qos.emulated_link import Link
+from scan2sim.services.qos.link_profile import Shape
 from tests.services.qos.needed import need_link
 
 

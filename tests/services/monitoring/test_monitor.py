@@ -11,16 +11,16 @@ from typing import Any
 
 import pytest
 
-from bench.bus_broker import Broker
 from scan2sim.services import kafka
-from scan2sim.services.monitoring.record import Record
-from scan2sim.services.records import Spool
-from tests.ports import free_port
+from scan2sim.services.monitoring.node.record import Record
+from scan2sim.services.outbox import Spool
+from tests.fakes.broker import Broker
+from tests.fakes.ports import free_port
 from tests.services.conftest import Start
 
 NODE = """
 import sys, time
-from scan2sim.services.monitoring.monitor import Monitor, ros
+from scan2sim.services.monitoring.node.monitor import Monitor, ros
 from scan2sim.services.transport import QoS
 String = ros.message_type("std_msgs/msg/String")
 
@@ -48,7 +48,7 @@ ros.shutdown()
 """
 ENDED = """
 import signal, sys
-from scan2sim.services.monitoring.monitor import Monitor, ros
+from scan2sim.services.monitoring.node.monitor import Monitor, ros
 signal.signal(signal.SIGTERM, signal.default_int_handler)
 ros.init()
 node = Monitor("ended", period=600, log_file=sys.argv[1])

@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from scan2sim.pipeline.errors import InputError
-from scan2sim.services.monitoring.events import Alarm, QueueState
-from scan2sim.services.monitoring.rules import Alarms, Rule, read
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.services.monitoring.events.rules import Alarms, Rule, read
+from scan2sim.services.monitoring.events.schema import Alarm, QueueState
 
 
 def record(node: str, time: float, *flows: dict[str, Any], subscribes: tuple[str, ...] = ()) -> dict[str, Any]:

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from bench.osm_fake import Fake, State
 from scan2sim.services.orchestration import lifecycle
 from scan2sim.services.orchestration import osm as osm_client
 from scan2sim.services.orchestration.osm import Osm
 from scan2sim.services.orchestration.settings import Connection
+from tests.fakes.osm import Fake, State
 
 TOWN = """
 deployment = "town"

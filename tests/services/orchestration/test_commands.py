@@ -9,15 +9,15 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from bench.osm_fake import Fake, State
 from scan2sim.flows.commands.orchestrate import app
-from scan2sim.pipeline.errors import StepError
+from scan2sim.pipeline.core.errors import StepError
 from scan2sim.services.orchestration import description, operations
 from scan2sim.services.orchestration.lifecycle import Patience
 from scan2sim.services.orchestration.osm import Osm
 from scan2sim.services.orchestration.package import build
 from scan2sim.services.orchestration.settings import Connection
 from scan2sim.services.qos.requirements import Environment
+from tests.fakes.osm import Fake, State
 
 Command = Callable[..., str]
 

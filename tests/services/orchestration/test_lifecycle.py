@@ -12,8 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from bench.osm_fake import CUT_AFTER, CUT_BEFORE, Fake, State
-from scan2sim.pipeline.errors import InputError, ScanError, SettingError, StepError, UnavailableError
+from scan2sim.pipeline.core.errors import InputError, ScanError, SettingError, StepError, UnavailableError
 from scan2sim.services.orchestration import apply, deployment, operations
 from scan2sim.services.orchestration.apply import Applied, Change
 from scan2sim.services.orchestration.instance import Action, Instance, Wanted, next_action
@@ -22,6 +21,7 @@ from scan2sim.services.orchestration.osm import FAULTS, Osm
 from scan2sim.services.orchestration.package import Packages, build
 from scan2sim.services.orchestration.settings import ApplyParams, Connection
 from scan2sim.services.qos.requirements import Environment
+from tests.fakes.osm import CUT_AFTER, CUT_BEFORE, Fake, State
 from tests.services.orchestration.conftest import TOWN
 
 QUIET: Callable[[str], None] = lambda text: None  # noqa: E731

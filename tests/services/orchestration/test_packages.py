@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from scan2sim.pipeline.errors import InputError, SettingError
+from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.services.orchestration import chart, description, descriptor, package
 from scan2sim.services.orchestration.description import Description
 from scan2sim.services.orchestration.package import build, unpacked

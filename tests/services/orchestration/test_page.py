@@ -13,8 +13,7 @@ from typing import Any
 
 import pytest
 
-from bench.osm_fake import Fake
-from scan2sim.services import serving
+from scan2sim.services.http import factory
 from scan2sim.services.orchestration import description
 from scan2sim.services.orchestration.catalogue import Catalogue
 from scan2sim.services.orchestration.osm import Osm
@@ -23,6 +22,7 @@ from scan2sim.services.orchestration.page import application
 from scan2sim.services.orchestration.settings import PageParams
 from scan2sim.services.qos.requirements import Environment
 from tests.browser import Page, chromium
+from tests.fakes.osm import Fake
 
 ONBOARDED = "[...document.querySelectorAll('#services article')].some(one => !one.textContent.includes('not in OSM'))"
 
@@ -61,7 +61,7 @@ def served(fake: Fake, osm: Osm, tmp_path: Path) -> Iterator[Served]:
         listening.set()
 
     app = application(params, catalogue)
-    threading.Thread(target=serving.run, args=(app, params, say), daemon=True).start()
+    threading.Thread(target=factory.run, args=(app, params, say), daemon=True).start()
     assert listening.wait(20)
     yield Served(told[0].rstrip("/"), params.packages)
     catalogue.close()

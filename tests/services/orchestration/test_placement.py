@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from scan2sim.pipeline.errors import InputError
+from scan2sim.pipeline.core.errors import InputError
 from scan2sim.services.orchestration import placement
 
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from bench.osm_fake import Fake
-from scan2sim.services.monitoring.actuators.osm import OsmReplicas
+from scan2sim.services.monitoring.autoscale.actuators.osm import OsmReplicas
 from scan2sim.services.orchestration import description, operations
 from scan2sim.services.orchestration.lifecycle import Patience
 from scan2sim.services.orchestration.osm import Osm
 from scan2sim.services.orchestration.package import build
 from scan2sim.services.orchestration.settings import Connection
 from scan2sim.services.qos.requirements import Environment
+from tests.fakes.osm import Fake
 
 
 def until(done: Callable[[], bool]) -> None:

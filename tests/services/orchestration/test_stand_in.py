@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from bench.osm_fake import Fake
+from tests.fakes.osm import Fake
 
 ASKED = r"^/(vnfpkgm/v1/vnf_packages|nsd/v1/ns_descriptors|nslcm/v1/ns_(instances|lcm_op_occs)|admin/v1/(tokens|vim_accounts|k8sclusters))(/|$)"  # noqa: E501
 ARCHIVES = r"(package|nsd)_content$"  # which schemathesis can't make

@@ -7,7 +7,7 @@ import shutil
 
 import pytest
 
-from scan2sim.pipeline.errors import UnavailableError
+from scan2sim.pipeline.core.errors import UnavailableError
 from scan2sim.services.qos import links
 
 

@@ -11,8 +11,8 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from scan2sim.flows.cli import app
-from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.types import U8
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.types import U8
 from scan2sim.services.qos.encoding import (
     by_http,
     choose_h264,

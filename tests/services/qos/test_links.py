@@ -13,16 +13,16 @@ from typing import Any
 
 import pytest
 
-from scan2sim.pipeline import backends
-from scan2sim.pipeline.backends import Lacking
-from scan2sim.pipeline.errors import SettingError, UnavailableError
+from scan2sim.pipeline.core import plugins
+from scan2sim.pipeline.core.errors import SettingError, UnavailableError
+from scan2sim.pipeline.core.plugins import Lacking
 from scan2sim.services.qos import links, namespaces
 from scan2sim.services.qos.counters import Counter
-from scan2sim.services.qos.link import Link
-from scan2sim.services.qos.shape import Shape
+from scan2sim.services.qos.emulated_link import Link
+from scan2sim.services.qos.link_profile import Shape
 from tests.services.qos.needed import need_link
 
-each = pytest.mark.parametrize("backend", backends.names(links.__name__))
+each = pytest.mark.parametrize("backend", plugins.names(links.__name__))
 FLOOD = """
 import socket, sys, time
 address, size, count, pause = sys.argv[1], *map(float, sys.argv[2:])
@@ -95,7 +95,8 @@ def test_no_more_passes_than_the_rate(backend: str) -> None:
 def test_all_is_gone_when_its_maker_is_killed(tmp_path: Path) -> None:
     need_link()
     code = (
-        "import sys, time\nfrom scan2sim.services.qos.link import Link\nfrom scan2sim.services.qos.shape import Shape\n"
+        "import sys, time\nfrom scan2sim.services.qos.emulated_link import Link\n"
+        "from scan2sim.services.qos.link_profile import Shape\n"
         "with Link(Shape()) as link:\n    sleeping = link.far.popen('sleep', '600')\n"
         "    print(sleeping.pid, link.near.name, link.far.name, flush=True)\n    time.sleep(600)\n"
     )
@@ -131,8 +132,8 @@ def test_what_a_link_needs_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
         pass
     with pytest.raises(SettingError, match="there is no 'tin can'"):
         links.find("tin can")
-    for name in backends.names(links.__name__):
-        monkeypatch.setattr(backends.module(links.__name__, name), "lacking", lambda: Lacking("lacks it", "Get it"))
+    for name in plugins.names(links.__name__):
+        monkeypatch.setattr(plugins.module(links.__name__, name), "lacking", lambda: Lacking("lacks it", "Get it"))
     with pytest.raises(UnavailableError, match=r"netem lacks it; wirefilter lacks it\. Get it"):
         links.find()
     assert links.programs(sh="dash", no_such_program="its-package") == Lacking(

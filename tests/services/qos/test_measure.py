@@ -13,18 +13,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.errors import InputError, UnavailableError
-from scan2sim.pipeline.step import silent
-from scan2sim.services.qos import environments, places, robot
+from scan2sim.pipeline.core.errors import InputError, UnavailableError
+from scan2sim.pipeline.core.step import silent
+from scan2sim.services.qos import deployment, environments, robot
+from scan2sim.services.qos.compare import needs, passed, rows
 from scan2sim.services.qos.encoding import Jpeg
 from scan2sim.services.qos.environments import Network, network
-from scan2sim.services.qos.machine import Machine, Usage
+from scan2sim.services.qos.host_load import Machine, Usage
+from scan2sim.services.qos.link_profile import Shape
 from scan2sim.services.qos.measure import FREE, Measured, MeasureParams, encoding_of, measure
 from scan2sim.services.qos.probe import Seen
 from scan2sim.services.qos.requirements import NETWORK, Environment, Requirements, read
 from scan2sim.services.qos.robot import Answers
-from scan2sim.services.qos.shape import Shape
-from scan2sim.services.qos.verdict import needs, passed, rows
 
 
 class _Answering(BaseHTTPRequestHandler):
@@ -129,7 +129,7 @@ needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root may make ne
 def test_the_probe_sees_what_the_link_does() -> None:
     there = Shape(delay=0.03, loss=0.1)
     try:
-        with places.between(Network(there=there, back=Shape(delay=0.01))) as ends:
+        with deployment.between(Network(there=there, back=Shape(delay=0.01))) as ends:
             seen = ends.seen(ends.probe(5.0))
     except UnavailableError as error:
         pytest.skip(str(error))

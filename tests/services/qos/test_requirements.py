@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from scan2sim.pipeline.errors import InputError, SettingError
+from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.services.qos import requirements
 from scan2sim.services.qos.requirements import Bound, Environment, read
 

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from scan2sim.services import serving
-from scan2sim.services.served import Served
-from scan2sim.services.teleoperation.cockpit import Screens, application
-from tests.ports import free_port
+from scan2sim.services.http import factory
+from scan2sim.services.http.settings import Served
+from scan2sim.services.teleoperation.station.web import Screens, application
+from tests.fakes.ports import free_port
 from tests.services.teleoperation.street import HERE, Desk, Street, until
 
 
@@ -40,7 +40,7 @@ def served(tmp_path: Path, params: Served) -> Iterator[Cockpit]:
     told: list[str] = []
     try:
         made = page_of(street, params)
-        threading.Thread(target=serving.run, args=(made.app, params, told.append), daemon=True).start()
+        threading.Thread(target=factory.run, args=(made.app, params, told.append), daemon=True).start()
         until(lambda: told)
         made.url = told[0]
         yield made

@@ -11,25 +11,25 @@ import cv2
 import numpy as np
 
 from scan2sim.services.teleoperation import cameras
-from scan2sim.services.teleoperation.adapting import Bounds
-from scan2sim.services.teleoperation.authority import certify
-from scan2sim.services.teleoperation.bundle import Policy
 from scan2sim.services.teleoperation.cameras import Camera, Picture, View
-from scan2sim.services.teleoperation.car import CarParams, CarUnit
-from scan2sim.services.teleoperation.control import Address
-from scan2sim.services.teleoperation.controls import Controls, Gear, VehicleState
-from scan2sim.services.teleoperation.dialling import Link
-from scan2sim.services.teleoperation.fleet import Fleet
-from scan2sim.services.teleoperation.gateway import Gateway
-from scan2sim.services.teleoperation.identity import Identity
-from scan2sim.services.teleoperation.listening import Listener
-from scan2sim.services.teleoperation.membership import Membership
-from scan2sim.services.teleoperation.messages import Command, Stream
-from scan2sim.services.teleoperation.station import Station
-from scan2sim.services.teleoperation.translating import TranslateParams, Translating
-from scan2sim.services.teleoperation.vehicle import Vehicle
-from scan2sim.services.teleoperation.watching import Frame
-from tests.services.teleoperation.relay import Relay
+from scan2sim.services.teleoperation.control.controls import Controls, Gear, VehicleState
+from scan2sim.services.teleoperation.control.messages import Command, Stream
+from scan2sim.services.teleoperation.gateway.client import Membership
+from scan2sim.services.teleoperation.gateway.fleet import Fleet
+from scan2sim.services.teleoperation.gateway.identity import Identity
+from scan2sim.services.teleoperation.gateway.pki import certify
+from scan2sim.services.teleoperation.gateway.protocol import Address
+from scan2sim.services.teleoperation.gateway.server import Gateway
+from scan2sim.services.teleoperation.station.app import Station
+from scan2sim.services.teleoperation.transport.multipath import Policy
+from scan2sim.services.teleoperation.transport.station_side import Listener
+from scan2sim.services.teleoperation.transport.vehicle_side import Link
+from scan2sim.services.teleoperation.vehicle.adapter import TranslateParams, Translating
+from scan2sim.services.teleoperation.vehicle.app import Vehicle
+from scan2sim.services.teleoperation.vehicle.onboard_unit import CarParams, CarUnit
+from scan2sim.services.teleoperation.video.jitter_buffer import Frame
+from scan2sim.services.teleoperation.video.rate_control import Bounds
+from tests.services.teleoperation.transport.relay import Relay
 
 HERE = "127.0.0.1"
 LIMIT = 1500.0

@@ -11,7 +11,7 @@ import pytest
 
 pytest.importorskip("OpenSSL", reason="the extra teleop isn't installed")
 
-from scan2sim.services.teleoperation.controls import Controls
+from scan2sim.services.teleoperation.control.controls import Controls
 from tests.services.teleoperation.street import AHEAD, REST, Street, until
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from scan2sim.pipeline.types import F32, U8
+from scan2sim.pipeline.core.types import F32, U8
 from scan2sim.services.toolboxes.results import Detection
 
 RATE, SIZE = 25.0, (240, 400)

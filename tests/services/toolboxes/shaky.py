@@ -8,11 +8,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from scan2sim.pipeline.errors import StepError
-from scan2sim.pipeline.types import U8
-from scan2sim.services.toolboxes.boxes import Facts, Follow
+from scan2sim.pipeline.core.errors import StepError
+from scan2sim.pipeline.core.types import U8
 from scan2sim.services.toolboxes.results import Body, Class
 from scan2sim.services.toolboxes.settings import ToolboxParams as Params
+from scan2sim.services.toolboxes.tasks import Facts, Follow
 
 NEEDS = ()
 DIES, HANGS, FAILS, RAISES, SLOW, SLOWER = 201, 202, 203, 204, 205, 206

@@ -16,7 +16,7 @@ from PIL import Image
 pytest.importorskip("fastapi", reason="the extra bus isn't installed")
 from fastapi.testclient import TestClient
 
-from scan2sim.services.served import Served
+from scan2sim.services.http.settings import Served
 from scan2sim.services.toolboxes.api import LARGEST, application
 from scan2sim.services.toolboxes.engine import Engine
 from scan2sim.services.toolboxes.settings import ToolboxParams

@@ -15,7 +15,7 @@ from PIL import Image
 pytest.importorskip("cyclonedds", reason="the extra bus isn't installed")
 
 from scan2sim.services.toolboxes.settings import IMAGE
-from tests.ports import free_port
+from tests.fakes.ports import free_port
 from tests.services.conftest import Start
 from tests.services.toolboxes import hearing, shaky
 from tests.services.toolboxes.test_sources import film

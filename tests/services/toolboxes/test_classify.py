@@ -9,8 +9,8 @@ import pytest
 
 pytest.importorskip("efficientnet_lite_pytorch", reason="the extra toolboxes isn't installed")
 
-from scan2sim.services.toolboxes.boxes import classify
-from scan2sim.services.toolboxes.networks import imagenet
+from scan2sim.services.toolboxes.detector import imagenet
+from scan2sim.services.toolboxes.tasks import classify
 from tests.conftest import ROOT
 
 

@@ -18,18 +18,18 @@ import pytest
 pytest.importorskip("fastapi", reason="the extra bus isn't installed")
 from fastapi.testclient import TestClient
 
-from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.step import silent
-from scan2sim.services.served import Served
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.step import silent
+from scan2sim.services.http.settings import Served
 from scan2sim.services.toolboxes import offline, sources
 from scan2sim.services.toolboxes.api import application
 from scan2sim.services.toolboxes.engine import Engine
-from scan2sim.services.toolboxes.following import Follower
 from scan2sim.services.toolboxes.frames import Frame
+from scan2sim.services.toolboxes.per_source_worker import Follower
 from scan2sim.services.toolboxes.results import Body, Result
 from scan2sim.services.toolboxes.settings import ToolboxParams
 from scan2sim.services.toolboxes.sources import Cameras
-from tests.ports import free_port
+from tests.fakes.ports import free_port
 from tests.services.toolboxes import shaky
 
 USER, PASSWORD, TOKEN = "admin", "hunter2", "s3cret"

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scan2sim.pipeline import extras
-from scan2sim.pipeline.errors import InputError, SettingError, UnavailableError
+from scan2sim.pipeline.core import optional_deps
+from scan2sim.pipeline.core.errors import InputError, SettingError, UnavailableError
 from scan2sim.services.toolboxes import coco, models
-from scan2sim.services.toolboxes.boxes import detect
-from scan2sim.services.toolboxes.boxes.detect import Params
+from scan2sim.services.toolboxes.tasks import detect
+from scan2sim.services.toolboxes.tasks.detect import Params
 
 
 def test_the_package_of_coco_is_named_where_it_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -21,7 +21,7 @@ def test_the_package_of_coco_is_named_where_it_is_missing(monkeypatch: pytest.Mo
         detect.check(Params(network="coco"))
 
 
-@pytest.mark.skipif(extras.missing(coco.PACKAGE) is not None, reason=f"{coco.PACKAGE} isn't installed")
+@pytest.mark.skipif(optional_deps.missing(coco.PACKAGE) is not None, reason=f"{coco.PACKAGE} isn't installed")
 def test_cars_of_a_real_photo_are_found_by_coco(real_data: Path) -> None:
     import cv2
 

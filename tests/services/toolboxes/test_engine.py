@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from scan2sim.pipeline.errors import SettingError
-from scan2sim.pipeline.types import U8
+from scan2sim.pipeline.core.errors import SettingError
+from scan2sim.pipeline.core.types import U8
 from scan2sim.services.toolboxes.engine import Engine
 from scan2sim.services.toolboxes.frames import LARGEST, Frame, Raw
 from scan2sim.services.toolboxes.results import Result, State
@@ -198,8 +198,8 @@ def test_there_is_no_such_toolbox() -> None:
 
 
 def test_weights_that_may_hold_code_are_refused(tmp_path: Path) -> None:
-    from scan2sim.pipeline.errors import InputError
-    from scan2sim.services.toolboxes.boxes import classify
+    from scan2sim.pipeline.core.errors import InputError
+    from scan2sim.services.toolboxes.tasks import classify
 
     pickled = tmp_path / "model.pt"
     pickled.write_bytes(b"\x80\x04.")

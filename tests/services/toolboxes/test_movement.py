@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import pytest
 
-from scan2sim.services.toolboxes.boxes import movement
 from scan2sim.services.toolboxes.frames import Frame
 from scan2sim.services.toolboxes.results import Body, Moving
+from scan2sim.services.toolboxes.tasks import movement
 from tests.services.toolboxes.moving_scene import RATE, Scene, detected
 
 pytest.importorskip("trackers")

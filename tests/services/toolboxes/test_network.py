@@ -10,8 +10,8 @@ import pytest
 
 from scan2sim.data_samples import boxes
 from scan2sim.services.toolboxes import yolo
-from scan2sim.services.toolboxes.networks import labelled
-from scan2sim.services.toolboxes.networks.score import Found, Truth, average_precision
+from scan2sim.services.toolboxes.detector import dataset
+from scan2sim.services.toolboxes.detector.metrics import Found, Truth, average_precision
 from tests.conftest import ROOT
 
 onnxruntime = pytest.importorskip("onnxruntime")
@@ -30,7 +30,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_pictures_come_with_boxes_and_go_on_where_they_ended(made: Path) -> None:
-    found, names = labelled.read(made)
+    found, names = dataset.read(made)
     before = (made / "boxes.jsonl").read_text(encoding="utf-8")
     for _ in boxes.write(made, 60, 500, processes=1):
         pass
@@ -38,7 +38,7 @@ def test_pictures_come_with_boxes_and_go_on_where_they_ended(made: Path) -> None
     assert {"car", "train"} <= {names[int(k)] for one in found for k in one.classes}
     rng = np.random.default_rng(0)
     for one in found[::7]:
-        image, things, left_alone = labelled.seen(one, (256, 320), rng)
+        image, things, left_alone = dataset.seen(one, (256, 320), rng)
         assert image.shape == (256, 320, 3) and image.min() >= 0 and image.max() <= 1
         for corners in (things[:, :4], left_alone):
             assert (corners >= 0).all() and (corners <= [320, 256, 320, 256]).all()
@@ -52,10 +52,10 @@ def test_boxes_move_with_the_picture(tmp_path: Path) -> None:
     rgb[100:180, 300:420] = 255
     cv2.imwrite(str(tmp_path / "a.png"), rgb)
     box = np.array([[300, 100, 420, 180]], np.float32)
-    one = labelled.Labelled(tmp_path / "a.png", box, np.zeros(1, np.float32), np.ones(1, np.float32))
+    one = dataset.Labelled(tmp_path / "a.png", box, np.zeros(1, np.float32), np.ones(1, np.float32))
     seen = 0
     for seed in range(20):
-        image, things, _ = labelled.seen(one, (320, 384), np.random.default_rng(seed))
+        image, things, _ = dataset.seen(one, (320, 384), np.random.default_rng(seed))
         if not len(things):
             continue
         x0, y0, x1, y1 = np.round(things[0, :4]).astype(int)
@@ -69,7 +69,7 @@ def test_boxes_move_with_the_picture(tmp_path: Path) -> None:
 
 
 def test_each_box_is_found_by_places_near_its_middle() -> None:
-    from scan2sim.services.toolboxes.networks.network import assigned, grid
+    from scan2sim.services.toolboxes.detector.network import assigned, grid
 
     at, stride = grid(384, 640)
     rng = np.random.default_rng(3)
@@ -84,7 +84,7 @@ def test_each_box_is_found_by_places_near_its_middle() -> None:
 
 
 def test_perfect_answers_cost_nothing_and_bad_ones_much() -> None:
-    from scan2sim.services.toolboxes.networks.network import assigned, grid, weighed
+    from scan2sim.services.toolboxes.detector.network import assigned, grid, weighed
 
     size = (128, 192)
     at, stride = grid(*size)
@@ -106,8 +106,8 @@ def test_perfect_answers_cost_nothing_and_bad_ones_much() -> None:
 
 
 def test_the_file_says_what_torch_says_for_any_batch_and_size(tmp_path: Path) -> None:
-    from scan2sim.services.toolboxes.networks.export import export
-    from scan2sim.services.toolboxes.networks.network import VehicleNet
+    from scan2sim.services.toolboxes.detector.export import export
+    from scan2sim.services.toolboxes.detector.network import VehicleNet
 
     torch.manual_seed(0)
     network = VehicleNet(3).eval()
@@ -140,8 +140,8 @@ def test_the_trained_network_finds_vehicles_it_has_never_seen(made: Path) -> Non
     session = onnxruntime.InferenceSession(OWN, providers=["CPUExecutionProvider"])
     names = json.loads(session.get_modelmeta().custom_metadata_map["names"])
     found, truth = [], []
-    for one in labelled.read(made)[0]:
-        image, transform = yolo.letterbox(labelled.picture(one.image), 640)
+    for one in dataset.read(made)[0]:
+        image, transform = yolo.letterbox(dataset.picture(one.image), 640)
         got = yolo.decode(session.run(None, {"images": image[None]})[0][0], transform, 0.01)
         found.append(Found(got.corners, got.scores, got.labels))
         sides = (one.boxes[:, 2:] - one.boxes[:, :2]).max(axis=1, initial=0)

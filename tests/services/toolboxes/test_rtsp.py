@@ -14,7 +14,7 @@ from scan2sim.services.toolboxes import offline
 from scan2sim.services.toolboxes.engine import Engine
 from scan2sim.services.toolboxes.settings import ToolboxParams
 from scan2sim.services.toolboxes.sources import SILENT, Cameras
-from tests.ports import free_port
+from tests.fakes.ports import free_port
 from tests.services.toolboxes import shaky
 
 PYTHON = "/usr/bin/python3"

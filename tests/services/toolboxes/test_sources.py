@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from scan2sim.pipeline.errors import InputError
-from scan2sim.pipeline.step import silent
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.step import silent
 from scan2sim.services.toolboxes import offline, sources
 from scan2sim.services.toolboxes.engine import Engine
 from scan2sim.services.toolboxes.settings import ToolboxParams

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.types import F32
-from scan2sim.services.toolboxes.overlap import overlaps
+from scan2sim.pipeline.core.types import F32
+from scan2sim.services.toolboxes.iou import overlaps
 from scan2sim.services.toolboxes.yolo import GREY, Transform, decode, letterbox
 
 

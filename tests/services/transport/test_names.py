@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from scan2sim.pipeline.errors import SettingError
+from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.services.transport import names
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from scan2sim.pipeline.errors import SettingError
+from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.services.transport import load
 from tests.services.conftest import Start
 

@@ -1,0 +1,1 @@
+"""Benchmarks of the event bus: `python -m bench.bus`."""

@@ -1,0 +1,5 @@
+"""`python -m bench.bus`."""
+
+from bench.bus.run import main
+
+main()

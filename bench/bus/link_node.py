@@ -1,0 +1,63 @@
+"""A node at one end of a shaped link, for `bench.bus.link`: it talks, or watches, until it is asked to end.
+
+`python -m bench.bus.link_node talk|watch LOG [--machine NAME] [--ahead SECONDS] [--size N] [--interval SECONDS]`: with
+`--machine` it takes itself for one on another machine, and asks for the time; with `--ahead` its clock goes wrong by so
+much (what reads the time otherwise than through Python isn't fooled: rclpy).
+"""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import time
+from pathlib import Path
+
+TOPIC = "/link"
+WINDOW = 100_000
+"""Latencies that a record's mean is of, at most: all."""
+
+
+def main() -> None:
+    """Run it."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("role", choices=("talk", "watch"))
+    parser.add_argument("log", type=Path)
+    parser.add_argument("--machine")
+    parser.add_argument("--ahead", type=float, default=0.0)
+    parser.add_argument("--size", type=int, default=1000)
+    parser.add_argument("--interval", type=float, default=0.01)
+    given = parser.parse_args()
+
+    from scan2sim.services.monitoring.node import clock_sync
+
+    if given.ahead:
+        right, ahead = time.time_ns, round(given.ahead * 1e9)
+        time.time_ns = lambda: right() + ahead
+    if given.machine:
+        clock_sync.this_host = lambda: given.machine  # type: ignore[assignment]
+    _spin(given)
+
+
+def _spin(given: argparse.Namespace) -> None:
+    from scan2sim.services.monitoring.example_nodes.talker import Talker
+    from scan2sim.services.monitoring.node.monitor import STRING, ros
+    from scan2sim.services.monitoring.node.topic_monitor import TopicMonitor
+    from scan2sim.services.monitoring.settings.monitor import TalkerParams, TopicParams
+
+    asked: list[int] = []
+    ros.init()
+    signal.signal(signal.SIGTERM, lambda number, _: asked.append(number))  # after rclpy's own
+    if given.role == "talk":
+        node = Talker(TalkerParams(topic=TOPIC, size=given.size, interval=given.interval, log_file=given.log))
+    else:
+        node = TopicMonitor(
+            TopicParams(topics=[TOPIC], type=STRING, best_effort=True, window_size=WINDOW, log_file=given.log)
+        )
+    while not asked:
+        ros.spin_once(node, 0.1)
+    node.destroy_node()
+    ros.shutdown()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""The gate: exported worlds run through the programs that use them: `python -m bench.gate`."""

@@ -1,0 +1,5 @@
+"""`python -m bench.gate`."""
+
+from bench.gate.run import main
+
+main()

@@ -1,0 +1,40 @@
+"""Points surveyed 5 km from a world's origin, taken through every format and back to the CRS."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from scan2sim.pipeline.core import plugins
+from scan2sim.pipeline.core.step import silent
+from scan2sim.pipeline.io import world_formats
+from scan2sim.pipeline.io.world_formats import SceneParams
+from tests.pipeline import synthetic
+from tests.pipeline.io.scene_readers import READERS, surveyed_off
+
+APART = 5000.1234567
+
+
+def georeference(folder: Path) -> dict[str, Any]:
+    """Print the metres between where the points were surveyed and where each format's own readers find them.
+
+    Returns:
+        `georef_max_m`: the largest of them.
+    """
+    shutil.rmtree(folder, ignore_errors=True)
+    scene = synthetic.scene(folder / "scene", tiles=2, apart=APART)
+    off = {}
+    for name in READERS:
+        if plugins.missing(world_formats.PACKAGE, name):
+            continue
+        world_formats.write(scene, [name], folder / name, SceneParams(), silent)
+        try:
+            off[name] = round(surveyed_off(folder / name, scene, name), 6)
+        except pytest.skip.Exception:  # its reader isn't installed
+            continue
+    print(f"{'all':8} {'surveyed':10} {json.dumps(off)}", flush=True)
+    return {"georef_max_m": max(off.values())}

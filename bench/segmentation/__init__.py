@@ -1,0 +1,1 @@
+"""Benchmarks of segmentation: `python -m bench.segmentation`."""

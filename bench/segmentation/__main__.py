@@ -1,0 +1,5 @@
+"""`python -m bench.segmentation`."""
+
+from bench.segmentation.run import main
+
+main()

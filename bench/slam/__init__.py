@@ -1,0 +1,1 @@
+"""Benchmarks of SLAM: `python -m bench.slam`."""

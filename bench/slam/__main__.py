@@ -1,0 +1,5 @@
+"""`python -m bench.slam`."""
+
+from bench.slam.run import main
+
+main()

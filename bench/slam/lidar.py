@@ -1,0 +1,282 @@
+"""Lidar, camera and GPS, each alone and all in one graph: how far each path of a scanner is from the truth.
+
+`python -m bench.slam.lidar [--out bench-out/slam_lidar] [--turn FRAMES]`, over
+
+- KITTI odometry 04: 25 real sweeps and photos, true poses, a receiver as `data_samples.gps` makes up;
+- the rendered turn of `data_samples.turn` (FRAMES, if it is rendered already), with sweeps of the same town;
+- ten simulated drives of 400 m (`simulated`), each with a tunnel of 60 m for the lidar, a dark stretch of 50 m for the
+  camera, whose scale drifts, and GPS with outliers and a jump.
+
+Metres are the root mean square of places after a rigid alignment, the camera's (which has no scale) after a similarity.
+Ends with `RESULT {json}`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from bench.paths import ROOT
+from bench.segmentation.run import scan2sim
+from scan2sim.data_samples import paths, turn
+from scan2sim.data_samples.gps import receiver
+from scan2sim.data_samples.panorama import Panorama
+from scan2sim.data_samples.town import build
+from scan2sim.data_samples.traffic import Traffic
+from scan2sim.pipeline.camera.models import pixel_rays
+from scan2sim.pipeline.core.step import silent
+from scan2sim.pipeline.core.types import F64, Camera, Trajectory
+from scan2sim.pipeline.geometry.similarity import umeyama
+from scan2sim.pipeline.importers import sweeps as io
+from scan2sim.pipeline.io import trajectory as trajectory_io
+from scan2sim.slam.geometry import exp_so3, inverse
+from scan2sim.slam.steps.fuse import FuseParams, fuse_path
+from scan2sim.slam.steps.lidar import LidarParams, lidar
+from scan2sim.slam.trajectory.fusion import Fixes, Fused, Steps, camera_steps, fuse
+
+KITTI = ROOT.parent / "shared" / "data" / "kitti_odo04_f00-24"
+SENSORS = ("lidar", "visual", "gps", "fused")
+T_CAMERA_SCANNER = np.array([[0.0, -1, 0, 0], [0, 0, -1, -0.3], [1, 0, 0, 0], [0, 0, 0, 1]])
+"""Of the turn: the scanner stands 30 cm above the camera."""
+ROWS, LOWEST, HIGHEST = 360, -25.0, 15.0
+"""Of the turn's sweeps: rows of half a degree, and elevations (degrees)."""
+NOISE = 0.02
+"""Metres, of their ranges."""
+
+
+def ate(places: F64, truth: F64, *, scaled: bool = False) -> float:
+    """Root mean square metres of places (N, 3) after they are aligned."""
+    off = umeyama(places, truth, scaled=scaled).apply(places) - truth
+    return float(np.sqrt((off**2).sum(axis=1).mean()))
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """A drive on disk.
+
+    Attributes:
+        sweeps, photos: folders.
+        truth: (T, 4, 4) of the scanner, at `times` (T,), when each sweep and each photo was taken.
+        focal, centre: of the photos, pixels.
+        extrinsics, clock, gps: files: T_camera_scanner, the times, a receiver's fixes.
+    """
+
+    sweeps: Path
+    photos: Path
+    truth: F64
+    times: F64
+    focal: float
+    centre: tuple[float, float]
+    extrinsics: Path
+    clock: Path
+    gps: Path
+
+    def measure(self, out: Path) -> dict[str, float]:
+        """ATE of each sensor alone, and of all together."""
+        scan2sim("slam", self.photos, "--focal", self.focal, "--centre", *self.centre, "--times", self.clock,
+                 "--out", out / "slam")  # fmt: skip
+        for name in ("lidar", "fused"):
+            (out / name).mkdir(parents=True, exist_ok=True)
+        given = {"sweeps": self.sweeps, "times": self.clock}
+        matched = lidar(given, LidarParams(), out / "lidar", silent, out / "checkpoint").files["matched"]
+        alone = fuse_path({**given, "matched": matched}, FuseParams(), out / "lidar", silent)
+        poses = out / "slam" / "trajectory.csv"
+        sources = {"matched": matched, "poses": poses, "extrinsics": self.extrinsics, "gps": self.gps}
+        fused = fuse_path(given | sources, FuseParams(), out / "fused", silent)
+        print(f"{out.name}: {fused.facts['told']}; unsure {fused.facts['unsure_share']}")
+        truth = self.truth[:, :3, 3]
+        fixes = np.loadtxt(self.gps, delimiter=",", skiprows=1)
+        there = np.column_stack([np.interp(self.times, fixes[:, 0], fixes[:, k]) for k in (1, 2, 3)])
+        camera = trajectory_io.read(poses)
+        beside = (self.truth @ inverse(io.read_extrinsics(self.extrinsics)))[:, :3, 3]
+        return {
+            "lidar": ate(trajectory_io.read(alone.files["trajectory"]).positions, truth),
+            "visual": ate(camera.positions, beside, scaled=True),
+            "gps": ate(there, truth),
+            "fused": ate(trajectory_io.read(fused.files["trajectory"]).positions, truth),
+        }
+
+
+def received(truth: F64, times: F64, out: Path) -> Path:
+    """A file of what a consumer's receiver says, five times a second, of poses (T, 4, 4) with z up."""
+    way = Trajectory(np.append(times, times[-1] + 0.3), np.concatenate([truth, truth[-1:]])[:, :3, 3])
+    when, places = receiver(way, rate=5.0)
+    np.savetxt(out, np.column_stack([when, places]), "%.4f", delimiter=",", header="time,x,y,z", comments="")
+    return out
+
+
+def kitti(out: Path) -> Recorded:
+    """Of KITTI odometry 04: its scanner's true poses are those of camera 0, by `Tr`."""
+    out.mkdir(parents=True, exist_ok=True)
+    calib, photos = KITTI / "calib.txt", KITTI / "image_2"
+    T = io.read_extrinsics(calib)
+    camera = np.tile(np.eye(4), (25, 1, 1))
+    camera[:, :3] = np.loadtxt(KITTI / "poses.txt")[:25].reshape(-1, 3, 4)
+    truth = inverse(T) @ camera @ T
+    times = np.loadtxt(KITTI / "times.txt")[:25]
+    beside = io.photo_extrinsics(calib, photos)
+    assert beside is not None
+    np.savetxt(out / "extrinsics.txt", beside[:3], "%.9f")
+    np.savetxt(out / "times.txt", times, "%.6f")
+    line = next(line for line in calib.read_text(encoding="utf-8").splitlines() if line.startswith("P2:"))
+    P = [float(value) for value in line.split()[1:]]
+    return Recorded(
+        KITTI / "velodyne", photos, truth, times, P[0], (P[2], P[6]), out / "extrinsics.txt", out / "times.txt",
+        received(truth, times, out / "gps.csv"),
+    )  # fmt: skip
+
+
+def turned(out: Path, frames: Path | None) -> Recorded:
+    """The rendered turn, and sweeps of the town around it, each taken at once."""
+    frames = turn.generate_turn(out / "frames") if frames is None else frames
+    path = paths.town_path(0, turn.WAY)
+    whole = paths.drive(path, turn.SPEED, turn.FPS, still=0.0, seed=0)
+    driven = turn.filmed(whole)
+    town = Panorama(build(path, 0), Traffic(path, whole, 0), ROWS, 0)
+    rays = pixel_rays(Camera("equirectangular", 2 * ROWS, ROWS)).reshape(-1, 3).astype(np.float64)
+    height = np.degrees(np.arcsin(-rays[:, 1]))
+    beam = (height > LOWEST) & (height < HIGHEST)
+    truth, rng = driven.poses @ T_CAMERA_SCANNER, np.random.default_rng(0)
+    (out / "sweeps").mkdir(parents=True, exist_ok=True)
+    for i, (pose, time) in enumerate(zip(truth, driven.times, strict=True)):
+        looking = pose.copy()
+        looking[:3, :3] = pose[:3, :3] @ T_CAMERA_SCANNER[:3, :3].T
+        far = town.render(looking, float(time)).depth.ravel()
+        hit = beam & (far < 80) & (far > 1)
+        xyz = rays[hit] * (far[hit] + rng.normal(0, NOISE, int(hit.sum())))[:, None] @ T_CAMERA_SCANNER[:3, :3]
+        np.column_stack([xyz, np.full(len(xyz), 0.5)]).astype(np.float32).tofile(out / "sweeps" / f"{i:06d}.bin")
+    np.savetxt(out / "extrinsics.txt", T_CAMERA_SCANNER[:3], "%.9f")
+    times = driven.times - driven.times[0]
+    np.savetxt(out / "times.txt", times, "%.6f")
+    P = [float(value) for value in (frames / "calib.txt").read_text(encoding="utf-8").split()]
+    return Recorded(
+        out / "sweeps", frames / "image_l", truth, times, P[0], (P[2], P[6]), out / "extrinsics.txt",
+        out / "times.txt", received(truth, times, out / "gps.csv"),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """What sensors say of a drive: the scanner's `truth` (N, 4, 4) at `times`, steps of a lidar, a camera's path."""
+
+    times: F64
+    truth: F64
+    lidar: Steps
+    camera: Trajectory
+    T_camera_scanner: F64
+    gps: F64
+
+    @property
+    def fixes(self) -> Fixes:
+        """GPS as a factor."""
+        return Fixes(self.gps, 0.3, 1.5, 60.0)
+
+    def fused(self, *sensors: str) -> Fused:
+        """The path by some of lidar, camera, gps."""
+        return fuse(
+            self.times,
+            lidar=self.lidar if "lidar" in sensors else None,
+            camera=camera_steps(self.camera, self.times) if "camera" in sensors else None,
+            T_camera_scanner=self.T_camera_scanner,
+            fixes=self.fixes if "gps" in sensors else None,
+            first=self.truth[0],
+        )
+
+    def measure(self) -> dict[str, float]:
+        """ATE of each sensor alone, and of all together."""
+        truth = self.truth[:, :3, 3]
+        beside = (self.truth @ inverse(self.T_camera_scanner))[:, :3, 3]
+        return {
+            "lidar": ate(self.fused("lidar").trajectory.positions, truth),
+            "visual": ate(self.camera.positions, beside, scaled=True),
+            "gps": ate(self.gps, truth),
+            "fused": ate(self.fused("lidar", "camera", "gps").trajectory.positions, truth),
+        }
+
+
+def simulated(
+    seed: int,
+    *,
+    tunnel: tuple[int, int] = (100, 160),
+    dark: tuple[int, int] = (250, 300),
+    outliers: int = 40,
+) -> Simulated:
+    """A drive of 400 m in 40 s, by sensors that fail in places.
+
+    Args:
+        tunnel: steps in which the lidar sees three tenths of the way, and knows that it doesn't know.
+        dark: steps in which the camera is carried on, and marked unsure.
+        outliers: fixes of 400 that are off by tens of metres; fifteen more, together, by 9 m.
+    """
+    rng, n = np.random.default_rng(seed), 400
+    times: F64 = np.arange(n, dtype=np.float64) * 0.1
+    heading = np.cumsum(rng.normal(0, 0.003, n) + 0.01 * np.sin(times / 5))
+    truth = np.tile(np.eye(4), (n, 1, 1))
+    truth[:, :3, :3] = exp_so3(np.outer(heading, [0, 0, 1]))
+    ahead = np.stack([np.cos(heading), np.sin(heading), 0.01 * np.sin(times)], axis=1)
+    truth[1:, :3, 3] = np.cumsum(ahead, axis=0)[:-1]
+    T = np.array([[0.0, -1, 0, 0.1], [0, 0, -1, 0.4], [1, 0, 0, -0.3], [0, 0, 0, 1]])
+
+    step = inverse(truth[:-1]) @ truth[1:]
+    sigma = np.repeat([[0.02, 0.01, 0.01, 0.001, 0.001, 0.001]], n - 1, axis=0)
+    error = rng.normal(size=(n - 1, 6)) * sigma
+    step[:, :3, 3] += error[:, :3]
+    step[:, :3, :3] = step[:, :3, :3] @ exp_so3(error[:, 3:])
+    inside = slice(*tunnel)
+    step[inside, 0, 3] *= 0.3
+    sigma[inside, 0] = np.sqrt(tunnel[1] - tunnel[0])
+    sure = np.ones(n - 1, bool)
+    sure[inside] = False
+    lidar_steps = Steps(step, sigma[:, :, None] ** 2 * np.eye(6), sure)
+
+    camera = truth @ inverse(T)
+    seen = inverse(camera[:-1]) @ camera[1:]
+    size = 0.7 * np.exp(np.cumsum(rng.normal(0, 0.006, n - 1))) * (1 + rng.normal(0, 0.01, n - 1))
+    seen[:, :3, 3] = size[:, None] * seen[:, :3, 3] + rng.normal(0, 0.005, (n - 1, 3))
+    seen[:, :3, :3] = seen[:, :3, :3] @ exp_so3(rng.normal(0, 0.0007, (n - 1, 3)))
+    seen[slice(*dark)] = seen[dark[0]]
+    path = [camera[0]]
+    for one in seen:
+        path.append(path[-1] @ one)
+    unsure = np.zeros(n, bool)
+    unsure[dark[0] + 1 : dark[1] + 1] = True
+    poses = np.array(path)
+
+    keep = np.exp(-0.1 / 60)
+    slow = rng.normal(0, 1.5, (n, 3))
+    for i in range(1, n):
+        slow[i] = keep * slow[i - 1] + np.sqrt(1 - keep**2) * slow[i]
+    gps = truth[:, :3, 3] + slow + rng.normal(0, 0.3, (n, 3))
+    gps[rng.choice(n, outliers, replace=False)] += rng.normal(0, 30, (outliers, 3))
+    if outliers:
+        gps[330:345] += [8, 5, 0]
+    return Simulated(times, truth, lidar_steps, Trajectory(times, poses[:, :3, 3], poses[:, :3, :3], unsure), T, gps)
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=ROOT / "bench-out" / "slam_lidar")
+    parser.add_argument("--turn", type=Path, help="what `python -m scan2sim.data_samples.turn` wrote")
+    a = parser.parse_args()
+    rows: dict[str, Mapping[str, float]] = {}
+    if KITTI.is_dir():
+        rows["kitti"] = kitti(a.out / "kitti").measure(a.out / "kitti")
+    drives = [simulated(seed).measure() for seed in range(10)]
+    rows["simulated"] = {name: float(np.mean([one[name] for one in drives])) for name in SENSORS}
+    rows["turn"] = turned(a.out / "turn", a.turn).measure(a.out / "turn")
+    print(f"{'ATE, m':<12}" + "".join(f"{name:>10}" for name in SENSORS))
+    for drive, row in rows.items():
+        print(f"{drive:<12}" + "".join(f"{row[name]:>10.3f}" for name in SENSORS))
+    prefix = {"kitti": "", "turn": "turn_", "simulated": "simulated_"}
+    figures = {f"{prefix[d]}{name}_ate_m": round(row[name], 4) for d, row in rows.items() for name in SENSORS}
+    print("RESULT " + json.dumps(figures))
+
+
+if __name__ == "__main__":
+    main()

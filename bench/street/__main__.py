@@ -1,0 +1,5 @@
+"""`python -m bench.street`."""
+
+from bench.street.run import main
+
+main()

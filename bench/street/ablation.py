@@ -1,0 +1,78 @@
+"""What each part of the chain is worth on the two real streets: their worlds without it, scored as by `bench.street`.
+
+`python -m bench.street.ablation [--parts carve things ...] [--streets odo04 raw0009] [--out bench-out/street_ablation]`
+
+Vehicles are left out of the figures as in `bench.street`; `outline_px` is of all drawn outlines, `remains_m2` of the
+parked vehicle of which most is left (raw 0009 alone has their boxes). Ends with `RESULT {json}`: by part and street.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bench.paths import ROOT
+from bench.street.run import STREETS, Street, made, scored
+
+WITHOUT: dict[str, tuple[str, ...]] = {
+    "nothing": (),
+    "carve": ("carve.when=never",),
+    "things": ("things.find=false",),
+    "reach": ("reach.limit=off",),
+    "outlines": ("planes.when=never", "furniture.when=never", "agreement.sky=false"),
+    "facades": ("facades.when=never",),
+    "signs": ("signs.when=never",),
+    "filling": ("ground.when=never", "texture.continued=false"),
+    "refine": ("refine.when=never",),
+}
+"""Settings that leave a part out."""
+FIGURES = ("psnr_db", "ssim", "sharpness", "outline_px", "inside_mesh", "corridor_m2", "remains_m2", "seen_share")
+
+
+def figures(street: Street, folder: Path, pictures: Path, settings: tuple[str, ...]) -> dict[str, float]:
+    """Those of `FIGURES`, of the street's world with these settings."""
+    found: dict[str, Any] = scored(street, *made(street, folder, settings), pictures)
+    found["outline_px"] = float(np.median(found["displacements_px"]))
+    found["remains_m2"] = max(found["remains_m2"].values(), default=0.0)
+    return {name: round(float(found[name]), 3) for name in FIGURES}
+
+
+def table(found: Mapping[str, Mapping[str, Mapping[str, float]]]) -> None:
+    """Print a row for each part left out, by street."""
+    for name in STREETS:
+        print(f"\n{name}, without: " + ", ".join(FIGURES))
+        for part, streets in found.items():
+            if name in streets:
+                print(f"  {part:10}" + "".join(f"{streets[name][key]:>9.2f}" for key in FIGURES))
+
+
+def main() -> None:
+    """Run the streets without each part, print the table and the result."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--parts", nargs="*", choices=list(WITHOUT), default=list(WITHOUT))
+    parser.add_argument("--streets", nargs="*", choices=list(STREETS), default=list(STREETS))
+    parser.add_argument("--out", type=Path, default=ROOT / "bench-out" / "street_ablation")
+    arguments = parser.parse_args()
+    out: Path = arguments.out.resolve()
+    found: dict[str, dict[str, dict[str, float]]] = {}
+    for part in arguments.parts:
+        for name in arguments.streets:
+            if not STREETS[name].data.is_dir():
+                print(f"{name}: left out, there is no {STREETS[name].data}")
+                continue
+            shutil.rmtree(out / name / "run" / "world", ignore_errors=True)
+            without = figures(STREETS[name], out / name, out / "pictures" / part, WITHOUT[part])
+            found.setdefault(part, {})[name] = without
+            print(f"{name} without {part}: {without}", flush=True)
+    table(found)
+    print("RESULT " + json.dumps(found))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,330 @@
+"""Two real streets, from raw data to a scored world, by a scorer of its own, with OpenMVS' figures beside.
+
+`python -m bench.street [--parts odo04 raw0009 keep synthetic time] [--out bench-out/street] [--score-only]
+[--set KEY=VALUE ...]`
+
+The streets are 25 frames each of KITTI odometry 04 (traffic) and of KITTI raw drive 0009 (parked cars); every 8th photo
+(frames 4, 12 and 20) is held out. The world is read as anyone would read it (OBJ and PNG), cast with 3 x 3 rays a pixel
+through true pixel centres. One gain a channel is solved for each photo; figures are means over the three photos, each
+of which counts, however bad it is.
+
+**Which pixels count**: those whose middle ray meets the world, whether a photo ever saw the place or not (grey counts
+as what it is); not those that show what moves or, where vehicles are removed, any vehicle: by KITTI's tracking boxes
+on raw 0009, by hand on odometry 04 (`street_truth.json`). Sky and places without surface don't count; `uncovered` is
+the share of the held-out frame's own returns within 30 m that fall on such pixels, so that leaving surface out shows.
+
+- odo04, raw0009: the streets by the defaults. keep: raw 0009 with `split.vehicles=keep`, all pixels counting.
+- synthetic: figures against the truth of a synthetic street (`street_synthetic.py`), and of straight edges
+  (`bench.edges`).
+- time: the street of nine million points by this checkout and by an older one (`--old FOLDER`).
+
+A part's figures stay in its `figures.json` below `--out`; what isn't run again is told from there. Pictures of photo
+and rendering lie beside it. Ends with `RESULT {json}`; null, with a reason before it, where there is no figure.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bench.measure import measure
+from bench.paths import ROOT
+from bench.street import boxes, score
+from bench.street import synthetic as street_synthetic
+from bench.street.world import BACKGROUND, Photo, Seen, World, photos
+from scan2sim.pipeline.core.types import F64, I64, U8, Bools
+
+DATA = ROOT.parent / "shared" / "data"
+HELD_OUT = (4, 12, 20)
+NEAR, PER_PHOTO = 30.0, 0.05
+"""Metres within which returns are to be covered, and seconds from the photo's time to those of its own sweep."""
+BESIDE = 3
+"""Pixels beside a return that the lidar has reached, too."""
+PARTS = ("odo04", "raw0009", "keep", "synthetic", "time")
+EDGES = "bench.edges"
+"""Measures `edge_cm`."""
+OPENMVS = {"odo04": "17.6 / .63 / 1.20 (on a carved mesh)", "raw0009": "18.5 / .80 / 1.14 (on this chain's mesh)"}
+"""TextureMesh: dB, SSIM, sharpness; measured over 51 and 25 frames."""
+SIGN = 12.0
+"""Pixels across from which a plate is to be readable."""
+NOTHING: dict[str, Any] = {}
+
+
+@dataclass(frozen=True)
+class Street:
+    """A real street: what imports it, and where its vehicles' boxes are (None: drawn by hand alone)."""
+
+    name: str
+    data: Path
+    importing: tuple[str, ...]
+    labels: Path | None = None
+
+
+RAW = DATA / "kitti_raw0009_f00-24"
+ODO = DATA / "kitti_odo04_f00-24"
+STREETS = {
+    "odo04": Street("odo04", ODO, ("kitti-odometry", str(ODO))),
+    "raw0009": Street(
+        "raw0009",
+        RAW,
+        ("kitti-raw", str(RAW), "--poses", str(RAW / "T_velo0_velo_icp_frames_0-24.txt")),
+        RAW / "tracking_gt_0001_frames_0-24.txt",
+    ),
+}
+
+
+def scan2sim(*arguments: object, code: Path | None = None) -> float:
+    """Run the command, of another checkout if given; seconds."""
+    at = code or ROOT  # the folder it runs from comes before all others on Python's path
+    command = [sys.executable, "-m", "scan2sim.flows.cli", *map(str, arguments)]
+    measured = measure(["env", f"--chdir={at}", f"PYTHONPATH={at}", *command])
+    if measured.status:
+        sys.exit(f"scan2sim {arguments[0]} failed with exit status {measured.status}")
+    return measured.seconds
+
+
+def made(street: Street, folder: Path, settings: tuple[str, ...] = (), *, run: bool = True) -> tuple[Path, Path]:
+    """Import the street and make its world; folders of tile and run. What is made already stays."""
+    tile, out = folder / "tile", folder / "run"
+    if not (tile / "tile.toml").is_file():
+        scan2sim("import", *street.importing, "--out", tile)
+    if run:
+        scan2sim("run", tile, "--out", out, "--hold-out", 8, *(x for s in settings for x in ("--set", s)))
+    return tile, out
+
+
+def scored(street: Street, tile: Path, run: Path, pictures: Path, *, keep: bool = False) -> dict[str, Any]:
+    """All figures of a street's world."""
+    import laspy
+
+    world = World(run / "world")
+    views = photos(tile, run, world.origin)
+    rows, shifts, scanned, signs = {}, [], [], {}
+    cloud = laspy.read(tile / "cloud.laz")
+    returns = np.stack([cloud.x, cloud.y, cloud.z], axis=1) - world.origin
+    times_of = np.asarray(cloud.gps_time)
+    for frame in HELD_OUT:
+        photo, drawn = views[frame], score.truth()[street.name][str(frame)]
+        seen = world.seen(photo)
+        masked = np.zeros(photo.rgb.shape[:2], bool) if keep else _vehicles(street, frame, photo)
+        counts = seen.hit & ~masked
+        own = np.abs(times_of - photo.time) < PER_PHOTO
+        rows[frame] = score.likeness(photo.rgb, seen.rgb, counts)
+        rows[frame] |= {"counted": float(counts.mean()), "uncovered": _uncovered(returns[own], photo, seen, masked)}
+        reached = _reached(returns, photo)
+        gained = np.round(score.gained(photo.rgb, seen.rgb, counts)).astype(np.uint8)
+        for kind, lines in drawn["outlines"].items():
+            for i, line in enumerate(lines):
+                shift, (column, row) = _shifts(photo.rgb, gained, line)
+                shifts.append((f"{frame} {kind} {i}", shift))
+                scanned.append(reached[row, column])
+        for name, polygon in drawn["signs"].items():
+            if np.ptp(np.array(polygon), axis=0).max() >= SIGN:
+                at = score.filled([polygon], photo.rgb.shape)
+                signs[f"{frame} {name}"] = score.psnr(score.squared_error(photo.rgb, gained, at))
+        _picture(pictures / f"{street.name}_{frame:02d}.png", photo.rgb, gained, counts)
+    parked = boxes.boxes(street.labels, views) if street.labels and not keep else []
+    path = np.array([views[f].T[:3, 3] for f in sorted(views)])
+    left = boxes.remains(world, parked)
+    together = np.concatenate([s for _, s in shifts])
+    return {
+        "photos": rows,
+        **{k: float(np.mean([r[k] for r in rows.values()])) for k in ("psnr_db", "ssim", "sharpness", "counted")},
+        "psnr_pooled_db": score.psnr(
+            sum(r["mse"] * r["pixels"] for r in rows.values()) / sum(r["pixels"] for r in rows.values())
+        ),
+        "uncovered": float(np.mean([r["uncovered"] for r in rows.values()])),
+        "inside_mesh": int((world.distance(path) < 1.0).sum()),
+        "nearest_m": float(world.distance(path).min()),
+        "corridor_m2": boxes.corridor(world, path),
+        "remains_m2": left,
+        "outlines": {name: float(np.median(s)) for name, s in shifts if len(s)},
+        "displacements_px": together.tolist(),
+        "displacements_scanned_px": together[np.concatenate(scanned)].tolist(),
+        "signs_db": signs,
+        "seen_share": json.loads((run / "report.json").read_text(encoding="utf-8"))["texture"]["coverage"],
+    }
+
+
+def _vehicles(street: Street, frame: int, photo: Photo) -> Bools:
+    """(H, W) pixels that show a vehicle."""
+    drawn = score.truth()[street.name][str(frame)]["vehicles"]
+    masked = score.filled(drawn, photo.rgb.shape)
+    return masked | boxes.mask(street.labels, frame, photo.rgb.shape) if street.labels else masked
+
+
+def _shifts(photo: U8, rendering: U8, line: Sequence[Sequence[float]]) -> tuple[F64, I64]:
+    shift, at = score.displacements(photo, rendering, line)
+    return shift, at.T
+
+
+def _reached(returns: F64, photo: Photo) -> Bools:
+    """(H, W) pixels beside which any sweep's return within 60 m falls: what of the photo the lidar reached."""
+    from scipy.ndimage import binary_dilation
+
+    column, row = _pixels(returns, photo, 2 * NEAR)
+    out = np.zeros(photo.rgb.shape[:2], bool)
+    out[row, column] = True
+    return np.asarray(binary_dilation(out, iterations=BESIDE))
+
+
+def _pixels(returns: F64, photo: Photo, far: float) -> tuple[I64, I64]:
+    """Columns and rows of the places (N, 3) in front of a photo, nearer than `far` metres, that fall into it."""
+    local = (returns - photo.T[:3, 3]) @ photo.T[:3, :3]
+    local = local[(local[:, 2] > 0.5) & (np.linalg.norm(local, axis=1) < far)] @ photo.K.T
+    column, row = np.round(local[:, :2] / local[:, 2:]).astype(np.int64).T
+    height, width = photo.rgb.shape[:2]
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    return column[inside], row[inside]
+
+
+def _uncovered(own: F64, photo: Photo, seen: Seen, masked: Bools) -> float:
+    """Share of the returns of the photo's own sweep, on pixels that aren't masked, where the world shows nothing."""
+    column, row = _pixels(own, photo, NEAR)
+    free = ~masked[row, column]
+    return float((~seen.hit[row, column])[free].mean())
+
+
+def _picture(path: Path, photo: U8, rendering: U8, counts: Bools) -> None:
+    """Photo, rendering, and their difference where it counts, one below the other."""
+    from PIL import Image
+
+    apart = np.abs(photo.astype(np.float64) - rendering).mean(axis=2, keepdims=True) * 3
+    difference = np.where(counts[..., None], np.clip(apart, 0, 255), BACKGROUND).astype(np.uint8)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.vstack([photo, rendering, difference])).save(path)
+
+
+def can_keep() -> bool:
+    """Whether vehicles can be kept."""
+    from scan2sim.pipeline.steps.split import SPLIT
+
+    return "vehicles" in SPLIT.params.model_fields
+
+
+def synthetic(folder: Path) -> dict[str, Any]:
+    """Figures against truth; that of edges null where its bench isn't there."""
+    out: dict[str, Any] = dict(street_synthetic.figures(folder, scan2sim))
+    if importlib.util.find_spec(EDGES) is None:
+        print(f"edge_cm: null, there is no {EDGES}")
+        return out | {"edge_cm": None}
+    command = [sys.executable, "-m", EDGES, str(folder / "tile"), str(folder / "run")]
+    output = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    print(output, end="")
+    result = next(line for line in reversed(output.splitlines()) if line.startswith("RESULT "))
+    return out | {"edge_cm": json.loads(result.removeprefix("RESULT "))["edge_cm"]}
+
+
+def times(folder: Path, old: Path | None) -> dict[str, Any]:
+    """The street of nine million points by an older checkout and by this one, one after the other."""
+    if old is None or not (old / "pyproject.toml").is_file():
+        print("time_ratio: null, no older checkout was given (--old)")
+        return {"time_ratio": None}
+    old = old.resolve()
+    tile = folder / "street_9m"
+    if not (tile / "tile.toml").is_file():
+        scan2sim("sample", "--length=100", "--points=9e6", "--photos=40", "--seed=0", tile)
+    seconds = {}
+    for name, code in (("old", old), ("new", ROOT)):
+        sample = code / "data_samples" / "tile"
+        scan2sim("run", sample, "--out", folder / f"warm_{name}", code=code)  # kernels compiled before times are taken
+        shutil.rmtree(folder / name, ignore_errors=True)
+        seconds[name] = scan2sim("run", tile, "--out", folder / name, code=code)
+    return {"time_ratio": seconds["new"] / seconds["old"], "seconds": seconds}
+
+
+def table(figures: Mapping[str, Mapping[str, Any]]) -> None:
+    """Print what was found."""
+    for name in ("odo04", "raw0009", "keep"):
+        one = figures.get(name)
+        if not one or "psnr_db" not in one:
+            continue
+        print(f"\n{name}: {one['psnr_db']:.2f} dB / {one['ssim']:.3f} / sharpness {one['sharpness']:.2f}", end="")
+        print(f" (all pixels as one: {one['psnr_pooled_db']:.2f} dB); OpenMVS {OPENMVS.get(name, 'not measured')}")
+        for frame, row in one["photos"].items():
+            print(
+                f"  frame {frame}: {row['psnr_db']:.2f} dB / {row['ssim']:.3f} / {row['sharpness']:.2f}, "
+                f"{row['counted']:.0%} of the pixels count, {row['uncovered']:.1%} of near returns without surface"
+            )
+        print(
+            f"  cameras within 1 m of a surface: {one['inside_mesh']} of 25, nearest {one['nearest_m']:.2f} m;", end=""
+        )
+        print(f" surface where the car drove: {one['corridor_m2']:.1f} m2; seen {one['seen_share']:.0%}")
+        if one["remains_m2"]:
+            left = {track: round(area, 2) for track, area in one["remains_m2"].items()}
+            print(f"  left of vehicles, m2 by track: {left}")
+        near = one["displacements_scanned_px"]
+        print(f"  outlines that the lidar reached: median {np.median(near):.2f} px, {len(near)} of", end="")
+        print(f" {len(one['displacements_px'])} places")
+        print(f"  outlines, median px: { ({k: round(v, 2) for k, v in one['outlines'].items()}) }")
+        if one["signs_db"]:
+            print(f"  signs, dB: { ({k: round(v, 1) for k, v in one['signs_db'].items()}) }")
+
+
+def result(figures: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """The figures that are to be reached."""
+    odo, raw, keep, made_up, time = (figures.get(name, NOTHING) for name in PARTS)
+    both = [part for part in (odo, raw) if part]
+    shifts = [s for part in both for s in part["displacements_px"]]
+    signs = [db for part in both for db in part["signs_db"].values()]
+    found = {
+        "odo04_psnr_db": odo.get("psnr_db"),
+        "odo04_ssim": odo.get("ssim"),
+        "raw0009_psnr_db": raw.get("psnr_db"),
+        "raw0009_ssim": raw.get("ssim"),
+        "raw0009_keep_psnr_db": keep.get("psnr_db"),
+        "sharpness_min": min((part["sharpness"] for part in both), default=None),
+        "inside_mesh": sum(part["inside_mesh"] for part in both) if both else None,
+        "remains_m2": max(raw["remains_m2"].values()) if raw.get("remains_m2") else None,
+        "static_lost": made_up.get("static_lost"),
+        "pole_recall": made_up.get("pole_recall"),
+        "seen_share_min": min((part["seen_share"] for part in both), default=None),
+        "outline_px": float(np.median(shifts)) if shifts else None,
+        "sign_psnr_db": float(np.mean(signs)) if signs else None,
+        "edge_cm": made_up.get("edge_cm"),
+        "time_ratio": time.get("time_ratio"),
+    }
+    return {k: round(v, 3) if isinstance(v, float) else v for k, v in found.items()}
+
+
+def main() -> None:
+    """Run the parts, print tables and the result."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--parts", nargs="*", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--out", type=Path, default=ROOT / "bench-out" / "street")
+    parser.add_argument("--old", type=Path, help="an older checkout, for `time`")
+    parser.add_argument("--score-only", action="store_true", help="score the worlds that are there already")
+    parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="settings of the real streets' runs")
+    arguments = parser.parse_args()
+    out: Path = arguments.out.resolve()
+    for part in arguments.parts:
+        folder = out / part
+        folder.mkdir(parents=True, exist_ok=True)
+        street = STREETS.get("raw0009" if part == "keep" else part)
+        if street and not street.data.is_dir():
+            print(f"{part}: left out, there is no {street.data}")
+            continue
+        if part == "keep" and not can_keep():
+            print("raw0009_keep_psnr_db: null, there is no split.vehicles yet")
+            continue
+        if street:
+            settings = (*arguments.set, *(("split.vehicles=keep",) if part == "keep" else ()))
+            tile, run = made(street, folder, settings, run=not arguments.score_only)
+            found = scored(street, tile, run, out / "pictures" / part, keep=part == "keep")
+        else:
+            found = synthetic(folder) if part == "synthetic" else times(folder, arguments.old)
+        (folder / "figures.json").write_text(json.dumps(found, indent=1), encoding="utf-8")
+    files = {part: out / part / "figures.json" for part in PARTS}
+    figures = {part: json.loads(f.read_text(encoding="utf-8")) for part, f in files.items() if f.is_file()}
+    table(figures)
+    print("RESULT " + json.dumps(result(figures)))

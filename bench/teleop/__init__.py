@@ -1,0 +1,1 @@
+"""Benchmarks of teleoperation: `python -m bench.teleop`."""

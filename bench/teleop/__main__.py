@@ -1,0 +1,5 @@
+"""`python -m bench.teleop`."""
+
+from bench.teleop.run import main
+
+main()

@@ -1,0 +1,1 @@
+"""Benchmarks of texturing: `python -m bench.texture`."""

@@ -1,0 +1,5 @@
+"""`python -m bench.texture`."""
+
+from bench.texture.run import main
+
+main()

@@ -1,0 +1,91 @@
+"""What each part of texturing is worth: ours with one part off at a time, on the scenes of `bench.texture`.
+
+`python -m bench.texture.ablation [--scenes kitti street_hard] [--out bench-out/texture]`, after `python -m
+bench.texture`, whose depth maps it takes. Figures as there; ends with `RESULT {json}`: scene, part, figures.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bench.paths import ROOT
+from bench.texture.scenes import Scene, available, fresh, run
+from scan2sim.texturing.exposure import EXPOSURE
+from scan2sim.texturing.photo_consistency import AGREEMENT
+from scan2sim.texturing.texture import TEXTURE
+from scan2sim.texturing.unwrap import UNWRAP
+from scan2sim.texturing.view_selection.step import CHOOSE
+
+OFF: dict[str, dict[str, dict[str, Any]]] = {
+    "all parts on": {},
+    "exposure": {"exposure": {"solve": False}},
+    "ghost masks": {"agreement": {"ghosts": False}},
+    "displacement": {"agreement": {"align": False}},
+    "smooth choice": {"choose": {"smoothness": 0}},
+    "blended low frequencies": {"texture": {"band": 0}},
+    "one photo's detail": {"texture": {"band": -1}},
+    "fading along seams": {"texture": {"fade": False}},
+    "charts cut from photos": {"unwrap": {"backend": "xatlas"}},
+}
+"""What is switched off, and by which parameters of which step."""
+
+
+def paint(scene: Scene, given: dict[str, dict[str, Any]], folder: Path) -> Path:
+    """Our texture of a scene with some parameters; its folder."""
+    files = {"mesh": scene.mesh, "views": scene.views, "depth": scene.depth} | scene.clouds
+    for step in (EXPOSURE, AGREEMENT, CHOOSE, UNWRAP, TEXTURE):
+        files |= run(step, files, fresh(folder / step.name), **given.get(step.name, {}))
+    return files["textured"]
+
+
+def figures(scene: Scene, folder: Path, clean: Path | None) -> dict[str, float]:
+    """Of a texture: at the held-out photos, and on a street against its truth; ghosts where `clean` is given."""
+    from scan2sim.pipeline.camera.renderer import Renderer, textured
+    from scan2sim.texturing.evaluate import held_out
+
+    held = scene.photos(held_out=True)
+    results = list(
+        held_out(Renderer([textured(folder)]), list(held.values()), [scene.depth / f"{i}.npy" for i in held])
+    )
+    out = {
+        key: round(float(np.mean([getattr(result, key) for result in results])), 3)
+        for key in ("psnr_db", "psnr_gain_db", "ssim", "sharpness")
+    }
+    if scene.folder.name.startswith("street"):
+        from bench.texture.truth import samples, truth_psnr
+
+        out["truth_gain_db"] = round(truth_psnr(folder, samples(scene))[1], 3)
+    if clean is not None:
+        from bench.texture.truth import Road
+
+        clean_scene = Scene(scene.folder.with_name("street_clean"))
+        out["ghosts"] = Road(clean_scene, scene).ghosts(clean, folder)[0]
+    return out
+
+
+def main() -> None:
+    """Print a table a scene, and the result."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", nargs="+", default=["kitti", "street_hard"])
+    parser.add_argument("--out", type=Path, default=ROOT / "bench-out" / "texture")
+    arguments = parser.parse_args()
+    result: dict[str, dict[str, dict[str, float]]] = {}
+    for name in arguments.scenes:
+        if not available(name):
+            continue
+        scene, result[name] = Scene(arguments.out / name), {}
+        for part, given in OFF.items():
+            folder = paint(scene, given, scene.folder / "ablation")
+            clean = scene.folder.with_name("street_clean") / "methods" / "ours" if name == "street_hard" else None
+            result[name][part] = figures(scene, folder, clean)
+            print(f"{name:12s} {part:26s} {result[name][part]}", flush=True)
+    print("RESULT " + json.dumps(result))
+
+
+if __name__ == "__main__":
+    main()

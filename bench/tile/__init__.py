@@ -1,0 +1,1 @@
+"""The main job beside the obvious chain of libraries: `python -m bench.tile`."""

@@ -1,0 +1,5 @@
+"""`python -m bench.tile`."""
+
+from bench.tile.run import main
+
+main()

@@ -1,0 +1,1 @@
+"""Benchmarks of the ML toolboxes: `python -m bench.toolboxes`."""

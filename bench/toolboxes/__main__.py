@@ -1,0 +1,5 @@
+"""`python -m bench.toolboxes`."""
+
+from bench.toolboxes.run import main
+
+main()

@@ -1,0 +1,157 @@
+"""Whether things move, held against truth, by frame (part `movement` of `bench.toolboxes`; D3.2, table 9).
+
+Films of level crossings (`data_samples.crossing`: ten views, day and dusk, a mast in the wind) go through the toolbox.
+A thing counts in a frame if it has been seen for a second, at least half of it and 20 pixels of its shorter side; it
+moves if it did so on the mean of that second (`STANDS` and faster). A frame is right if the toolbox says the same of
+what overlaps it most; of a thing that it hasn't found it says nothing, which is wrong.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from scan2sim.data_samples.crossing_traffic import STANDS
+from scan2sim.services.toolboxes import sources
+from scan2sim.services.toolboxes.frames import Frame
+from scan2sim.services.toolboxes.iou import overlaps
+from scan2sim.services.toolboxes.results import Body, Moving
+from scan2sim.services.toolboxes.tasks import movement
+
+VIEWS, FRAMES, SEED = 10, 1000, 0
+FOLLOWED = ("train", "car", "van", "bus", "truck")
+HISTORY = 1.0
+"""Seconds."""
+SEEN = 0.5
+"""Share of a thing that is seen."""
+SMALLEST = 20.0
+"""Pixels of a thing's shorter side: what is smaller neither counts nor spoils anything."""
+OVERLAP = 0.3
+"""Intersection over union from which a detection is of a thing."""
+BATCH = 4
+
+
+@dataclass(frozen=True)
+class Said:
+    """Of a thing in a frame: whether it moves, and what was said (None: nothing)."""
+
+    view: int
+    label: str
+    moves: bool
+    said: bool | None
+    found: bool
+
+
+def rendered(out: Path, views: int = VIEWS, frames: int = FRAMES, seed: int = SEED) -> Path:
+    """The films, made where they aren't there yet."""
+    folder = out / f"crossings-{views}-{frames}-{seed}"
+    if not (folder / "truth.jsonl").exists():
+        command = [sys.executable, "-m", "scan2sim.data_samples.crossing", str(folder)]
+        subprocess.run([*command, "--views", str(views), "--frames", str(frames), "--seed", str(seed)], check=True)
+    return folder
+
+
+def said_of(folder: Path) -> Iterator[Said]:
+    """Of all things in all films."""
+    truth: dict[int, list[dict[str, Any]]] = defaultdict(list)
+    for line in (folder / "truth.jsonl").open():
+        one = json.loads(line)
+        truth[one["view"]].append(one)
+    model = movement.load(movement.Params())
+    for view, frames in sorted(truth.items()):
+        yield from _of_film(folder / f"view_{view:02}.mp4", model, view, frames)
+
+
+def _of_film(film: Path, model: Any, view: int, truth: Sequence[dict[str, Any]]) -> Iterator[Said]:
+    follow = movement.follow(movement.Params())
+    assert follow
+    history: dict[int, list[tuple[float, float]]] = defaultdict(list)
+    for shot, body, frame in _detected(film, model, truth):
+        followed = follow(
+            Frame(shot.name, str(film), round(frame["time"] * 1e9), shot.image, lambda _: None), shot.image, body
+        )
+        for thing in frame["things"]:
+            if thing["class"] in FOLLOWED and thing["visible"] >= SEEN and _side(thing["box"]) >= SMALLEST:
+                past = history[thing["track"]]
+                past.append((frame["time"], abs(thing["speed"])))
+                if frame["time"] - past[0][0] >= HISTORY:
+                    yield _said(view, thing, past, followed)
+            else:
+                history.pop(thing["track"], None)
+
+
+def _detected(film: Path, model: Any, truth: Sequence[dict[str, Any]]) -> Iterator[tuple[Any, Body, dict[str, Any]]]:
+    """A film's images, what the detector found in each, and their truth; some at a time."""
+    batch = []
+    for shot, frame in zip(sources.shots(film), truth, strict=True):
+        batch.append((shot, frame))
+        if len(batch) == BATCH or frame is truth[-1]:
+            bodies = model([one.image for one, _ in batch])
+            for (one, its), body in zip(batch, bodies, strict=True):
+                yield one, body, its
+            batch = []
+
+
+def _said(view: int, thing: dict[str, Any], past: list[tuple[float, float]], body: Body) -> Said:
+    recent = [speed for time, speed in past if past[-1][0] - time <= HISTORY]
+    things = body.detections or ()
+    shares = overlaps([one.box for one in things], [thing["box"]])[:, 0]
+    found = bool((shares >= OVERLAP).any())
+    best = things[int(shares.argmax())] if found else None
+    said = best.moving if isinstance(best, Moving) else None
+    return Said(view, thing["class"], sum(recent) / len(recent) >= STANDS, said, found)
+
+
+def _side(box: Sequence[float]) -> float:
+    return min(box[2] - box[0], box[3] - box[1])
+
+
+def movement_accuracy(out: Path, views: int = VIEWS, frames: int = FRAMES) -> dict[str, Any]:
+    """Shares of frames that are right, of moving and of standing things, and of those that were found."""
+    counts: Counter[tuple[int, str, bool, str]] = Counter()
+    for one in said_of(rendered(out, views, frames)):
+        outcome = (
+            "right"
+            if one.said == one.moves
+            else "unfound"
+            if not one.found
+            else "unknown"
+            if one.said is None
+            else "wrong"
+        )
+        counts[one.view, one.label, one.moves, outcome] += 1
+    print(
+        f"{'view':>4} {'of':<6} {'moves':<6} {'frames':>7} {'right %':>8} {'not found':>9} {'unknown':>8} {'wrong':>6}"
+    )
+    for view, label, moves in sorted({key[:3] for key in counts}):
+        row = Counter({key[3]: count for key, count in counts.items() if key[:3] == (view, label, moves)})
+        print(
+            f"{view:4d} {label:<6} {moves!s:<6} {row.total():7d} {100 * row['right'] / row.total():8.2f} "
+            f"{row['unfound']:9d} {row['unknown']:8d} {row['wrong']:6d}"
+        )
+    return {
+        "moving": _share(counts, True),
+        "standing": _share(counts, False),
+        "moving_found": _share(counts, True, found=True),
+        "standing_found": _share(counts, False, found=True),
+        "movement_frames": counts.total(),
+    }
+
+
+def _share(counts: Counter[tuple[int, str, bool, str]], moves: bool, found: bool = False) -> float | None:
+    of = Counter[str]()
+    for (_, _, state, outcome), count in counts.items():
+        if state == moves and not (found and outcome == "unfound"):
+            of[outcome] += count
+    return round(of["right"] / of.total(), 4) if of else None
+
+
+if __name__ == "__main__":
+    given = [int(word) for word in sys.argv[1:]]
+    print(movement_accuracy(Path("bench-out"), *given))

@@ -1,0 +1,121 @@
+"""ML toolboxes and their quality of service, measured.
+
+`python -m bench.toolboxes [--parts tracks detect movement classes pixels batch load qos] [--out DIR]`
+
+- tracks: MOTA and IDF1 on KITTI's boxes, degraded (bench/toolboxes/tracks.py).
+- detect: the detector on synthetic pictures (bench/toolboxes/detect.py has more).
+- movement: moving or standing, by frame, in ten films of 1000 frames (bench/toolboxes/movement.py); rendering them
+  takes
+  a quarter of an hour the first time.
+- classes, pixels: classification and segmentation out of the box (bench/toolboxes/classes.py).
+- batch: seconds an image alone by seconds an image of four at once, of one thread; above 1, batching gains.
+- load: ten minutes at five times what a toolbox can do, then its model is killed (bench/toolboxes/load.py).
+- qos: all toolboxes in all environments; wants root.
+
+Ends with `RESULT {json}`; null where a part was left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bench.toolboxes import classes, load, movement, tracks
+from scan2sim.pipeline.core.types import U8
+from scan2sim.services.qos.requirements import Environment, read
+from scan2sim.services.toolboxes import tasks
+
+KEYS = (
+    "moving", "standing", "mota", "idf1", "detect_ap50_synthetic", "classify_top1", "segment_miou", "qos", "batch_gain",
+    "overload_memory_growth", "recovery_s",
+)  # fmt: skip
+BATCH, TURNS = 4, 5
+QOS_RATE, QOS_SECONDS = "1", "30"
+Found = dict[str, Any]
+
+
+def detect(out: Path) -> Found:
+    """As bench.toolboxes.detect, on synthetic pictures."""
+    told = _told("bench.toolboxes.detect", "--parts", "synthetic", "--out", str(out / "detect"))
+    return {"detect_ap50_synthetic": told["detect_ap50_synthetic"]}
+
+
+def _told(*module: str) -> Found:
+    """The result of another bench."""
+    done = subprocess.run([sys.executable, "-m", *module], stdout=subprocess.PIPE, text=True, check=True)
+    print(done.stdout, end="", flush=True)
+    found: Found = json.loads(done.stdout.splitlines()[-1].removeprefix("RESULT "))
+    return found
+
+
+def batch() -> Found:
+    """By toolbox, how many times as long an image takes alone as one of four at once."""
+    gains = {}
+    for name in ("detect", "classify", "segment"):
+        size = read(name).image
+        assert size
+        model = tasks.find(name).load(tasks.find(name).Params(threads=1))
+        image = np.random.default_rng(0).integers(0, 255, (size[1], size[0], 3), np.uint8)
+        alone, together = [], []
+        for _ in range(TURNS):
+            alone.append(_seconds(model, [[image]] * BATCH))
+            together.append(_seconds(model, [[image] * BATCH]))
+        gains[name] = round(float(np.median(alone) / np.median(together)), 3)
+        print(f"batch of {BATCH}, {name}: {np.median(alone) / BATCH:.4f} s of work an image alone, gain {gains[name]}")
+    return {"batch_gain": gains}
+
+
+def _seconds(model: tasks.Model, batches: list[list[U8]]) -> float:
+    """Of a processor."""
+    began = time.process_time()
+    for images in batches:
+        model(images)
+    return time.process_time() - began
+
+
+def qos(out: Path) -> Found:
+    """Whether each toolbox's service passes in each environment, and the machine."""
+    service: dict[str, dict[str, bool]] = {}
+    machine: dict[str, dict[str, bool]] = {}
+    for name in tasks.names():
+        for environment in Environment:
+            file = out / f"qos-{name}-{environment}.json"
+            command = [sys.executable, "-m", "scan2sim.flows.cli", "qos", "measure", name, "--environment", environment]
+            subprocess.run([*command, "--rate", QOS_RATE, "--seconds", QOS_SECONDS, "--out", str(file)], check=True)
+            told = json.loads(file.read_text(encoding="utf-8"))
+            service.setdefault(name, {})[environment] = told["passed"]
+            machine.setdefault(name, {})[environment] = told["machine_passed"]
+    return {"qos": service, "qos_machine": machine}
+
+
+PARTS: dict[str, Callable[[Path], Found | None]] = {
+    "tracks": lambda _: tracks.tracks(),
+    "detect": detect,
+    "movement": movement.movement_accuracy,
+    "classes": lambda _: classes.classes(),
+    "pixels": classes.pixels,
+    "batch": lambda _: batch(),
+    "load": lambda _: load.load(),
+    "qos": qos,
+}
+
+
+def main() -> None:
+    """Run the parts, print the result."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--out", type=Path, default=Path("bench-out") / "toolboxes")
+    given = parser.parse_args()
+    given.out.mkdir(parents=True, exist_ok=True)
+    result: Found = dict.fromkeys(KEYS)
+    for name in given.parts:
+        result |= PARTS[name](given.out) or {}
+    print("RESULT " + json.dumps(result))

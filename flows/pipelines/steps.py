@@ -1,0 +1,8 @@
+"""All steps of all recipes."""
+
+from __future__ import annotations
+
+from scan2sim.flows.pipelines import drive, study, tile, video
+from scan2sim.pipeline.core.step import Step
+
+STEPS: tuple[Step, ...] = (*tile.STEPS, *video.STEPS, *drive.STEPS, *study.STEPS)

@@ -1,0 +1,184 @@
+"""Outlines of roofs seen from above: which cells are one roof, and straight sides around each.
+
+Sides are fitted to the outline of a mask and turned to the building's main directions (as Sampath and Shan, "Building
+boundary tracing and regularization from airborne lidar point clouds", PE&RS 73, 2007).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from scan2sim.pipeline.core.types import F64, I64, Bools
+from scan2sim.pipeline.geometry.height_map import Raster, closed, signed_area
+
+FINE = 4  # pixels of the outline's picture in a cell
+TURN = np.radians(12.0)  # by which a side may be turned to the building's main directions
+CORNER = np.radians(20.0)  # sides that differ by less have no corner in common
+END = 0.15  # share of a side at each end, near corners, that its line is not fitted to
+CLOSE = 2  # cells: gaps within one roof
+
+
+@dataclass(frozen=True)
+class Places:
+    """Places along the sides of rings.
+
+    Attributes:
+        xy: (N, 2) local metres.
+        outward: (N, 2) unit, away from what the ring encloses.
+        side: (N,) number of the side, counted through all rings.
+    """
+
+    xy: F64
+    outward: F64
+    side: I64
+
+    def __len__(self) -> int:
+        return len(self.xy)
+
+    @staticmethod
+    def along(rings: list[F64], step: float) -> Places:
+        """Places every `step` metres, or a little closer, along rings (K, 2) that have their inside to the left."""
+        xy, outward, side = [np.zeros((0, 2))], [np.zeros((0, 2))], [np.zeros(0, np.int64)]
+        count = 0
+        for ring in rings:
+            for start, end in pairwise(np.concatenate([ring, ring[:1]])):
+                length = float(np.linalg.norm(end - start))
+                if length < 1e-6:
+                    continue
+                n = max(1, int(np.ceil(length / step)))
+                forward = (end - start) / length
+                xy.append(start + ((np.arange(n) + 0.5) / n)[:, None] * (end - start))
+                outward.append(np.tile([forward[1], -forward[0]], (n, 1)))
+                side.append(np.full(n, count))
+                count += 1
+        return Places(np.concatenate(xy), np.concatenate(outward), np.concatenate(side))
+
+
+def roofs(top: F64, cell: float, step: float, least: float) -> I64:
+    """Which roof each cell belongs to, 0: none.
+
+    Cells are of one roof where one gets from one to the other without a step of more than `step` metres; what is
+    smaller than `least` m2 (chimneys) belongs to the roof around it, or to none.
+
+    Args:
+        top: (rows, columns) heights, NaN where there is no roof.
+    """
+    from scipy import ndimage
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    mask = closed(np.isfinite(top), CLOSE)
+    if not mask.any():
+        return np.zeros(top.shape, np.int64)
+    height = nearest_value(top, np.isfinite(top))
+    number = np.full(top.shape, -1)
+    number[mask] = np.arange(int(mask.sum()))
+    pairs = []
+    for a, b in (((slice(None, -1), slice(None)), (slice(1, None), slice(None))),
+                 ((slice(None), slice(None, -1)), (slice(None), slice(1, None)))):  # fmt: skip
+        level = mask[a] & mask[b] & (np.abs(height[a] - height[b]) <= step)
+        pairs.append(np.stack([number[a][level], number[b][level]]))
+    i, j = np.concatenate(pairs, axis=1)
+    n = int(mask.sum())
+    _, piece = connected_components(coo_matrix((np.ones(len(i), bool), (i, j)), shape=(n, n)), directed=False)
+    large = np.bincount(piece) * cell**2 >= least
+    component = np.zeros(top.shape, np.int64)
+    component[mask] = np.where(large[piece], np.cumsum(large)[piece], 0)
+    loose = mask & (component == 0)
+    if loose.any() and component.any():
+        reach, index = ndimage.distance_transform_edt(component == 0, return_indices=True)
+        near = loose & (reach <= np.sqrt(least) / cell)
+        component[near] = component[tuple(index)][near]
+    return component
+
+
+def nearest_value(values: F64, known: Bools) -> F64:
+    """The array with every cell's value that of the nearest known one."""
+    from scipy import ndimage
+
+    index = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+    return values[tuple(index)]
+
+
+def rings(mask: Bools, raster: Raster, tolerance: float, least: float) -> list[F64]:
+    """Rings (K, 2) of straight sides around a mask's cells and its holes, their inside to the left, local metres.
+
+    Args:
+        mask: (rows, columns).
+        raster: where they are.
+        tolerance: metres by which a side may miss the outline of the cells.
+        least: m2 of a hole that is a courtyard.
+    """
+    import cv2
+
+    rows, columns = np.nonzero(mask)
+    if not len(rows):
+        return []
+    low, high = (rows.min(), columns.min()), (rows.max() + 1, columns.max() + 1)
+    part = np.pad(mask[low[0] : high[0], low[1] : high[1]], 3)
+    picture = part.repeat(FINE, axis=0).repeat(FINE, axis=1).astype(np.float32)
+    picture = cv2.GaussianBlur(picture, (0, 0), 0.6 * FINE)
+    contours, tree = cv2.findContours((picture > 0.5).astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    found = []
+    for contour, links in zip(contours, tree[0] if tree is not None else (), strict=True):
+        hole, points = links[3] >= 0, contour[:, 0].astype(np.float64)
+        if len(points) < 4 * FINE or (hole and cv2.contourArea(contour) * (raster.cell / FINE) ** 2 < least):
+            continue
+        local = ((points + 0.5) / FINE - 3 + (low[1], low[0]) + raster.low) * raster.cell
+        if (signed_area(local) > 0) == hole:
+            local = local[::-1]
+        ring = straight(local, tolerance)
+        if ring is not None:
+            found.append(ring)
+    return found
+
+
+def straight(contour: F64, tolerance: float) -> F64 | None:
+    """A ring (K, 2) of straight sides through a contour (N, 2); None where it has less than three."""
+    import cv2
+
+    middle = contour.mean(axis=0)
+    simple = cv2.approxPolyDP((contour - middle).astype(np.float32)[:, None], tolerance, closed=True)[:, 0]
+    if len(simple) < 3:
+        return None
+    at = np.sort([int(np.argmin(((contour - middle - corner) ** 2).sum(axis=1))) for corner in simple])
+    at = np.unique(at)
+    if len(at) < 3:
+        return None
+    ends = list(zip(at, np.roll(at, -1), strict=True))
+    runs = [np.take(contour, np.arange(i, j if j > i else j + len(contour)), axis=0, mode="wrap") for i, j in ends]
+    lines = [_line(run, contour[j % len(contour)] - contour[i]) for run, (i, j) in zip(runs, ends, strict=True)]
+    length = np.array([len(run) for run in runs], float)
+    angle = np.array([np.arctan2(d[1], d[0]) for _, d in lines])
+    main = np.arctan2((length * np.sin(4 * angle)).sum(), (length * np.cos(4 * angle)).sum()) / 4
+    off = (angle - main + np.pi / 4) % (np.pi / 2) - np.pi / 4
+    angle = np.where(np.abs(off) < TURN, angle - off, angle)
+    lines = [(centre, np.array([np.cos(a), np.sin(a)])) for (centre, _), a in zip(lines, angle, strict=True)]
+    corners: list[F64] = []
+    for k, (i, _) in enumerate(ends):
+        corners += _corner(contour[i], lines[k - 1], lines[k], tolerance)
+    return np.array(corners)
+
+
+def _line(run: F64, along: F64) -> tuple[F64, F64]:
+    """A point and the direction of the line through a run of points, which goes `along`."""
+    cut = int(END * len(run))
+    inner = run[cut : len(run) - cut] if len(run) - 2 * cut >= 3 else run
+    centre = inner.mean(axis=0)
+    direction = np.linalg.svd(inner - centre, full_matrices=False)[2][0] if len(inner) > 2 else along
+    direction = direction if direction @ along >= 0 else -direction
+    return centre, direction / max(float(np.linalg.norm(direction)), 1e-9)
+
+
+def _corner(place: F64, before: tuple[F64, F64], after: tuple[F64, F64], tolerance: float) -> list[F64]:
+    """Where two lines intersect, near `place`; where they don't, the feet of `place` on both."""
+    (p, d), (q, e) = before, after
+    cross = d[0] * e[1] - d[1] * e[0]
+    if abs(cross) > np.sin(CORNER):
+        t = ((q - p)[0] * e[1] - (q - p)[1] * e[0]) / cross
+        if np.linalg.norm(p + t * d - place) < 3 * tolerance:
+            return [p + t * d]
+    return [p + ((place - p) @ d) * d, q + ((place - q) @ e) * e]

@@ -1,0 +1,194 @@
+"""Coordinate reference systems: which one a tile is in, and metres per unit of its axes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.types import F64, Frame
+
+if TYPE_CHECKING:
+    from pyproj import CRS
+
+    from scan2sim.pipeline.io.clouds import Header
+
+UNITS = {"m": 1.0, "ft": 0.3048, "us-ft": 1200 / 3937}
+LOCAL = "local"
+
+
+def common(
+    tile: Path, crs: str | None, units: str | None, clouds: Sequence[Path], headers: Sequence[Header]
+) -> tuple[str, float]:
+    """The CRS of a tile and metres per unit: the tile's own word, else what its clouds agree on.
+
+    Raises:
+        InputError: no CRS at all, clouds in different ones, or one that isn't projected.
+    """
+    own = [(path, h.crs) for path, h in zip(clouds, headers, strict=True)]
+    known = [(path, c) for path, c in own if c]
+    for path, other in known[1:]:
+        if not same(known[0][1], other):
+            raise InputError(
+                path,
+                f"is in {name(other)}, but {known[0][0].name} is in {name(known[0][1])}",
+                "Bring all clouds of a tile to one CRS first",
+            )
+    if crs is None:
+        unknown = [path for path, c in own if not c]
+        if unknown:
+            raise InputError(
+                unknown[0],
+                "has no CRS, and the tile names none",
+                'Add crs = "EPSG:..." to tile.toml, or crs = "local" for metres without georeference',
+            )
+        crs = known[0][1] or LOCAL
+    elif crs != LOCAL and known and not same(crs, known[0][1]):
+        raise InputError(
+            known[0][0],
+            f"is in {name(known[0][1])}, but {tile.name} says {name(crs)}",
+            "Mend `crs` in tile.toml, or leave it out to take the cloud's",
+        )
+    if crs == LOCAL:
+        return LOCAL, UNITS[units or "m"]
+    unit = _metres_per_unit(tile, crs)
+    if units and abs(UNITS[units] / unit - 1) > 1e-5:
+        raise InputError(
+            tile,
+            f"says units = {units!r}, but the axes of {name(crs)} are of {unit:g} m",
+            "Leave `units` out: a CRS has its own; it is for clouds without one",
+        )
+    return crs, unit
+
+
+def utm(latitude: float, longitude: float) -> str:
+    """The code of the UTM zone (WGS 84) of a place in degrees."""
+    return utm_zone(min(int((longitude + 180) // 6) + 1, 60), north=latitude >= 0)
+
+
+def utm_zone(zone: int, *, north: bool) -> str:
+    """The code of a UTM zone (WGS 84), 1 to 60, of one hemisphere."""
+    return f"EPSG:{(32600 if north else 32700) + zone}"
+
+
+def to_wgs84(frame: Frame, xyz: npt.ArrayLike = (0.0, 0.0, 0.0)) -> tuple[float, float, float] | None:
+    """(latitude deg, longitude deg, height m) of a local point; None for a local frame.
+
+    The height is the CRS's own (ellipsoidal or local, as it says); no vertical shift is applied.
+    """
+    if frame.crs == LOCAL:
+        return None
+    from pyproj import Transformer
+
+    local = np.asarray(xyz, float)
+    x, y, _ = frame.to_crs(local).tolist()
+    lon, lat = Transformer.from_crs(_horizontal(frame.crs), "EPSG:4979", always_xy=True).transform(x, y)[:2]
+    return float(lat), float(lon), float(local[2] + frame.origin[2])
+
+
+def to_ecef(frame: Frame, xyz: npt.ArrayLike) -> F64:
+    """Local points (N, 3) as earth-centred WGS 84 metres (N, 3), EPSG:4978; heights as `to_wgs84` takes them."""
+    from pyproj import Transformer
+
+    local = np.asarray(xyz, np.float64)
+    places = frame.to_crs(local)
+    lon, lat = Transformer.from_crs(_horizontal(frame.crs), "EPSG:4979", always_xy=True).transform(*places.T[:2])[:2]
+    to_centre = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
+    return np.stack(to_centre.transform(lon, lat, local[:, 2] + frame.origin[2]), axis=1)
+
+
+def convergence(frame: Frame) -> float:
+    """Meridian convergence at the origin, radians: the angle from true north to grid north, clockwise positive."""
+    if frame.crs == LOCAL:
+        return 0.0
+    from pyproj import Proj
+
+    here = to_wgs84(frame)
+    assert here is not None
+    return float(np.radians(Proj(_horizontal(frame.crs)).get_factors(here[1], here[0]).meridian_convergence))
+
+
+def has_heights(crs: str) -> bool:
+    """Whether a CRS says of its own what heights are above (a geoid, say)."""
+    return crs != LOCAL and bool(_parsed(crs).is_compound)
+
+
+def proj_string(crs: str) -> str:
+    """A projected CRS as PROJ's text, in metres whatever its own units are; what it says of heights is left out."""
+    import warnings
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # that PROJ's text says less than WKT: why formats want both
+        text = _horizontal(crs).to_proj4()
+    return (
+        " ".join(part for part in text.split() if not part.startswith(("+units", "+to_meter", "+type"))) + " +units=m"
+    )
+
+
+def _parsed(crs: str) -> CRS:
+    from pyproj import CRS
+    from pyproj.exceptions import CRSError
+
+    try:
+        return CRS.from_user_input(crs)
+    except CRSError as error:
+        raise InputError(
+            "crs", f"{crs[:60]!r} is not a CRS ({error})", 'Give a code such as "EPSG:32633", or WKT'
+        ) from None
+
+
+def _horizontal(crs: str) -> CRS:
+    parsed = _parsed(crs)
+    return parsed.sub_crs_list[0] if parsed.is_compound else parsed
+
+
+def same(a: str | None, b: str | None) -> bool:
+    """Whether two codes or WKTs mean the same CRS, heights aside."""
+    if a == b:
+        return True
+    if not a or not b or LOCAL in (a, b):
+        return False
+    first, second = _horizontal(a), _horizontal(b)
+    return bool(first == second or (first.to_epsg() is not None and first.to_epsg() == second.to_epsg()))
+
+
+def name(crs: str | None) -> str:
+    """How a person calls a CRS: its EPSG code, else its name."""
+    if not crs or crs == LOCAL:
+        return "no CRS"
+    parsed = _parsed(crs)
+    code = parsed.to_epsg()
+    return f"EPSG:{code}" if code else str(parsed.name)
+
+
+def short(crs: str) -> str:
+    """The authority's code where it says all that the CRS says, otherwise the CRS as it is."""
+    if crs == LOCAL:
+        return crs
+    from pyproj import CRS
+
+    code = CRS.from_user_input(crs).to_epsg(min_confidence=100)
+    return f"EPSG:{code}" if code else crs
+
+
+def _metres_per_unit(tile: Path, crs: str) -> float:
+    horizontal = _horizontal(crs)
+    if not horizontal.is_projected:
+        raise InputError(
+            tile,
+            f"its CRS {name(crs)} is not projected (degrees can't be meshed)",
+            "Reproject the clouds, to UTM for example",
+        )
+    factor = float(horizontal.axis_info[0].unit_conversion_factor)
+    heights = [float(axis.unit_conversion_factor) for axis in _parsed(crs).axis_info[2:]]
+    if any(abs(height / factor - 1) > 1e-5 for height in heights):
+        raise InputError(
+            tile,
+            f"in {name(crs)} heights are in units of {heights[0]:g} m, but positions of {factor:g} m",
+            "Bring the clouds to one unit first (a CRS with metres, or feet, for both)",
+        )
+    return factor

@@ -1,0 +1,94 @@
+"""Encode: frames to an H.264 video, one at a time, through PyAV."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, Self
+
+from scan2sim.pipeline.core.errors import from_os_error
+from scan2sim.pipeline.core.optional_deps import need
+from scan2sim.pipeline.core.types import U8
+
+TICKS = 90_000
+"""A second of the video's clock."""
+
+
+class Encoder:
+    """Write frames with `add`, then `close`; the file is there from the start, and whole after `close`."""
+
+    def __init__(
+        self,
+        file: Path,
+        size: tuple[int, int],
+        fps: float,
+        *,
+        bitrate: float | None = None,
+        container: dict[str, str] | None = None,
+        **options: str,
+    ) -> None:
+        """Begin.
+
+        Args:
+            file: its suffix doesn't matter, it is MP4.
+            size: width and height, both even.
+            fps: frames a second, which the bit rate counts on.
+            bitrate: bits a second that are aimed at.
+            container: options of the MP4.
+            options: of libx264: preset, crf, threads.
+
+        Raises:
+            UnavailableError: PyAV isn't installed.
+            SpaceError: the file can't be written to.
+        """
+        need("a video", "av")
+        import av
+
+        self.count, self.file, self._last = 0, file, -1
+        try:
+            self._container: Any = av.open(str(file), "w", format="mp4", options=container or {})
+        except OSError as error:
+            raise from_os_error(error, file) from error
+        stream = self._container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
+        stream.width, stream.height = size
+        stream.pix_fmt = "yuv420p"
+        if bitrate is not None:
+            stream.bit_rate = round(bitrate)
+        stream.time_base = stream.codec_context.time_base = Fraction(1, TICKS)
+        stream.codec_context.options = options
+        self._stream, self._frame = stream, av.VideoFrame
+
+    def add(self, picture: U8, time: float) -> None:
+        """A frame as `cv2.COLOR_BGR2YUV_I420` makes it, (H * 3 / 2, W), shown from `time` (seconds) on.
+
+        Raises:
+            SpaceError: the disk is full.
+        """
+        frame = self._frame.from_ndarray(picture, format="yuv420p")
+        self._last = max(self._last + 1, round(time * TICKS))
+        frame.pts, frame.time_base = self._last, Fraction(1, TICKS)
+        self.count += 1
+        self._mux(frame)
+
+    def close(self) -> None:
+        """Write what is still held back."""
+        if self._container is None:
+            return
+        self._mux(None)
+        container, self._container = self._container, None
+        try:
+            container.close()
+        except OSError as error:
+            raise from_os_error(error, self.file) from error
+
+    def _mux(self, frame: Any) -> None:
+        try:
+            self._container.mux(self._stream.encode(frame))
+        except OSError as error:
+            raise from_os_error(error, self.file) from error
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

@@ -1,0 +1,179 @@
+"""Agisoft Metashape's `cameras.xml` (Export Cameras, Agisoft XML).
+
+A camera's `transform` is camera to chunk, row by row, with OpenCV's axes. Its component's `transform` (rotation, scale,
+translation), or the chunk's where it has none, leads to geocentric coordinates where the chunk's `reference` is a CRS
+of the Earth, and to the reference's own coordinates where that is local. Of several components the largest is taken. Of
+a calibration:
+
+    u = w/2 + cx + x' f + x' b1 + y' b2,  v = h/2 + cy + y' f
+    x' = x (1 + k1 r2 + k2 r4 + k3 r6 + k4 r8) + p1 (r2 + 2 x2) + 2 p2 x y
+    y' = y (1 + k1 r2 + k2 r4 + k3 r6 + k4 r8) + p2 (r2 + 2 y2) + 2 p1 x y
+
+so that its p1, p2 are OpenCV's p2, p1; the middle of the top left pixel is (0.5, 0.5). For `fisheye` (x, y) have the
+length of the angle to the axis instead of its tangent. OpenCV has no k4 of this kind: where there is one, OpenCV's
+k1...k6 are fitted to the same lens, and refused if they are more than 0.05 pixels off. b2 has no counterpart.
+
+Source: Metashape Professional user manual 2.1, appendix D, Camera models.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from scan2sim.pipeline.camera import distortion_fit
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.types import F64, Camera
+from scan2sim.pipeline.geometry.similarity import Similarity
+from scan2sim.pipeline.io import xml
+from scan2sim.pipeline.io.geodata import crs as crs_io
+from scan2sim.pipeline.io.photogrammetry import Model, Photos, Shot
+
+REMEDY = "Export it again (File > Export > Export Cameras, Agisoft XML)"
+UNDISTORT = "Undistort the photos in Metashape and export them with their cameras, or fit without it"
+
+
+def read(model: Path, photos: Photos) -> Model:
+    """A cameras.xml of one chunk; disabled photos are left out, and such that are not aligned."""
+    chunk = _chunk(model)
+    try:
+        sensors = {str(sensor.get("id")): sensor for sensor in chunk.iterfind("sensors/sensor")}
+        wanted = [camera for camera in chunk.iterfind("cameras//camera") if camera.get("enabled", "1") in ("1", "true")]
+        aligned = [camera for camera in wanted if camera.find("transform") is not None]
+        components = {c.get("id"): _similarity(c.find("transform")) for c in chunk.iterfind("components/component")}
+        together = Counter(camera.get("component_id") for camera in aligned)
+        largest = together.most_common(1)[0][0] if together else None
+        apart = [camera for camera in aligned if camera.get("component_id") != largest]
+        aligned = [camera for camera in aligned if camera.get("component_id") == largest]
+        cameras, shots = {}, []
+        for camera in aligned:
+            key = str(camera.get("sensor_id"))
+            if key not in sensors:
+                raise ValueError(f"camera {camera.get('label')}: its sensor {key} is not described")
+            if f"sensor_{key}" not in cameras:
+                cameras[f"sensor_{key}"] = _camera(model, sensors[key])
+            pose = np.array(_numbers(camera.find("transform"), 16)).reshape(4, 4)
+            _check_rotation(pose[:3, :3], str(camera.get("label")))
+            shots.append(Shot(str(camera.get("label")), f"sensor_{key}", pose))
+        onto = components.get(largest) or _similarity(chunk.find("transform"))
+        reference = (chunk.findtext("reference") or "").strip()
+    except (TypeError, ValueError, KeyError) as error:
+        raise InputError(model, f"lacks or misstates {str(error)[:120]}", REMEDY) from None
+    notes = []
+    if apart:
+        notes.append(f"{len(apart)} photos of {len(together) - 1} smaller components are left out")
+    if len(wanted) > len(aligned) + len(apart):
+        notes.append(f"{len(wanted) - len(aligned) - len(apart)} photos that have no pose of their own are left out")
+    found = Model(cameras, tuple(shots), np.empty((0, 3)), notes=tuple(notes))
+    if onto is None:
+        return found
+    if not reference or reference.startswith("LOCAL"):
+        return found.moved(onto)
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = onto.scale * onto.rotation, onto.translation
+    return Model(cameras, found.shots, found.xyz, None, T, _projected(model, reference), found.notes)
+
+
+def _chunk(model: Path) -> Element:
+    chunks = [chunk for chunk in xml.root(model, REMEDY).iter("chunk") if chunk.find("cameras") is not None]
+    if len(chunks) != 1:
+        raise InputError(model, f"holds {len(chunks)} chunks with cameras", "Export one chunk's cameras as Agisoft XML")
+    return chunks[0]
+
+
+def _numbers(node: Element | None, count: int) -> list[float]:
+    if node is None or node.text is None:
+        raise ValueError(f"{count} numbers")
+    values = [float(value) for value in node.text.split()]
+    if len(values) != count or not np.isfinite(values).all():
+        raise ValueError(f"{count} numbers of `{node.tag}`")
+    return values
+
+
+def _similarity(node: Element | None) -> Similarity | None:
+    if node is None or node.find("rotation") is None:
+        return None
+    rotation = np.array(_numbers(node.find("rotation"), 9)).reshape(3, 3)
+    _check_rotation(rotation, "transform")
+    scale = _numbers(node.find("scale"), 1)[0] if node.find("scale") is not None else 1.0
+    if not scale > 0:
+        raise ValueError("the scale of `transform`")
+    return Similarity(scale, rotation, np.array(_numbers(node.find("translation"), 3)))
+
+
+def _check_rotation(R: F64, where: str) -> None:
+    if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
+        raise ValueError(f"{where}: its rotation is none")
+
+
+def _camera(model: Path, sensor: Element) -> Camera:
+    title = f"sensor {sensor.get('label') or sensor.get('id')}"
+    resolution = sensor.find("resolution")
+    if resolution is None:
+        raise ValueError(f"{title}: its resolution")
+    width, height = int(resolution.get("width") or 0), int(resolution.get("height") or 0)
+    if min(width, height) < 1:
+        raise ValueError(f"{title}: its resolution")
+    kind = sensor.get("type", "frame")
+    if kind == "spherical":
+        return Camera("equirectangular", width, height)
+    if kind not in ("frame", "fisheye"):
+        raise InputError(model, f"{title} is of type {kind!r}, which is not supported", UNDISTORT)
+    found = {str(node.get("class", "adjusted")): node for node in sensor.iterfind("calibration")}
+    calibration = found.get("adjusted", found.get("initial"))
+    if calibration is None:
+        raise InputError(model, f"{title} has no calibration", "Align the photos, and export the cameras again")
+    value = {node.tag: float(node.text or 0) for node in calibration if node.tag != "resolution"}
+    f = value.get("f") or value.get("fy") or 0.0
+    if not (np.isfinite(list(value.values())).all() and f > 0):
+        raise ValueError(f"{title}: its focal length")
+    fx, cx, cy = f + value.get("b1", 0.0), value.get("cx", 0.0), value.get("cy", 0.0)
+    cx, cy = width / 2 + cx - 0.5, height / 2 + cy - 0.5
+    k1, k2, k3, k4, p1, p2, p3, p4, b2 = (
+        value.get(n, 0.0) for n in ("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "b2")
+    )
+    reach = distortion_fit.reach(width, height, fx, f, cx, cy)
+    lost = {"b2": b2 * max(cy, height - cy) / f, "p3, p4": f * max(abs(p3), abs(p4)) * reach**4}
+    if kind == "fisheye":
+        lost["p1, p2 of a fisheye"] = f * 3 * max(abs(p1), abs(p2)) * reach**2
+    for name, pixels in lost.items():
+        if abs(pixels) > 0.01:
+            raise InputError(
+                model, f"{title} has {name} (up to {abs(pixels):.2f} pixels), which is not supported", UNDISTORT
+            )
+    if kind == "fisheye":
+        return Camera("fisheye", width, height, fx, f, cx, cy, (k1, k2, k3, k4))
+    k: tuple[float, ...] = (k3,)
+    if k4:
+        factor = np.polynomial.Polynomial([1, k1, k2, k3, k4])
+        fitted, off = distortion_fit.radial(lambda r: np.asarray(factor(r * r)), _undistorted(factor, reach), f)
+        if off > distortion_fit.EXACT:
+            raise InputError(model, f"{title}: k1 to k4 are {off:.3f} pixels off in OpenCV's model", UNDISTORT)
+        k1, k2, *rest = fitted.tolist()
+        k = tuple(rest)
+    return Camera("opencv", width, height, fx, f, cx, cy, (k1, k2, p2, p1, *k))
+
+
+def _undistorted(factor: np.polynomial.Polynomial, reach: float) -> float:
+    """The radius that a lens moves to `reach`; the radius where it folds back, if that is nearer."""
+    r = np.linspace(0, 3 * reach, 3000)
+    moved = r * np.asarray(factor(r * r))
+    beyond = np.flatnonzero((moved >= reach) | (np.gradient(moved, r) <= 0))
+    return float(r[beyond[0]]) if len(beyond) else float(r[-1])
+
+
+def _projected(model: Path, reference: str) -> str | None:
+    """The chunk's CRS, where it is a projected one."""
+    from pyproj import CRS
+    from pyproj.exceptions import CRSError
+
+    try:
+        crs = CRS.from_user_input(reference)
+    except CRSError as error:
+        raise InputError(model, f"its reference is no CRS ({str(error)[:80]})", REMEDY) from None
+    if not crs.is_projected:
+        return None
+    return crs_io.short(crs.to_wkt())

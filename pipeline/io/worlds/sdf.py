@@ -1,0 +1,314 @@
+"""SDF 1.9: a Gazebo world, the static model of a tile, and a world of many tiles in levels.
+
+Choices, and why:
+
+- The world names its systems. A world that names none gets Gazebo's default ones, which leave out
+  the sensors; one that names any gets no default. The names are those of Garden and later; Fortress
+  takes them too since 6.16 (gz-sim #2275).
+- World axes are the CRS's grid axes, so that world coordinates plus the origin are CRS coordinates.
+  Grid north is not true north: `heading_deg` turns them back by the meridian convergence at the
+  world's origin. With 0 a NavSat sensor would be 3 m off at 100 m where the convergence is 2 degrees.
+- The photos hold the light and shadows of their day: the ambient light is strong, the sun weak, and
+  the tile's surfaces cast no shadow a second time; robots do.
+- No `<material>`: it would replace the mesh's own textures.
+- Every visual carries its class's LAS code for Gazebo's segmentation cameras.
+- Gazebo loads a level when a performer's box meets the level's box, and unloads it when the performer
+  is `<buffer>` away from it (gz-sim #28: the buffer is no help on the way in). So a level's box is
+  larger than its tile, or a robot would see nothing until it stands on it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from math import degrees
+from pathlib import Path
+from xml.sax.saxutils import escape
+
+from scan2sim.pipeline.core.types import Frame
+from scan2sim.pipeline.geometry.cylinders import Cylinder
+from scan2sim.pipeline.io.geodata import crs
+from scan2sim.pipeline.simulation.collision_shapes import Solid
+from scan2sim.pipeline.simulation.robot import ROBOT, Start
+
+HEADROOM = 500.0
+"""Metres that a level reaches above and below its tile: whatever flies over it sees it."""
+BUFFER = 20.0
+"""Metres around a tile within which a performer has it loaded."""
+PERFORMER = ROBOT.name
+"""Name of the model that levels are loaded for."""
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A tile's model in a world.
+
+    Attributes:
+        name: of the model.
+        offset: metres from the world's origin to the model's.
+        low, high: corners of the box around its meshes, metres from the model's origin.
+    """
+
+    name: str
+    offset: Vector
+    low: Vector
+    high: Vector
+
+
+@dataclass(frozen=True)
+class Georeference:
+    """Where a world's origin is on WGS 84, and how its axes lie.
+
+    Attributes:
+        latitude, longitude: degrees.
+        elevation: metres, in the height system of the CRS (no vertical shift is applied).
+        heading: degrees counter-clockwise from east to the world's x axis, as SDF counts.
+    """
+
+    latitude: float
+    longitude: float
+    elevation: float
+    heading: float
+
+    @classmethod
+    def of(cls, frame: Frame) -> Georeference | None:
+        """The georeference of a frame's origin; None for a local frame."""
+        here = crs.to_wgs84(frame)
+        return None if here is None else cls(*here, -degrees(crs.convergence(frame)))
+
+    def facts(self) -> dict[str, float | str]:
+        """The same as metadata.json has it."""
+        return {
+            "latitude_deg": self.latitude,
+            "longitude_deg": self.longitude,
+            "height_m": self.elevation,
+            "height_system": "as in the CRS",
+            "heading_deg": self.heading,
+        }
+
+
+def write_world(path: Path, name: str, place: Georeference | None, offset: Vector, start: Start | None = None) -> None:
+    """Write a world that includes `model://<name>`.
+
+    Args:
+        path: of the world's .sdf.
+        name: of the world and its model.
+        place: of the world's origin, or None.
+        offset: metres from the world's origin to the model's.
+        start: of the robot, `model://robot`, where there is one.
+    """
+    path.write_text(_world(path, name, place, _include(name, offset) + _robot(start)), encoding="utf-8")
+
+
+def write_levels(
+    path: Path,
+    name: str,
+    place: Georeference | None,
+    tiles: Sequence[Placed],
+    buffer: float,
+    performer: str,
+    start: Start | None = None,
+) -> None:
+    """Write a world of many models, each in a level of its own, so that Gazebo can load those near a robot only.
+
+    Without Gazebo's option `--levels` all are loaded, whether there is a robot or not.
+
+    Args:
+        path: of the world's .sdf.
+        name: of the world.
+        place: of the world's origin, or None.
+        tiles: models, found as `model://<name>`.
+        buffer: metres around a tile within which a performer has it loaded; it is unloaded twice as far away.
+        performer: name of the model that levels are loaded for. It need not be there: Gazebo says so, and goes on.
+        start: of the robot, `model://robot`, where there is one.
+    """
+    path.write_text(
+        _world(
+            path,
+            name,
+            place,
+            "".join(_include(tile.name, tile.offset) for tile in tiles)
+            + _robot(start)
+            + _levels(tiles, buffer, performer),
+            f"""
+     All tiles are loaded then. With the option "levels" (two dashes before it, which XML forbids here) only those
+     near a performer are: the model that <performer> names below, if it is in this file when Gazebo starts, and
+     any model that is named to the service /world/{name}/level/set_performer later.
+     Fortress reads levels only where the last plugin below is named ignition::gazebo.""",
+        ),
+        encoding="utf-8",
+    )
+
+
+def write_model(folder: Path, name: str, visuals: Mapping[str, int], solids: Sequence[Solid]) -> None:
+    """Write `model.sdf` and `model.config` of a static model.
+
+    Args:
+        folder: of the model.
+        name: of the model; its meshes are found as `model://<name>/...`.
+        visuals: path of every visual mesh, relative to `folder`, to its label.
+        solids: what bodies collide with; meshes are found as `meshes/collision_<name>.obj`.
+    """
+    shown = "".join(_visual(name, mesh, label) for mesh, label in visuals.items())
+    touched = "".join(_collision(name, solid) for solid in solids)
+    (folder / "model.sdf").write_text(
+        f"""<?xml version="1.0"?>
+<sdf version="1.9">
+  <model name="{name}">
+    <static>true</static>
+    <link name="link">
+{shown}{touched}    </link>
+  </model>
+</sdf>
+""",
+        encoding="utf-8",
+    )
+    write_config(folder, name, "A street scanned by lidar and photos: textured surfaces, and what bodies collide with.")
+
+
+def write_config(folder: Path, name: str, about: str) -> None:
+    """Write what Gazebo finds a model by, `model.config`, beside its `model.sdf`."""
+    (folder / "model.config").write_text(
+        f"""<?xml version="1.0"?>
+<model>
+  <name>{name}</name>
+  <version>1.0</version>
+  <sdf version="1.9">model.sdf</sdf>
+  <author>
+    <name>scan2sim</name>
+  </author>
+  <description>{about}</description>
+</model>
+""",
+        encoding="utf-8",
+    )
+
+
+def _world(path: Path, name: str, place: Georeference | None, content: str, note: str = "") -> str:
+    """A world's SDF: physics, systems and light, and what is in it."""
+    return f"""<?xml version="1.0"?>
+<!-- Run in this folder: GZ_SIM_RESOURCE_PATH=$PWD/models gz sim {path.name}
+     (Fortress: IGN_GAZEBO_RESOURCE_PATH=$PWD/models ign gazebo {path.name}){note} -->
+<sdf version="1.9">
+  <world name="{name}">
+    <physics name="dart_1ms" type="dart">
+      <max_step_size>0.001</max_step_size>
+      <real_time_factor>1</real_time_factor>
+    </physics>
+    <gravity>0 0 -9.8</gravity>
+    <plugin filename="gz-sim-physics-system" name="gz::sim::systems::Physics"/>
+    <plugin filename="gz-sim-user-commands-system" name="gz::sim::systems::UserCommands"/>
+    <plugin filename="gz-sim-scene-broadcaster-system" name="gz::sim::systems::SceneBroadcaster"/>
+    <plugin filename="gz-sim-contact-system" name="gz::sim::systems::Contact"/>
+    <plugin filename="gz-sim-imu-system" name="gz::sim::systems::Imu"/>
+    <plugin filename="gz-sim-navsat-system" name="gz::sim::systems::NavSat"/>
+    <plugin filename="gz-sim-sensors-system" name="gz::sim::systems::Sensors">
+      <render_engine>ogre2</render_engine>
+    </plugin>
+{_spherical(place)}    <scene>
+      <ambient>0.7 0.7 0.7 1</ambient>
+      <background>0.7 0.8 0.9 1</background>
+      <grid>false</grid>
+    </scene>
+    <light name="sun" type="directional">
+      <cast_shadows>true</cast_shadows>
+      <pose>0 0 100 0 0 0</pose>
+      <diffuse>0.4 0.4 0.4 1</diffuse>
+      <specular>0.1 0.1 0.1 1</specular>
+      <direction>-0.4 0.2 -0.9</direction>
+    </light>
+{content}  </world>
+</sdf>
+"""
+
+
+def _include(name: str, offset: Vector, angles: Vector = (0.0, 0.0, 0.0)) -> str:
+    return f"""    <include>
+      <uri>model://{name}</uri>
+      <pose>{numbers(offset)} {numbers(angles)}</pose>
+    </include>
+"""
+
+
+def _robot(start: Start | None) -> str:
+    return _include(ROBOT.name, start.position, start.angles) if start else ""
+
+
+def _levels(tiles: Sequence[Placed], buffer: float, performer: str) -> str:
+    """The plugin that Gazebo looks for by its name; there is no such file, and it needs none."""
+    return f"""    <plugin filename="dummy" name="gz::sim">
+      <performer name="performer">
+        <ref>{escape(performer)}</ref>
+        <geometry><box><size>2 2 2</size></box></geometry>
+      </performer>
+{"".join(_level(tile, buffer) for tile in tiles)}    </plugin>
+"""
+
+
+def _level(tile: Placed, buffer: float) -> str:
+    reach = (buffer, buffer, HEADROOM)
+    corners = list(zip(tile.offset, tile.low, tile.high, strict=True))
+    x, y, z = (offset + (low + high) / 2 for offset, low, high in corners)
+    dx, dy, dz = (high - low + 2 * r for (_, low, high), r in zip(corners, reach, strict=True))
+    return f"""      <level name="{tile.name}_level">
+        <pose>{numbers((x, y, z))} 0 0 0</pose>
+        <geometry><box><size>{numbers((dx, dy, dz))}</size></box></geometry>
+        <buffer>{buffer:g}</buffer>
+        <ref>{tile.name}</ref>
+      </level>
+"""
+
+
+def _visual(name: str, mesh: str, label: int) -> str:
+    return f"""      <visual name="{Path(mesh).stem}">
+        <cast_shadows>false</cast_shadows>
+        <geometry>
+          <mesh><uri>model://{name}/{mesh}</uri></mesh>
+        </geometry>
+        <plugin filename="gz-sim-label-system" name="gz::sim::systems::Label">
+          <label>{label}</label>
+        </plugin>
+      </visual>
+"""
+
+
+def _collision(name: str, solid: Solid) -> str:
+    shape = solid.shape
+    if isinstance(shape, Cylinder):
+        place = f"        <pose>{numbers(shape.centre)} {numbers(shape.angles)}</pose>\n"
+        form = f"<cylinder><radius>{shape.radius:.4f}</radius><length>{shape.length:.4f}</length></cylinder>"
+    else:
+        place, form = "", f"<mesh><uri>model://{name}/meshes/collision_{solid.name}.obj</uri></mesh>"
+    mu = f"{solid.friction:g}"
+    return f"""      <collision name="collision_{solid.name}">
+{place}        <geometry>
+          {form}
+        </geometry>
+        <surface>
+          <friction>
+            <ode><mu>{mu}</mu><mu2>{mu}</mu2></ode>
+            <bullet><friction>{mu}</friction><friction2>{mu}</friction2></bullet>
+          </friction>
+        </surface>
+      </collision>
+"""
+
+
+def _spherical(place: Georeference | None) -> str:
+    if place is None:
+        return ""
+    return f"""    <spherical_coordinates>
+      <surface_model>EARTH_WGS84</surface_model>
+      <world_frame_orientation>ENU</world_frame_orientation>
+      <latitude_deg>{place.latitude:.9f}</latitude_deg>
+      <longitude_deg>{place.longitude:.9f}</longitude_deg>
+      <elevation>{place.elevation:.4f}</elevation>
+      <heading_deg>{place.heading:.7f}</heading_deg>
+    </spherical_coordinates>
+"""
+
+
+def numbers(values: Iterable[float]) -> str:
+    """As XML has them, to a thousandth of a millimetre."""
+    return " ".join(f"{value:.6f}".rstrip("0").rstrip(".") for value in values)

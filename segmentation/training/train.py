@@ -1,0 +1,158 @@
+"""Training of the project's own network on labelled photos. Import late: loads torch.
+
+From a folder as `segmentation.training.dataset` reads it. Runs are repeatable for a seed, on one machine with one
+number of threads.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+
+from scan2sim.pipeline.core.step import Report, silent
+from scan2sim.pipeline.core.types import F32, I64
+from scan2sim.segmentation.labels import CLASSES, IGNORED, index_of_code
+from scan2sim.segmentation.lidar_channels import COUNT
+from scan2sim.segmentation.network import StreetNet
+from scan2sim.segmentation.training.augment import augmented
+from scan2sim.segmentation.training.dataset import pairs, read, read_channels, split
+
+MEMORY = 0.002
+"""Share of a step's weights in their running mean."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How the network is trained.
+
+    Attributes:
+        steps: of the optimiser.
+        batch, crop: photos a step, and pixels of each, height and width.
+        rate: the highest learning rate, of one cycle.
+        held_out: share of the streets (the names' first part) that figures are told from.
+        minutes: at most; the cycle is shortened to fit, 0: no limit.
+        seed: of weights, crops and looks.
+        start: weights (safetensors) to go on from; None: from nothing.
+    """
+
+    steps: int = 3000
+    batch: int = 8
+    crop: tuple[int, int] = (256, 416)
+    rate: float = 3e-3
+    held_out: float = 0.05
+    minutes: float = 0
+    seed: int = 0
+    start: Path | None = None
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A network, and how it does on streets that it wasn't trained on: intersection over union, by class."""
+
+    network: StreetNet
+    iou: dict[str, float]
+
+
+def train(folder: Path, recipe: Recipe, report: Report = silent) -> Trained:
+    """Train on the labelled photos of a folder."""
+    torch.manual_seed(recipe.seed)
+    rng = np.random.default_rng(recipe.seed)
+    learn, check = split(pairs(folder), recipe.held_out)
+    network = StreetNet(len(CLASSES))
+    if recipe.start is not None:
+        network.load_state_dict(_widened(recipe.start), strict=False)
+    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    weight = class_weights([file for _, file in learn])
+    optimiser = torch.optim.AdamW(network.parameters(), recipe.rate, weight_decay=1e-2)
+    smooth = torch.optim.swa_utils.AveragedModel(network, avg_fn=averaged, use_buffers=True)
+    network.train()
+    start, done = time.monotonic(), 0.0
+    step = 0
+    while done < 1:
+        spent = (time.monotonic() - start) / 60
+        done = max(step / recipe.steps, spent / recipe.minutes if recipe.minutes else 0.0)
+        for group in optimiser.param_groups:
+            group["lr"] = recipe.rate * one_cycle(done)
+        some = [learn[i] for i in rng.integers(0, len(learn), recipe.batch)]
+        views = [_seen(pair, recipe.crop, rng) for pair in some]
+        seen = torch.from_numpy(np.stack([image for image, _ in views])).permute(0, 3, 1, 2)
+        truth = torch.from_numpy(np.stack([classes for _, classes in views]))
+        logits = network(seen.contiguous(memory_format=torch.channels_last))
+        loss = F.cross_entropy(
+            F.interpolate(logits, scale_factor=2, mode="bilinear"), truth[:, 1::2, 1::2], weight, ignore_index=IGNORED
+        )
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(network.parameters(), 2.0)
+        optimiser.step()
+        smooth.update_parameters(network)
+        step += 1
+        report(min(done, 0.99), f"step {step}, loss {loss.item():.3f}, {60 * spent:.0f} s")
+    best = smooth.module
+    assert isinstance(best, StreetNet)
+    best.eval()
+    return Trained(best, evaluate(best, check) if check else {})
+
+
+def _seen(pair: tuple[Path, Path], crop: tuple[int, int], rng: np.random.Generator) -> tuple[F32, I64]:
+    rgb, classes = read(*pair)
+    return augmented(rgb, classes, read_channels(pair[0], classes.shape), crop, rng)
+
+
+def _widened(path: Path) -> dict[str, torch.Tensor]:
+    """Weights of a `StreetNet`; of one that took colours alone, with zeros for the other channels."""
+    from safetensors.torch import load_file
+
+    state = {name: value.float() for name, value in load_file(str(path)).items()}
+    first = state["stem.0.weight"]
+    lacking = 3 + COUNT - first.shape[1]
+    state["stem.0.weight"] = torch.cat([first, first.new_zeros(len(first), lacking, *first.shape[2:])], dim=1)
+    return state
+
+
+def averaged(mean: torch.Tensor, new: torch.Tensor, n: torch.Tensor | int) -> torch.Tensor:
+    """A running mean of weights over some 500 steps, over fewer at the beginning."""
+    return mean + (new - mean) * max(MEMORY, 9 / (10 + int(n)))
+
+
+def one_cycle(done: float) -> float:
+    """Share of the highest rate: up over the first twentieth, down along a cosine."""
+    return min(1.0, done / 0.05 + 0.02) * 0.5 * (1 + math.cos(math.pi * min(1.0, done)))
+
+
+def class_weights(truth: Sequence[Path]) -> torch.Tensor:
+    """(C,) what an error costs by class: rare ones more, by the root of their share."""
+    import cv2
+
+    count = np.zeros(256)
+    for file in truth[:: max(1, len(truth) // 100)]:
+        count += np.bincount(index_of_code()[cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)].ravel(), minlength=256)
+    share = count[: len(CLASSES)] / count[: len(CLASSES)].sum()
+    weight = np.where(share > 0, 1 / np.sqrt(np.maximum(share, 4e-3)), 0)
+    return torch.tensor(weight / weight[weight > 0].mean(), dtype=torch.float32)
+
+
+@torch.inference_mode()
+def evaluate(network: StreetNet, check: Sequence[tuple[Path, Path]]) -> dict[str, float]:
+    """Intersection over union of the pixels, by class."""
+    import cv2
+
+    n = len(CLASSES)
+    confusion = np.zeros((n, n), np.int64)
+    for pair in check:
+        rgb, truth = read(*pair)
+        codes = cv2.resize(read_channels(pair[0], truth.shape), truth.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        seen = np.concatenate([rgb, codes], axis=2).astype(np.float32) / 255
+        logits = network(torch.from_numpy(seen).permute(2, 0, 1)[None])
+        found = F.interpolate(logits, size=truth.shape, mode="bilinear")[0].argmax(dim=0).numpy()
+        labelled = truth != IGNORED
+        confusion += np.bincount(truth[labelled].astype(np.int64) * n + found[labelled], minlength=n * n).reshape(n, n)
+    both, either = np.diag(confusion), confusion.sum(axis=0) + confusion.sum(axis=1) - np.diag(confusion)
+    return {name: round(float(both[i] / either[i]), 4) for i, name in enumerate(CLASSES) if confusion[i].any()}

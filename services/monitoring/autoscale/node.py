@@ -1,0 +1,58 @@
+"""A node that asks for workers: of each queue that is told of on the bus, as many as it needs."""
+
+from __future__ import annotations
+
+import json
+import time
+from typing import Any
+
+from scan2sim.services.monitoring.autoscale.forecast import DAY, Blend, daily
+from scan2sim.services.monitoring.autoscale.policy import Scaler
+from scan2sim.services.monitoring.events.bus import Bus
+from scan2sim.services.monitoring.events.schema import QueueState, WorkersWanted
+from scan2sim.services.monitoring.example_nodes.dataset_talker import read_events
+from scan2sim.services.monitoring.node.monitor import ros
+from scan2sim.services.monitoring.settings.bus import ScaleParams
+
+
+class ScalerNode(ros.Node):  # type: ignore[misc]
+    """Decides whenever a queue is told of."""
+
+    def __init__(self, params: ScaleParams, node_name: str = "scaler") -> None:
+        self._params, self._scalers = params, dict[str, Scaler]()
+        self._usual = daily((seconds, 1) for seconds, _ in read_events(params.history)) if params.history else None
+        self._scaler()  # refuses limits that contradict each other, before anything is joined
+        super().__init__(node_name)
+        if params.log_file:
+            params.log_file.parent.mkdir(parents=True, exist_ok=True)
+        self._log = params.log_file.open("a", buffering=1) if params.log_file else None
+        self._bus = Bus(self, params)
+        self._bus.events.on("queue", self._decide)
+
+    def _scaler(self) -> Scaler:
+        return Scaler(self._params, Blend(self._params.window, self._usual) if self._usual else None)
+
+    def _decide(self, state: QueueState) -> None:
+        scaler = self._scalers.get(state.queue) or self._scalers.setdefault(state.queue, self._scaler())
+        wanted = scaler.decide(_local(), state.seconds, state.arrived, state.waiting)
+        rate = scaler.forecast.ahead(self._params.lead)
+        if wanted != state.workers:
+            told = WorkersWanted(queue=state.queue, workers=wanted, rate=rate, waiting=state.waiting)
+            self._bus.events.send("workers", told)
+        if self._log:
+            self._log.write(
+                json.dumps({"time": time.time(), "wanted": wanted, "rate": rate, **state.model_dump()}) + "\n"
+            )
+
+    def destroy_node(self) -> Any:
+        """Leave the bus, and end."""
+        self._bus.close()
+        if self._log:
+            self._log.close()
+        return super().destroy_node()
+
+
+def _local() -> float:
+    """Seconds since a Monday's midnight, by the clock on the wall here: 1970 began on a Thursday."""
+    now = time.time()
+    return now + time.localtime(now).tm_gmtoff - 4 * DAY

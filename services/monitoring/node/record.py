@@ -1,0 +1,243 @@
+"""A record: what a monitor reports of a node or topic once a period, by the field names of D3.2's code snippet 4.
+
+`Record` is the schema, too: `python -m scan2sim.services.monitoring.node.record` prints it as JSON Schema.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from scan2sim.services.monitoring.node.meter import Flow, Reading
+from scan2sim.services.transport.types import Endpoint
+
+SCHEMA = "scan2sim-monitor-1"
+"""Changes when a field does."""
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
+
+
+class Profile(_Model):
+    """A quality of service; durations in nanoseconds, 9223372036854775807 for never."""
+
+    reliability: str
+    durability: str
+    lifespan: int = Field(alias="lifespan (nanoseconds)")
+    deadline: int = Field(alias="deadline (nanoseconds)")
+    liveliness: str
+    lease: int = Field(alias="liveliness lease duration (nanoseconds)")
+
+
+class EndpointInfo(_Model):
+    """A publisher or a subscription; `GID` as numbers from 0 to 255."""
+
+    node_name: str = Field(alias="node name")
+    node_namespace: str = Field(alias="node namespace")
+    topic_type: str = Field(alias="topic type")
+    endpoint_type: Literal["PUBLISHER", "SUBSCRIPTION"] = Field(alias="endpoint type")
+    gid: list[int] = Field(alias="GID")
+    qos: Profile = Field(alias="QoS profile")
+
+
+class TopicEndpoints(_Model):
+    """Who is on a topic."""
+
+    topic_name: str = Field(alias="topic name")
+    publishers: list[EndpointInfo] = Field(alias="publishers_info_by_topic")
+    subscriptions: list[EndpointInfo] = Field(alias="subscriptions_info_by_topic")
+
+
+class TopicFlow(_Model):
+    """One direction of one topic over the period.
+
+    Attributes:
+        bandwidth: bytes a second.
+        sent: messages that publishers sent meanwhile, by their numbers: more than came, where a subscriber is slow.
+        latency: nanoseconds, mean of the window, with the clocks' offset taken away; `latency_p95` likewise.
+        clock_offset: by which the sender's clock is ahead, nanoseconds; None: unknown, as it isn't watched.
+        clock_uncertainty: how far that may be off.
+        unreadable: messages that came, and weren't of the topic's type; unknown to rclpy.
+    """
+
+    topic: str
+    direction: Literal["incoming", "outgoing"]
+    type: str
+    bandwidth: float
+    messages: int
+    size: float = Field(alias="message size mean")
+    sent: int | None = Field(None, alias="published messages")
+    lost: int | None = Field(None, alias="lost messages")
+    latency: int | None = Field(None, alias="latency (nanoseconds)")
+    latency_p95: int | None = Field(None, alias="latency p95 (nanoseconds)")
+    clock_offset: int | None = Field(None, alias="clock offset (nanoseconds)")
+    clock_uncertainty: int | None = Field(None, alias="clock uncertainty (nanoseconds)")
+    unreadable: int = Field(0, alias="unreadable messages")
+
+
+class Record(_Model):
+    """What a node did over a period.
+
+    Attributes:
+        id: of the record, NODE:NUMBER with the node's own identity; twice the same is the same record.
+        time: seconds since the epoch, at the end of the period.
+        period: seconds that it covers.
+        node_id: unlike any other's, of this life of the node.
+        bandwidth: bytes a second, in and out; likewise `messages`, `size` (bytes).
+        lost: None where no publisher numbers its messages.
+        latency: mean of all that came (of the window); None where no message says when it was sent.
+        clock_synchronised: whether NTP keeps this machine's clock, as its kernel says; None: it says nothing.
+        remarks: what is wrong with the topics, in words: profiles that don't fit, nodes of one name.
+        dropped: records and events that were given up before this one, as the disk's share for them was full.
+        dropped_by: likewise, of records and of each kind of events.
+    """
+
+    schema_name: str = Field(SCHEMA, alias="schema")
+    id: str = Field(alias="record id")
+    time: float
+    period: float
+    node_name: str = Field(alias="node name")
+    node_namespace: str = Field(alias="node namespace")
+    node_id: str = Field(alias="node id")
+    bandwidth: float
+    messages: int
+    size: float = Field(alias="message size mean")
+    out_bandwidth: float = Field(alias="outgoing bandwidth")
+    out_messages: int = Field(alias="outgoing messages")
+    out_size: float = Field(alias="outgoing message size mean")
+    in_bandwidth: float = Field(alias="incoming bandwidth")
+    in_messages: int = Field(alias="incoming messages")
+    in_size: float = Field(alias="incoming message size mean")
+    latency: int | None = Field(alias="latency (nanoseconds)")
+    latency_p95: int | None = Field(alias="latency p95 (nanoseconds)")
+    clock_synchronised: bool | None = Field(None, alias="clock synchronised")
+    lost: int | None = Field(alias="lost messages")
+    publishers: int
+    subscribers: int
+    topics: list[str]
+    flows: list[TopicFlow]
+    hostname: str
+    local_ip: str = Field(alias="local ip")
+    local_ips: list[str] = Field(alias="local ips")
+    endpoints: list[TopicEndpoints] = Field(alias="topics endpoint info")
+    cpu_times: dict[str, float] = Field(alias="cpu times")
+    cpu_percent: float = Field(alias="cpu percent")
+    virtual_memory: dict[str, float] = Field(alias="virtual memory")
+    disk_usage: list[float] = Field(alias="disk usage")
+    remarks: list[str] = []
+    dropped: int = Field(0, alias="dropped records")
+    dropped_by: dict[str, int] = Field({}, alias="dropped by kind")
+
+    @staticmethod
+    def machine(read: Mapping[str, Any]) -> dict[str, Any]:
+        """Fields of a machine's reading (`machine.Machine.read`), by their names here."""
+        return {name.replace(" ", "_"): value for name, value in read.items()}
+
+    @property
+    def share(self) -> str:
+        """What it counts for in a spool, where room is short."""
+        return "records"
+
+    def json_line(self) -> str:
+        """As one line of JSON."""
+        return self.model_dump_json(by_alias=True)
+
+
+def flows_of(reading: Reading, types: Mapping[str, str], period: float) -> list[TopicFlow]:
+    """A reading's flows; `types` are the names of topics' types, `period` is in seconds."""
+    out = [
+        TopicFlow(
+            topic=topic,
+            direction="outgoing",
+            type=types.get(topic, ""),
+            bandwidth=flow.size / period,
+            messages=flow.messages,
+            size=flow.mean(),
+        )
+        for topic, flow in reading.outgoing.items()
+    ]
+    incoming = [
+        TopicFlow(
+            topic=topic,
+            direction="incoming",
+            type=types.get(topic, ""),
+            bandwidth=found.flow.size / period,
+            messages=found.flow.messages,
+            size=found.flow.mean(),
+            sent=found.sent,
+            lost=found.lost,
+            latency=mean(found.latencies),
+            latency_p95=p95(found.latencies),
+            clock_offset=found.clock[0] if found.clock else None,
+            clock_uncertainty=found.clock[1] if found.clock else None,
+            unreadable=found.unreadable,
+        )
+        for topic, found in reading.incoming.items()
+    ]
+    return out + incoming
+
+
+def sums(reading: Reading, period: float) -> dict[str, Any]:
+    """A record's own figures: of all topics together."""
+    out = _all(reading.outgoing.values())
+    incoming = _all(found.flow for found in reading.incoming.values())
+    both = Flow(out.messages + incoming.messages, out.size + incoming.size)
+    latencies = [one for found in reading.incoming.values() for one in found.latencies]
+    lost = [found.lost for found in reading.incoming.values() if found.lost is not None]
+    return {
+        "bandwidth": both.size / period,
+        "messages": both.messages,
+        "size": both.mean(),
+        "out_bandwidth": out.size / period,
+        "out_messages": out.messages,
+        "out_size": out.mean(),
+        "in_bandwidth": incoming.size / period,
+        "in_messages": incoming.messages,
+        "in_size": incoming.mean(),
+        "latency": mean(latencies),
+        "latency_p95": p95(latencies),
+        "lost": sum(lost) if lost else None,
+    }
+
+
+def endpoint_info(endpoint: Endpoint) -> EndpointInfo:
+    """An endpoint as it stands in records."""
+    qos = endpoint.qos
+    return EndpointInfo(
+        node_name=endpoint.node_name,
+        node_namespace=endpoint.node_namespace,
+        topic_type=endpoint.type_name,
+        endpoint_type=endpoint.kind,
+        gid=list(endpoint.gid),
+        qos=Profile(
+            reliability=qos.reliability,
+            durability=qos.durability,
+            lifespan=qos.lifespan,
+            deadline=qos.deadline,
+            liveliness=qos.liveliness,
+            lease=qos.lease,
+        ),
+    )
+
+
+def mean(values: Any) -> int | None:
+    """Mean of some nanoseconds; None of none."""
+    return round(sum(values) / len(values)) if values else None
+
+
+def p95(values: Any) -> int | None:
+    """What 95 of 100 don't exceed; None of none."""
+    return sorted(values)[min(len(values) - 1, int(0.95 * len(values)))] if values else None
+
+
+def _all(flows: Any) -> Flow:
+    found = list(flows)
+    return Flow(sum(flow.messages for flow in found), sum(flow.size for flow in found))
+
+
+if __name__ == "__main__":
+    print(json.dumps(Record.model_json_schema(by_alias=True), indent=2))

@@ -1,0 +1,74 @@
+"""A node that has events of a topic worked on: they wait in a queue, and workers are started as they are asked for."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import time
+from typing import Any
+
+from scan2sim.services.monitoring.autoscale.actuators.local_workers import Processes
+from scan2sim.services.monitoring.events.bus import Bus
+from scan2sim.services.monitoring.events.schema import QueueState, WorkersWanted
+from scan2sim.services.monitoring.node.monitor import STRING, Monitor, ros
+from scan2sim.services.monitoring.settings.bus import BusParams
+from scan2sim.services.monitoring.settings.monitor import WorkParams
+from scan2sim.services.monitoring.work.queue import EventQueue
+from scan2sim.services.transport import Arrival, QoS
+
+EVENTS = QoS(depth=1000)
+
+
+class Work(Monitor):
+    """Takes strings for events, and reports on its queue as often as on itself.
+
+    Attributes:
+        queue: of the topic's name.
+    """
+
+    def __init__(self, params: WorkParams, node_name: str = "work") -> None:
+        super().__init__(node_name, **params.monitored())
+        self.queue = EventQueue(params.topic, params.queue_length, params.when_full)
+        self._workers = Processes(self.queue, shlex.split(params.command), params.deadline)
+        self._most, self._with_text = params.max_workers, params.with_text
+        self._sent: float | None = None
+        self._bus = Bus(
+            self,
+            BusParams(
+                kafka_bootstrap_servers=params.kafka_bootstrap_servers,
+                records_topic=params.publisher_topic,
+                events_topic=params.events_topic,
+            ),
+        )
+        self.drops.append(self._bus.dropped)
+        self._bus.events.on("workers", self._scale)
+        self.create_subscription(ros.message_type(STRING), params.topic, self._take, EVENTS)
+        self._reported = time.monotonic()
+        self._workers.scale(1)
+        self.create_timer(params.period, self._report_queue)
+
+    def received(self, arrival: Arrival) -> None:
+        """Remember when the message that comes next was sent."""
+        super().received(arrival)
+        self._sent = arrival.sent / 1e9 if arrival.sent is not None else None
+
+    def _take(self, message: Any) -> None:
+        sent = self._sent if self._sent is not None else time.time()
+        event = {"sent": sent, "size": len(message.data)} | ({"text": message.data} if self._with_text else {})
+        self.queue.put(json.dumps(event), sent)
+
+    def _scale(self, wanted: WorkersWanted) -> None:
+        if wanted.queue == self.queue.name:
+            self._workers.scale(min(self._most, wanted.workers))
+
+    def _report_queue(self) -> None:
+        now = time.monotonic()
+        state: QueueState = self.queue.state(now - self._reported, self._workers.workers())
+        self._reported = now
+        self._bus.events.send("queue", state)
+
+    def destroy_node(self) -> Any:
+        """Stop the workers, and end."""
+        self._workers.close()
+        self._bus.close()
+        return super().destroy_node()

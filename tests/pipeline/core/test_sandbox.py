@@ -1,0 +1,51 @@
+"""Native code in a child process: its result, its crash, its hanging."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+
+import pytest
+
+from scan2sim.pipeline.core import sandbox
+from scan2sim.pipeline.core.errors import StepError
+
+HERE = "tests.pipeline.core.test_sandbox"
+
+
+def double(value: int) -> int:
+    return 2 * value
+
+
+def crash() -> None:
+    os.kill(os.getpid(), signal.SIGSEGV)
+
+
+def refuse() -> None:
+    raise ValueError("no such luck")
+
+
+def hang() -> None:
+    time.sleep(600)
+
+
+def test_result_comes_back() -> None:
+    assert sandbox.call(f"{HERE}:double", 21, timeout=60) == 42
+
+
+def test_a_crash_becomes_an_error() -> None:
+    with pytest.raises(StepError, match="crashed"):
+        sandbox.call(f"{HERE}:crash", timeout=60)
+
+
+def test_an_exception_is_told() -> None:
+    with pytest.raises(StepError, match="no such luck"):
+        sandbox.call(f"{HERE}:refuse", timeout=60)
+
+
+def test_hanging_ends() -> None:
+    start = time.monotonic()
+    with pytest.raises(StepError, match="did not finish"):
+        sandbox.call(f"{HERE}:hang", timeout=3)
+    assert time.monotonic() - start < 30

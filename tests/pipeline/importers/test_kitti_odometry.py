@@ -1,0 +1,142 @@
+"""KITTI odometry: a made-up sequence whose geometry is known, and a real one where it is present."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
+
+from scan2sim.flows.cli import app
+from scan2sim.pipeline.camera.models import project
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.types import UNCOLOURED as GREY
+from scan2sim.pipeline.importers.kitti_odometry import import_kitti_odometry
+from scan2sim.pipeline.io import clouds
+from scan2sim.pipeline.io.tile import read_tile
+
+FRAMES, WIDTH, HEIGHT = 4, 600, 300
+AXES = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])  # scanner to camera
+P2 = np.array([[400, 0, 300.5, 24.0], [0, 400, 150.5, 0.2], [0, 0, 1, 0.003]])
+
+
+def rigid(turn: np.ndarray, shift: list[float]) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = turn, shift
+    return T
+
+
+TR = rigid(Rotation.from_rotvec([0.01, 0.02, -0.01]).as_matrix() @ AXES, [0.0, -0.08, -0.27])
+
+
+@pytest.fixture
+def sequence(tmp_path: Path) -> Path:
+    return make_sequence(tmp_path)
+
+
+def make_sequence(tmp_path: Path) -> Path:
+    """A car that drives a curve past a wall of dots, each of another colour; as the data set is laid out."""
+    folder = tmp_path / "sequences" / "31"
+    for name in ("velodyne", "image_2"):
+        (folder / name).mkdir(parents=True)
+    (tmp_path / "poses").mkdir()
+    y, z = np.meshgrid(np.linspace(-5, 5, 9), np.linspace(-1.5, 2, 5))
+    wall = np.stack([np.full(y.size, 16.0), y.ravel(), z.ravel()], axis=1)  # axes of the first sweep
+    np.save(tmp_path / "wall.npy", wall)
+    poses, pixels = [], []
+    for i in range(FRAMES):
+        T_velo = rigid(Rotation.from_euler("z", 0.05 * i).as_matrix(), [1.0 * i, 0.1 * i, 0.0])
+        poses.append((TR @ T_velo @ np.linalg.inv(TR))[:3].ravel())
+        local = (wall - T_velo[:3, 3]) @ T_velo[:3, :3]
+        own_car = [[1.0, 0.2, -0.5]]
+        sweep = np.column_stack([np.concatenate([local, own_car]), np.full(len(local) + 1, 0.5)])
+        sweep.astype(np.float32).tofile(folder / "velodyne" / f"{i:06d}.bin")
+        uvw = np.column_stack([local @ TR[:3, :3].T + TR[:3, 3], np.ones(len(local))]) @ P2.T
+        pixels.append(uvw[:, :2] / uvw[:, 2:])
+        image = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
+        for k, (u, v) in enumerate(pixels[-1]):
+            cv2.circle(image, (round(u), round(v)), 4, (k, 2 * k, 100), -1)
+        cv2.imwrite(str(folder / "image_2" / f"{i:06d}.png"), image)
+    np.save(tmp_path / "pixels.npy", pixels)
+    np.savetxt(tmp_path / "poses" / "31.txt", poses, "%.9e")
+    np.savetxt(folder / "times.txt", 0.1 * np.arange(FRAMES), "%.6e")
+    rows = {"P0": P2, "P2": P2, "Tr": TR[:3]}
+    (folder / "calib.txt").write_text(
+        "".join(f"{key}: {' '.join(f'{v:.12e}' for v in value.ravel())}\n" for key, value in rows.items()),
+        encoding="utf-8",
+    )
+    return folder
+
+
+def test_sweeps_lie_on_each_other_and_photos_show_them(sequence: Path, tmp_path: Path) -> None:
+    tile = read_tile(import_kitti_odometry(sequence, tmp_path / "tile"))
+    cloud = clouds.read(tile.clouds[0], tile.frame)
+    wall, pixels = np.load(tmp_path / "wall.npy"), np.load(tmp_path / "pixels.npy")
+    xyz = tile.frame.to_crs(cloud.xyz).reshape(FRAMES, len(wall), 3)  # the car's own return is gone
+    assert np.abs(xyz - wall).max() < 2e-3
+    assert cloud.rgb is not None and (cloud.rgb.reshape(FRAMES, -1, 3)[..., 0] == 100).all() and GREY != 100
+    assert [view.time for view in tile.views] == pytest.approx([0, 0.1, 0.2, 0.3])
+    for view, expected in zip(tile.views, pixels, strict=True):
+        uv, _ = project(view.camera, (tile.frame.to_local(wall) - view.centre) @ view.T_world_cam[:3, :3])
+        assert np.abs(uv - expected).max() < 0.01  # the files have ten digits
+
+
+def test_the_command_and_poses_of_ones_own(sequence: Path, tmp_path: Path) -> None:
+    (tmp_path / "poses" / "31.txt").rename(tmp_path / "mine.txt")
+    options = ["import", "kitti-odometry", str(sequence), "-o", str(tmp_path / "tile")]
+    refused = CliRunner().invoke(app, options)
+    assert isinstance(refused.exception, InputError) and "poses.txt" in str(refused.exception)
+    done = CliRunner().invoke(app, [*options, "--poses", str(tmp_path / "mine.txt")])
+    assert done.exit_code == 0 and len(read_tile(tmp_path / "tile").views) == FRAMES
+
+
+@pytest.mark.parametrize(
+    ("file", "body", "cause"),
+    [
+        ("calib.txt", "P2: 1 2 3\n", "has no `Tr` of 12 numbers"),
+        ("times.txt", "0\n1\n", "has 2 times, but sweep 3"),
+        ("times.txt", "0\n1\n1\n2\n", "don't ascend"),
+        ("times.txt", "none\n", "is no list of times"),
+        ("poses.txt", "1 2 3\n", "is no pose file"),
+        ("velodyne/000001.bin", "12345", "is no Velodyne sweep"),
+    ],
+)
+def test_a_damaged_sequence_is_refused(sequence: Path, tmp_path: Path, file: str, body: str, cause: str) -> None:
+    (sequence / file).write_text(body, encoding="utf-8")
+    with pytest.raises(InputError, match=cause):
+        import_kitti_odometry(sequence, tmp_path / "tile")
+    assert not (tmp_path / "tile").exists()
+
+
+def test_times_in_a_pipe_are_not_waited_for(sequence: Path, tmp_path: Path) -> None:
+    (sequence / "times.txt").unlink()
+    os.mkfifo(sequence / "times.txt")
+    with pytest.raises(InputError, match="is a pipe"):
+        import_kitti_odometry(sequence, tmp_path / "tile")
+
+
+def test_a_real_sequences_sweeps_agree(real_data: Path, tmp_path: Path) -> None:
+    """What stands is hit by sweeps of different places at the same place: near a sweep's points lie the next one's."""
+    source = real_data / "kitti_odo04_f00-24"
+    tile = read_tile(import_kitti_odometry(source, tmp_path / "tile", frames=(0, 8), max_range=30.0))
+    cloud = clouds.read(tile.clouds[0], tile.frame)
+    assert tile.frame.crs == "local" and len(tile.views) == 9 and len(cloud) > 500_000
+    assert cloud.time is not None and cloud.rgb is not None
+    path = np.array([view.centre for view in tile.views])
+    assert path[-1, 0] - path[0, 0] > 9 and np.ptp(path[:, 2]) < 0.5  # ahead is +x, and the road is level
+    first, last = (cloud.xyz[cloud.time == t] for t in (cloud.time.min(), cloud.time.max()))
+    first = first[(first[:, 2] > np.percentile(cloud.xyz[:, 2], 5) + 0.5)]  # rings on the road differ
+
+    def gap(shift: float) -> float:
+        return float(
+            np.median(cKDTree(last + [shift, 0, 0]).query(first[::5], distance_upper_bound=1.0)[0].clip(max=1))
+        )
+
+    assert gap(0.0) < 0.8 * min(gap(-0.5), gap(0.5))
+    coloured = (cloud.rgb != GREY).any(axis=1)
+    assert coloured.mean() > 0.2

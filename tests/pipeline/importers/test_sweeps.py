@@ -1,0 +1,464 @@
+"""Sweeps of a made-up hall, taken on a known way: its walls come out sharp, and coloured as they are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
+
+from scan2sim.flows.cli import app
+from scan2sim.pipeline.camera.models import pixel_rays
+from scan2sim.pipeline.core.errors import DataError, InputError, ScanError, SettingError
+from scan2sim.pipeline.core.types import F64, Camera, Frame, PointCloud, Tile, Trajectory
+from scan2sim.pipeline.importers.sweeps import (
+    Pictures,
+    Placing,
+    camera_of_photos,
+    import_sweeps,
+    photo_extrinsics,
+    read_camera,
+    read_extrinsics,
+    read_sweep,
+)
+from scan2sim.pipeline.io import clouds
+from scan2sim.pipeline.io import trajectory as trajectory_io
+from scan2sim.pipeline.io.clouds import las
+from scan2sim.pipeline.io.tile import read_tile
+from tests.present import present
+
+LOW, HIGH = np.array([-8.0, -6.0, 0.0]), np.array([30.0, 6.0, 5.0])  # the hall
+PAINT = np.array([[250, 30, 30], [30, 250, 30], [30, 30, 250], [250, 250, 30], [30, 250, 250], [250, 30, 250]])
+PERIOD, SWEEPS, SPEED, TURN = 0.1, 6, 9.0, 0.4
+CAMERA = Camera("equirectangular", 512, 256)
+T_CAMERA_SCANNER = np.eye(4)
+T_CAMERA_SCANNER[:3, :3] = Rotation.from_rotvec([0.02, -0.03, 0.01]).as_matrix() @ [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
+T_CAMERA_SCANNER[:3, 3] = [0.1, 0.4, -0.3]
+
+
+def way(times: F64) -> Trajectory:
+    """The scanner's: straight on, turning evenly to the left."""
+    heading = 0.3 + TURN * times
+    positions = np.array([0.5, -1.0, 1.8]) + np.outer(times, [SPEED, 2.0, 0])
+    return Trajectory(times, positions, Rotation.from_euler("z", heading[:, None]).as_matrix())
+
+
+def intersect(origin: F64, direction: F64) -> tuple[F64, np.ndarray]:
+    """(N, 3) where rays from within the hall meet a wall, and (N,) which: low x, y, z, high x, y, z."""
+    with np.errstate(divide="ignore"):
+        far = np.concatenate([(LOW - origin) / direction, (HIGH - origin) / direction], axis=1)
+    far[~(far > 1e-9)] = np.inf
+    wall = far.argmin(axis=1)
+    return origin + direction * far.min(axis=1)[:, None], wall
+
+
+def sweep(time: float, *, turning: bool) -> F64:
+    """(N, 3) in scanner axes, measured while it turns clockwise, from back to back, or all at once."""
+    columns = np.pi - (np.arange(600) + 0.5) / 600 * 2 * np.pi
+    azimuth, elevation = (a.ravel() for a in np.meshgrid(columns, np.radians(np.linspace(-60, 50, 24))))
+    flat = np.cos(elevation)
+    ray = np.stack([np.cos(azimuth) * flat, np.sin(azimuth) * flat, np.sin(elevation)], axis=1)
+    when = time + (-azimuth / (2 * np.pi) * PERIOD if turning else np.zeros(len(ray)))
+    poses = way(when)
+    assert poses.rotations is not None
+    hits, _ = intersect(poses.positions, np.einsum("nij,nj->ni", poses.rotations, ray))
+    return np.einsum("nji,nj->ni", poses.rotations, hits - poses.positions)
+
+
+def photo(T_world_cam: F64) -> np.ndarray:
+    """(H, W, 3) RGB: each wall in its colour."""
+    rays = pixel_rays(CAMERA).reshape(-1, 3).astype(np.float64) @ T_world_cam[:3, :3].T
+    _, wall = intersect(np.tile(T_world_cam[:3, 3], (len(rays), 1)), rays)
+    return PAINT[wall].reshape(CAMERA.height, CAMERA.width, 3).astype(np.uint8)
+
+
+def walls(xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) metres to the nearest wall's plane, and which it is."""
+    off = np.abs(np.concatenate([xyz - LOW, xyz - HIGH], axis=1))
+    return off.min(axis=1), off.argmin(axis=1)
+
+
+def to_bin(file: Path, xyz: F64) -> None:
+    np.column_stack([xyz, np.full(len(xyz), 0.5)]).astype(np.float32).tofile(file.with_suffix(".bin"))
+
+
+def to_laz(file: Path, xyz: F64) -> None:
+    levels = np.full(len(xyz), 32768, np.uint16)
+    las.write(file.with_suffix(".laz"), PointCloud(Frame(), xyz.astype(np.float32), intensity=levels))
+
+
+def to_open3d(suffix: str) -> Callable[[Path, F64], None]:
+    def write(file: Path, xyz: F64) -> None:
+        import open3d as o3d
+
+        cloud = o3d.t.geometry.PointCloud(xyz.astype(np.float32))
+        cloud.point["intensity"] = np.full((len(xyz), 1), 128, np.float32)
+        o3d.t.io.write_point_cloud(str(file.with_suffix(suffix)), cloud)
+
+    return write
+
+
+@dataclass
+class Drive:
+    """Folders of sweeps and photos, files of poses of the camera and of the scanner, the true times."""
+
+    folder: Path
+    times: F64
+    camera: Trajectory
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        return {"sweeps": self.folder / "sweeps", "poses": self.folder / "camera.csv", "extrinsics": T_CAMERA_SCANNER}
+
+    @property
+    def pictures(self) -> Pictures:
+        return Pictures(self.folder / "photos", CAMERA)
+
+
+def make(
+    folder: Path, *, turning: bool = False, write: Callable[[Path, F64], None] = to_bin, shift: Any = (0, 0, 0)
+) -> Drive:
+    times = 0.1 + PERIOD * np.arange(SWEEPS, dtype=float)
+    for name in ("sweeps", "photos"):
+        (folder / name).mkdir(parents=True)
+    scanner = way(times)
+    poses = scanner.poses @ np.linalg.inv(T_CAMERA_SCANNER)
+    for i, time in enumerate(times):
+        write(folder / "sweeps" / f"{i:06d}", sweep(float(time), turning=turning))
+        cv2.imwrite(str(folder / "photos" / f"{i:06d}.png"), photo(poses[i])[..., ::-1])
+    camera = Trajectory(times, poses[:, :3, 3] + shift, poses[:, :3, :3])
+    trajectory_io.write(folder / "camera.csv", camera)
+    trajectory_io.write(folder / "scanner.kitti", scanner)
+    np.savetxt(folder / "extrinsics.txt", T_CAMERA_SCANNER, "%.9f")
+    return Drive(folder, times, camera)
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
+    return make(tmp_path_factory.mktemp("drive"))
+
+
+def imported(**arguments: Any) -> Path:
+    """`import_sweeps`, its parameters and all else by their names."""
+    own = {name: arguments.pop(name) for name in Placing.model_fields.keys() & arguments.keys()}
+    return import_sweeps(**arguments, placing=Placing(**own))
+
+
+def cloud_of(path: Path) -> tuple[Tile, PointCloud, np.ndarray]:
+    """A tile, its cloud, and the points in the CRS."""
+    tile = read_tile(path)
+    cloud = clouds.read(tile.clouds[0], tile.frame)
+    return tile, cloud, tile.frame.to_crs(cloud.xyz)
+
+
+def test_a_turning_scanners_walls_come_out_sharp(tmp_path: Path) -> None:
+    drive = make(tmp_path, turning=True)
+    _, cloud, xyz = cloud_of(imported(**drive.arguments, out=tmp_path / "tile", deskew="kitti"))
+    assert len(xyz) == SWEEPS * 600 * 24 and walls(xyz)[0].max() < 0.003
+    assert cloud.time is not None
+    assert np.allclose([cloud.time.min(), cloud.time.max()], [0.05, 0.65], atol=1e-3)
+    assert cloud.intensity is not None and (cloud.intensity == 32768).all()
+    smeared = cloud_of(imported(**drive.arguments, out=tmp_path / "smeared"))[2]
+    assert walls(smeared)[0].max() > 0.2
+
+
+@pytest.mark.parametrize("write", [to_bin, to_laz, to_open3d(".pcd"), to_open3d(".ply")])
+def test_sweeps_of_all_formats(tmp_path: Path, write: Callable[[Path, F64], None]) -> None:
+    drive = make(tmp_path, write=write)
+    _, cloud, xyz = cloud_of(imported(**drive.arguments, out=tmp_path / "tile"))
+    assert len(xyz) == SWEEPS * 600 * 24 and walls(xyz)[0].max() < 0.003
+    assert cloud.intensity is not None and np.abs(cloud.intensity.astype(int) - 32768).max() < 300
+
+
+def test_poses_may_be_the_scanners_own(drive: Drive, tmp_path: Path) -> None:
+    given: dict[str, Any] = {"extrinsics": T_CAMERA_SCANNER, "scanner_poses": True}
+    for extra in ({}, given):
+        path = imported(
+            sweeps=drive.folder / "sweeps",
+            poses=drive.folder / "scanner.kitti",
+            out=tmp_path / "tile",
+            overwrite=True,
+            **extra,
+        )
+        tile, _, xyz = cloud_of(path)
+        assert walls(xyz)[0].max() < 0.003 and tile.trajectory is not None
+        assert np.allclose(tile.frame.to_crs(tile.trajectory.positions), way(drive.times).positions, atol=1e-5)
+
+
+def test_points_take_the_colour_of_their_wall_and_photos_their_pose(drive: Drive, tmp_path: Path) -> None:
+    tile, cloud, xyz = cloud_of(imported(**drive.arguments, out=tmp_path / "tile", photos=drive.pictures, link=True))
+    assert cloud.rgb is not None
+    off = np.abs(np.concatenate([xyz - LOW, xyz - HIGH], axis=1))
+    inner = np.sort(off, axis=1)[:, 1] > 0.5  # away from the edges between walls
+    right = (cloud.rgb == PAINT[walls(xyz)[1]]).all(axis=1)
+    assert right[inner].mean() > 0.999 and inner.mean() > 0.6
+    assert len(tile.views) == SWEEPS and tile.views[2].photo.is_symlink()
+    view, pose = tile.views[2], drive.camera.poses[2]
+    assert np.allclose(tile.frame.to_crs(view.centre), pose[:3, 3], atol=1e-5)
+    assert np.allclose(view.T_world_cam[:3, :3], pose[:3, :3], atol=1e-6) and view.time == pytest.approx(0.3)
+
+
+def test_a_mask_goes_with_the_photos_and_its_pixels_colour_nothing(drive: Drive, tmp_path: Path) -> None:
+    mask = np.full((CAMERA.height, CAMERA.width), 255, np.uint8)
+    mask[128:] = 0
+    cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    pictures = Pictures(drive.folder / "photos", CAMERA, mask=tmp_path / "mask.png")
+    tile, cloud, xyz = cloud_of(imported(**drive.arguments, out=tmp_path / "tile", photos=pictures))
+    assert cloud.rgb is not None and (cloud.rgb[xyz[:, 2] < 0.3] == 128).mean() > 0.8
+    assert {view.mask for view in tile.views} == {tile.path.parent / "masks" / "mask.png"}
+
+
+def test_what_is_unsure_is_left_out_and_told(drive: Drive, tmp_path: Path) -> None:
+    positions, unsure = drive.camera.positions.copy(), np.zeros(SWEEPS, bool)
+    positions[2:4] += [0.7, 0.4, 0.0]
+    unsure[2:4] = True
+    rotations = drive.camera.rotations
+    trajectory_io.write(tmp_path / "lost.csv", Trajectory(drive.times, positions, rotations, unsure))
+    notes: list[str] = []
+    arguments = drive.arguments | {"poses": tmp_path / "lost.csv", "photos": drive.pictures, "warn": notes.append}
+    tile, _, xyz = cloud_of(imported(**arguments, out=tmp_path / "tile"))
+    assert len(xyz) == (SWEEPS - 2) * 600 * 24 and walls(xyz)[0].max() < 0.003 and len(tile.views) == SWEEPS - 2
+    assert [text.partition(":")[0] for text in notes] == [
+        f"2 of 6 {what} are left out" for what in ("sweeps", "photos")
+    ]
+    notes.clear()
+    tile, _, xyz = cloud_of(imported(**arguments, out=tmp_path / "all", keep_unsure=True))
+    assert len(xyz) == SWEEPS * 600 * 24 and walls(xyz)[0].max() > 0.3 and not notes
+    trajectory_io.write(tmp_path / "lost.csv", Trajectory(drive.times, positions, rotations, ~np.zeros(SWEEPS, bool)))
+    with pytest.raises(DataError, match=r"none of 6 sweeps has a sure pose.*--keep-unsure"):
+        imported(**arguments, out=tmp_path / "none")
+
+
+def test_times_come_from_a_file_from_names_or_from_the_order(drive: Drive, tmp_path: Path) -> None:
+    few = tmp_path / "few"
+    few.mkdir()
+    source = sorted((drive.folder / "sweeps").iterdir())
+
+    def given(names: list[str]) -> Path:
+        for old in few.iterdir():
+            old.unlink()
+        for file, name in zip(source[1:4:2], names, strict=True):
+            (few / name).symlink_to(file)
+        return few
+
+    arguments = drive.arguments | {"out": tmp_path / "tile", "overwrite": True}
+    notes: list[str] = []
+    (tmp_path / "times.txt").write_text("0.2\n0.4\n", encoding="utf-8")
+    for names, extra in (
+        (["1.bin", "3.bin"], {}),  # frames' numbers
+        (["0.2.bin", "0.4.bin"], {}),
+        (["1700000000200000000.bin", "1700000000400000000.bin"], {"time_offset": -1700000000.0}),
+        (["a.bin", "b.bin"], {"times": tmp_path / "times.txt"}),
+    ):
+        _, _, xyz = cloud_of(imported(**arguments | {"sweeps": given(names), "warn": notes.append} | extra))
+        assert len(xyz) == 2 * 600 * 24 and walls(xyz)[0].max() < 0.003, names
+    assert not notes
+    with pytest.raises(InputError, match=r"few: has 2 sweeps for 6 poses.*Give their times"):
+        imported(**arguments | {"sweeps": given(["a.bin", "b.bin"])})
+    with pytest.raises(InputError, match=r"camera.csv: spans 0.10 to 0.60 s, the 2 sweeps 70.20 to 70.40 s.*offset"):
+        imported(**arguments | {"sweeps": given(["70.2.bin", "70.4.bin"])})
+    imported(**arguments | {"sweeps": given(["0.2.bin", "70.4.bin"]), "warn": notes.append})
+    assert notes == ["1 of 2 sweeps are left out: outside the trajectory's times"]
+
+
+def test_nothing_is_placed_within_a_gap_of_the_trajectory(drive: Drive, tmp_path: Path) -> None:
+    t = drive.camera
+    late = Trajectory(np.where(t.times > 0.35, t.times + 5, t.times), t.positions, t.rotations)
+    trajectory_io.write(tmp_path / "gap.csv", late)
+    (tmp_path / "times.txt").write_text("0.1 0.2 0.3 3.0 5.5 5.6".replace(" ", "\n"), encoding="utf-8")
+    notes: list[str] = []
+    arguments = drive.arguments | {
+        "poses": tmp_path / "gap.csv",
+        "times": tmp_path / "times.txt",
+        "warn": notes.append,
+    }
+    imported(**arguments, out=tmp_path / "tile")
+    assert notes == ["1 of 6 sweeps are left out: in gaps of the trajectory"]
+
+
+def test_a_projected_crs_keeps_its_large_coordinates(tmp_path: Path) -> None:
+    shift = np.array([500_000.0, 5_400_000.0, 200.0])
+    drive = make(tmp_path, shift=shift)
+    tile, cloud, xyz = cloud_of(imported(**drive.arguments, out=tmp_path / "tile", crs="EPSG:32633"))
+    assert tile.frame.crs == "EPSG:32633" and walls(xyz - shift)[0].max() < 0.003 and np.abs(cloud.xyz).max() < 100
+
+
+def test_thinning_keeps_a_point_a_voxel(drive: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = cloud_of(imported(**drive.arguments, out=tmp_path / "whole"))[2]
+    thin = cloud_of(imported(**drive.arguments, out=tmp_path / "thin", voxel=0.37))[2]
+    monkeypatch.setattr("scan2sim.pipeline.importers.sweeps.PENDING", 20_000)  # the same on the way
+    often = cloud_of(imported(**drive.arguments, out=tmp_path / "often", voxel=0.37))[2]
+    origin = np.floor(drive.camera.positions[0])
+    cells = [np.unique(np.floor((xyz - origin) / 0.37), axis=0) for xyz in (whole, thin)]
+    assert 0.97 * len(cells[0]) < len(thin) < 1.03 * len(cells[0]) < 0.2 * len(whole) and len(often) == len(thin)
+
+
+def test_range_is_bounded(drive: Drive, tmp_path: Path) -> None:
+    arguments = drive.arguments | {"out": tmp_path / "tile", "overwrite": True}
+    with pytest.raises(DataError, match="no points within range"):
+        imported(**arguments, max_range=1.5)
+    xyz = cloud_of(imported(**arguments, min_range=3.0, max_range=6.0))[2]
+    away = np.linalg.norm(xyz[:, None] - way(drive.times).positions, axis=2)
+    assert 2.99 < away.min(axis=1).max() < 6.01
+
+
+def test_extrinsics_the_wrong_way_round_are_noticed(drive: Drive, tmp_path: Path) -> None:
+    notes: list[str] = []
+    wrong = drive.arguments | {"extrinsics": np.linalg.inv(T_CAMERA_SCANNER)}
+    imported(**wrong, out=tmp_path / "tile", warn=notes.append)
+    assert any("right way round" in text for text in notes)
+
+
+@pytest.mark.parametrize("form", ["rows", "three", "velo_to_cam", "odometry"])
+def test_extrinsics_of_all_kinds_of_files(tmp_path: Path, form: str) -> None:
+    T, file = T_CAMERA_SCANNER, tmp_path / "T.txt"
+
+    def text(values: F64) -> str:
+        return " ".join(f"{v:.9f}" for v in values.ravel())
+
+    file.write_text(
+        {
+            "rows": "# camera, scanner\n" + "\n".join(map(text, T)),
+            "three": "\n".join(map(text, T[:3])).replace(" ", ", "),
+            "velo_to_cam": f"calib_time: 15-Mar-2012 11:37:16\nR: {text(T[:3, :3])}\nT: {text(T[:3, 3])}\n",
+            "odometry": f"P0: 1 2 3\nTr: {text(T[:3])}\n",
+        }[form],
+        encoding="utf-8",
+    )
+    assert np.allclose(read_extrinsics(file), T, atol=1e-8)
+
+
+def test_photos_of_kittis_second_camera_stand_beside_the_first(drive: Drive, tmp_path: Path) -> None:
+    """`Tr` is of camera 0; P2 tells that camera 2 sees what is 6 cm to the left of it."""
+    K, offset = np.array([[700.0, 0, 600], [0, 700, 180], [0, 0, 1]]), np.array([0.0613, -0.001, 0.003])
+    P2 = np.column_stack([K, K @ offset])
+    calib = tmp_path / "calib.txt"
+    matrices = {"P0": np.eye(3, 4), "P2": P2, "Tr": T_CAMERA_SCANNER[:3]}
+    lines = [f"{key}: {' '.join(f'{value:.9e}' for value in matrix.ravel())}\n" for key, matrix in matrices.items()]
+    calib.write_text("".join(lines), encoding="utf-8")
+    own = tmp_path / "image_2"
+    own.mkdir()
+    for file in sorted((drive.folder / "photos").iterdir()):
+        (own / file.name).symlink_to(file)
+    assert photo_extrinsics(calib, drive.folder / "photos") is None
+    assert photo_extrinsics(drive.folder / "extrinsics.txt", own) is None
+    beside = photo_extrinsics(calib, own)
+    centres = []
+    for i, extrinsics in enumerate((None, beside)):
+        pictures = Pictures(own, CAMERA, extrinsics=extrinsics)
+        tile = read_tile(imported(**drive.arguments, out=tmp_path / str(i), photos=pictures, link=True))
+        centres.append((tile.views[0].T_world_cam, tile.views[0].centre))
+    moved = centres[0][0][:3, :3].T @ (centres[1][1] - centres[0][1])
+    np.testing.assert_allclose(moved, -offset, atol=1e-6)
+    calib.write_text(
+        "P2: 1 2 3\nTr: " + " ".join(f"{v:.9f}" for v in T_CAMERA_SCANNER[:3].ravel()) + "\n", encoding="utf-8"
+    )
+    with pytest.raises(InputError, match="no sound `P2`"):
+        photo_extrinsics(calib, own)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("1 0 0\n0 1 0\n", r"T\.txt: holds no 3x4 or 4x4 matrix \(2 rows\)"),
+        ("1 0 0 0\n0 1 0 zero\n0 0 1 0", r"T\.txt: holds no 3x4 or 4x4 matrix"),
+        ("1 0 0 0\n0 1 0 0\n0 0 -1 0", r"T\.txt: its left 3x3 is no rotation"),
+        ("2 0 0 0\n0 2 0 0\n0 0 2 0", r"T\.txt: its left 3x3 is no rotation"),
+    ],
+)
+def test_bad_extrinsics_are_named(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "T.txt").write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match=message):
+        read_extrinsics(tmp_path / "T.txt")
+
+
+def test_a_camera_of_a_file_or_of_numbers(drive: Drive, tmp_path: Path) -> None:
+    file = tmp_path / "camera.toml"
+    file.write_text(
+        '[[cameras]]\nid = "a"\nmodel = "pinhole"\nsize = [100, 50]\nfocal = [80.0, 80.0]\ncentre = [49.5, 24.5]\n'
+        '[[cameras]]\nid = "b"\nmodel = "opencv"\n'
+        "size = [512, 256]\nfocal = [90.0, 91.0]\ndistortion = [0.1, 0, 0, 0]\n",
+        encoding="utf-8",
+    )
+    camera = Camera("opencv", 512, 256, 90.0, 91.0, 0.0, 0.0, (0.1, 0.0, 0.0, 0.0))
+    assert camera_of_photos(drive.folder / "photos", file=file) == read_camera(file, 512, 256) == camera
+    with pytest.raises(InputError, match=r"has no camera of 64x64 \(it has 100x50, 512x256\)"):
+        read_camera(file, 64, 64)
+    file.write_text('[[cameras]]\nid = "a"\nmodel = "spherical"\nsize = [100, 50]\n', encoding="utf-8")
+    with pytest.raises(InputError, match=r"camera\.toml: field `cameras\.model`"):
+        read_camera(file, 100, 50)
+    assert camera_of_photos(drive.folder / "photos") == CAMERA
+    pinhole = camera_of_photos(drive.folder / "photos", model="pinhole", focal=100.0)
+    assert pinhole == Camera("pinhole", 512, 256, 100.0, 100.0, 255.5, 127.5)
+    with pytest.raises(InputError, match=r"photos: needs a camera.*--focal"):
+        camera_of_photos(drive.folder / "photos", model="pinhole")
+
+
+def garbage(drive: Drive, name: str) -> dict[str, Any]:
+    """A drive's arguments with one of its files overwritten."""
+    (drive.folder / name).write_bytes(b"nonsense!")
+    return drive.arguments | {"photos": drive.pictures}
+
+
+@pytest.mark.parametrize(
+    ("change", "kind", "message"),
+    [
+        (lambda d: garbage(d, "sweeps/000002.bin"), InputError, r"000002\.bin: is no Velodyne sweep"),
+        (lambda d: garbage(d, "sweeps/000009.pcd") | {"times": d.folder / "t7.txt"}, InputError, r"000009\.pcd: is no"),
+        (lambda d: garbage(d, "photos/000002.png"), InputError, r"000002\.png: can't be read"),
+        (lambda d: garbage(d, "camera.csv"), InputError, r"camera\.csv: is no trajectory"),
+        (lambda d: d.arguments | {"poses": d.folder / "flat.csv"}, InputError, r"flat\.csv: knows positions alone"),
+        (lambda d: d.arguments | {"sweeps": d.folder / "photos"}, InputError, r"photos: holds no sweeps.*\.bin"),
+        (lambda d: d.arguments | {"sweeps": d.folder / "no"}, InputError, r"no: is missing"),
+        (lambda d: d.arguments | {"times": d.folder / "t7.txt"}, InputError, r"t7\.txt: has 7 times for 6 sweeps"),
+        (
+            lambda d: d.arguments | {"extrinsics": None, "photos": d.pictures},
+            SettingError,
+            "photos need the camera's place",
+        ),
+        (lambda d: d.arguments | {"crs": "EPSG:4326"}, InputError, "not projected"),
+        (lambda d: d.arguments | {"min_range": 60.0}, SettingError, "max_range"),
+        (
+            lambda d: d.arguments | {"photos": Pictures(d.folder / "photos", Camera("equirectangular", 64, 32))},
+            InputError,
+            r"000000\.png: is 512x256, but its calibration says 64x32",
+        ),
+    ],
+)
+def test_bad_input_is_named_and_leaves_nothing(
+    tmp_path: Path, change: Callable[[Drive], dict[str, Any]], kind: type[ScanError], message: str
+) -> None:
+    drive = make(tmp_path / "drive")
+    (drive.folder / "t7.txt").write_text("\n".join(f"{0.1 + 0.08 * i:.2f}" for i in range(7)), encoding="utf-8")
+    (drive.folder / "flat.csv").write_text("time,x,y,z\n0,0,0,0\n1,1,0,0\n", encoding="utf-8")
+    with pytest.raises(kind, match=message):
+        imported(**change(drive), out=tmp_path / "tile")
+    assert [p.name for p in tmp_path.iterdir()] == ["drive"]
+
+
+def test_a_sweeps_own_colours_are_kept_without_photos(tmp_path: Path) -> None:
+    xyz = np.random.default_rng(0).uniform(2, 5, (50, 3)).astype(np.float32)
+    rgb = np.tile(np.array([10, 20, 30], np.uint8), (50, 1))
+    las.write(tmp_path / "a.laz", PointCloud(Frame(), xyz, rgb))
+    assert np.array_equal(present(read_sweep(tmp_path / "a.laz")[2]), rgb)
+    (tmp_path / "poses.tum").write_text("0 0 0 0 0 0 0 1\n", encoding="utf-8")
+    cloud = cloud_of(imported(sweeps=tmp_path / "a.laz", poses=tmp_path / "poses.tum", out=tmp_path / "tile"))[1]
+    assert cloud.rgb is not None and (cloud.rgb == [10, 20, 30]).all()
+
+
+def test_the_command(drive: Drive, tmp_path: Path) -> None:
+    folder, out = drive.folder, tmp_path / "tile"
+    result = CliRunner().invoke(
+        app,
+        f"import sweeps {folder}/sweeps {folder}/camera.csv --out {out} --extrinsics {folder}/extrinsics.txt "
+        f"--photos {folder}/photos --time-offset -0.15 --max-range 20 --voxel 0.1 --name hall",
+    )
+    assert result.exit_code == 0, result.output
+    assert "1 of 6 sweeps are left out: outside the trajectory's times" in result.output
+    assert read_tile(out).name == "hall" and len(read_tile(out).views) == SWEEPS - 1

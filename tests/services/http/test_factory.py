@@ -1,0 +1,254 @@
+"""Whatever is served: health by its workers, a token, errors by one table, limits, TLS, headers."""
+
+from __future__ import annotations
+
+import socket
+import ssl
+import subprocess
+import threading
+import time
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from scan2sim.pipeline.core.errors import EXIT_CODES, InputError, ScanError, SettingError
+from scan2sim.services.http.settings import Served
+
+pytest.importorskip("fastapi", reason="the extra bus isn't installed")
+from fastapi import FastAPI, Request, WebSocket
+from fastapi.testclient import TestClient
+from starlette.websockets import WebSocketDisconnect
+
+from scan2sim.services.http import factory, limits
+
+TOKEN = "0123456789abcdef"
+
+
+class Worker:
+    """Lives until it is told not to."""
+
+    alive = True
+
+    def is_alive(self) -> bool:
+        return self.alive
+
+
+@pytest.fixture
+def token(tmp_path: Path) -> Path:
+    path = tmp_path / "token"
+    path.write_text(f"{TOKEN}\n", encoding="utf-8")
+    return path
+
+
+def app_of(served: Served | None = None, **more: Any) -> FastAPI:
+    app = factory.application("a test", served or Served(), **({"alive": {}} | more))
+
+    @app.get("/number")
+    def number(value: float = 0) -> float:
+        return value
+
+    @app.post("/length")
+    async def length(request: Request) -> int:
+        return len(await request.body())
+
+    @app.get("/fail/{kind}")
+    def fail(kind: str) -> None:
+        for error in EXIT_CODES:
+            if error.__name__ == kind and issubclass(error, ScanError):
+                raise error("tile.toml", "is wrong", "Mend it")
+        raise ZeroDivisionError("a secret")
+
+    @app.websocket("/socket")
+    async def socket(socket: WebSocket) -> None:
+        await socket.accept()
+        await socket.close()
+
+    return app
+
+
+def client_of(app: FastAPI, host: str = "localhost") -> TestClient:
+    return TestClient(app, base_url=f"http://{host}", raise_server_exceptions=False)
+
+
+def test_health_is_that_of_the_workers() -> None:
+    worker, broker = Worker(), Worker()
+    client = client_of(app_of(alive={"reader": worker.is_alive}, ready={"Kafka": broker.is_alive}))
+    assert client.get("/health/live").status_code == client.get("/health/ready").status_code == 200
+    broker.alive = False
+    assert client.get("/health/live").status_code == 200
+    ready = client.get("/health/ready")
+    assert (ready.status_code, ready.json()) == (503, {"failing": ["Kafka"]})
+    worker.alive = False
+    assert client.get("/health/live").json() == {"failing": ["reader"]}
+    assert client.get("/health/ready").json() == {"failing": ["reader", "Kafka"]}
+    assert 'scan2sim_worker_alive{worker="reader"} 0.0' in client.get("/metrics").text
+
+
+@pytest.mark.parametrize("kind", [kind for kind in EXIT_CODES if issubclass(kind, ScanError)])
+def test_errors_have_the_statuses_of_the_table(kind: type[ScanError]) -> None:
+    answer = client_of(app_of()).get(f"/fail/{kind.__name__}")
+    assert answer.status_code == EXIT_CODES[kind][1]
+    assert answer.json() == {"where": "tile.toml", "cause": "is wrong", "remedy": "Mend it"}
+
+
+@pytest.mark.parametrize(("path", "status"), [("/nix", 404), ("/number?value=x", 422), ("/fail/other", 500)])
+def test_every_error_names_place_cause_and_remedy_alone(path: str, status: int) -> None:
+    answer = client_of(app_of()).get(path)
+    assert answer.status_code == status and set(answer.json()) == {"where", "cause", "remedy"}
+    assert "secret" not in answer.text
+
+
+def test_a_machine_is_asked_by_any_of_its_names_with_the_token(token: Path) -> None:
+    client = client_of(app_of(Served(host="0.0.0.0", token=token)), "robot.example")
+    assert client.get("/number", headers={"Authorization": f"Bearer {TOKEN}"}).status_code == 200
+    assert client.get("/number").status_code == 401
+
+
+def test_without_the_token_only_health_and_files_of_pages_are_shown(token: Path) -> None:
+    client = client_of(app_of(Served(token=token), public=("/",)))
+    for path in ("/number", "/metrics", "/openapi.json", "/health", "/nix", "/pages/../number"):
+        for given in ({}, {"Authorization": "Bearer 0123456789abcdeX"}, {"Authorization": TOKEN}):
+            answer = client.get(path, headers=given)
+            assert answer.status_code == 401 and answer.headers["WWW-Authenticate"] == "Bearer", path
+    assert client.get("/health/live").status_code == client.get("/pages/style.css").status_code == 200
+    assert client.get("/number?value=3", headers={"Authorization": f"Bearer {TOKEN}"}).json() == 3
+    with pytest.raises(WebSocketDisconnect), client.websocket_connect("/socket"):
+        pass
+
+
+def test_websites_whose_names_lead_here_read_nothing() -> None:
+    for host in ("localhost", "127.0.0.1:8080", "[::1]:8080", "LOCALHOST:80"):
+        assert client_of(app_of(), host).get("/number").status_code == 200, host
+    for host in ("evil.example", "localhost.evil.example", "127.0.0.1.evil.example:8080"):
+        answer = client_of(app_of(), host).get("/number")
+        assert answer.status_code == 421 and set(answer.json()) == {"where", "cause", "remedy"}, host
+
+
+@pytest.mark.parametrize("text", ["", "short", "two words that are long", "ümläutümläutümläut"])
+def test_a_token_that_is_none_is_refused(text: str, token: Path) -> None:
+    token.write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match="openssl rand"):
+        Served(token=token).secret()
+    with pytest.raises(InputError, match="can't be read"):
+        Served(token=token.parent / "nowhere").secret()
+
+
+@pytest.mark.parametrize("told", [True, False], ids=["with a length", "in chunks"])
+def test_requests_that_are_too_large_are_refused(told: bool) -> None:
+    client = client_of(app_of(largest=1000))
+
+    def sent(size: int) -> Any:
+        chunks = (b"x" * 100 for _ in range(size // 100))
+        return client.post("/length", content=b"x" * size if told else chunks)
+
+    assert sent(1000).json() == 1000
+    assert sent(1100).status_code == 413 and "1000 bytes" in sent(1100).json()["cause"]
+
+
+def test_answers_forbid_what_pages_do_not_need() -> None:
+    client = client_of(app_of())
+    for path in ("/pages/style.css", "/nix", "/fail/other", "/health/live"):
+        headers = client.get(path).headers
+        assert "default-src 'none'; script-src 'self'" in headers["Content-Security-Policy"], path
+        assert headers["X-Content-Type-Options"] == "nosniff"
+    assert client.get("/pages/%2e%2e/serving.py").status_code == 404
+
+
+@pytest.fixture
+def certificate(tmp_path: Path) -> tuple[Path, Path]:
+    """Of localhost, by nobody but itself."""
+    paths = tmp_path / "certificate.pem", tmp_path / "key.pem"
+    made = subprocess.run(
+        ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes", "-days", "2",
+         "-subj", "/CN=localhost", "-addext", "subjectAltName=DNS:localhost", "-out", paths[0], "-keyout", paths[1]],
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert made.returncode == 0, made.stderr
+    return paths
+
+
+@pytest.fixture
+def served(certificate: tuple[Path, Path]) -> Iterator[str]:
+    """Address of a service that runs, by TLS."""
+    told: list[str] = []
+    served = Served(port=0, host="localhost", certificate=certificate[0], key=certificate[1])
+    thread = threading.Thread(target=factory.run, args=(app_of(served), served, told.append), daemon=True)
+    thread.start()
+    for _ in range(600):
+        if told:
+            break
+        time.sleep(0.05)
+    yield told[0]
+
+
+def test_it_is_served_by_tls(served: str, certificate: tuple[Path, Path]) -> None:
+    trusting = ssl.create_default_context(cafile=certificate[0])
+    with urllib.request.urlopen(f"{served}number?value=2", context=trusting, timeout=60) as answer:
+        assert answer.read() == b"2.0"
+    with pytest.raises(OSError), urllib.request.urlopen(served.replace("https", "http"), timeout=60):
+        pass
+
+
+def test_what_can_not_be_served_is_told_before(certificate: tuple[Path, Path], tmp_path: Path) -> None:
+    with pytest.raises(SettingError, match="--key"):
+        Served(certificate=certificate[0]).check_tls()
+    (tmp_path / "other.pem").write_text("no key", encoding="utf-8")
+    with pytest.raises(InputError, match=r"other\.pem"):
+        Served(certificate=certificate[0], key=tmp_path / "other.pem").check_tls()
+    with Served(port=0).listen() as taken, pytest.raises(SettingError, match="Choose another --port"):
+        Served(port=taken.getsockname()[1]).listen()
+    with pytest.raises(SettingError, match="192.0.2.1"):
+        Served(host="192.0.2.1", token=tmp_path / "token").listen()
+
+
+@pytest.mark.parametrize(("host", "by_token"), [("0.0.0.0", False), ("0.0.0.0", True), ("127.0.0.1", False)])
+def test_tls_without_a_token_is_served_with_a_warning(
+    host: str, by_token: bool, certificate: tuple[Path, Path], token: Path,
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.setattr("uvicorn.Server.run", lambda self, sockets: None)
+    given = token if by_token else None
+    served = Served(port=0, host=host, token=given, certificate=certificate[0], key=certificate[1])
+    factory.run(app_of(served), served, lambda address: None)
+    assert ("--token FILE" in caplog.text) == (host == "0.0.0.0" and not by_token)
+
+
+@pytest.fixture
+def plain(monkeypatch: pytest.MonkeyPatch) -> int:
+    """Port of a service that runs, and closes silent connections soon."""
+    monkeypatch.setattr(limits, "SILENT", 1.0)
+    monkeypatch.setattr(factory, "SENT_WITHIN", 0.5)
+    told: list[str] = []
+    served = Served(port=0)
+    threading.Thread(target=factory.run, args=(app_of(served), served, told.append), daemon=True).start()
+    while not told:
+        time.sleep(0.05)
+    return int(told[0].rsplit(":")[-1].strip("/"))
+
+
+def test_a_thousand_idle_connections_keep_nobody_out_and_are_closed(plain: int) -> None:
+    idle = [socket.create_connection(("127.0.0.1", plain)) for _ in range(1000)]
+    with urllib.request.urlopen(f"http://127.0.0.1:{plain}/number?value=2", timeout=10) as answer:
+        assert answer.read() == b"2.0"
+    for one in idle:
+        one.settimeout(20)
+        assert one.recv(1) == b""
+        one.close()
+
+
+def test_a_body_that_never_comes_is_waited_for_in_bounds(plain: int) -> None:
+    with socket.create_connection(("127.0.0.1", plain), timeout=20) as half:
+        half.sendall(b"POST /length HTTP/1.1\r\nHost: localhost\r\nContent-Length: 10\r\n\r\nabc")
+        assert b"408" in half.recv(100)
+
+
+def test_other_sites_pages_have_nothing_done() -> None:
+    """A visitor's browser would send their forms here; it says where they are from."""
+    client = TestClient(app_of(), base_url="http://localhost:8080")
+    assert client.post("/length", content=b"abc", headers={"Origin": "http://evil.example"}).status_code == 403
+    assert client.post("/length", content=b"abc", headers={"Origin": "null"}).status_code == 403
+    assert client.post("/length", content=b"abc", headers={"Origin": "http://localhost:8080"}).json() == 3
+    assert client.post("/length", content=b"abc").json() == 3 and client.get("/number?value=1").json() == 1

@@ -1,0 +1,205 @@
+"""The driver's page, in a browser: pictures with their age, the wheel, the confirmation; who leaves lets go."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("OpenSSL", reason="the extra teleop isn't installed")
+pytest.importorskip("fastapi", reason="the extra bus isn't installed")
+pytest.importorskip("websockets", reason="the extra teleop isn't installed")
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+
+from scan2sim.services.http.settings import Served
+from scan2sim.services.teleoperation.control.controls import Controls, Gear
+from scan2sim.services.teleoperation.control.messages import Command
+from tests.browser import Page, chromium
+from tests.services.teleoperation.pages import Cockpit, served
+from tests.services.teleoperation.street import until
+
+TOKEN = "0123456789abcdef/+="
+
+
+@pytest.fixture
+def cockpit(tmp_path: Path) -> Iterator[Cockpit]:
+    with served(tmp_path, Served(port=0)) as made:
+        yield made
+
+
+def live(cockpit: Cockpit, **more: Any) -> ClientConnection:
+    """The page's WebSocket."""
+    return connect(cockpit.url.replace("http", "ws") + "live", **more)
+
+
+def driving(page: Page, cockpit: Cockpit) -> None:
+    """From the page that was opened to a vehicle that drives."""
+    cockpit.street.fleet.join("car", "desk", "operator")
+    page.do("Page.navigate", url=cockpit.url)
+    page.until("document.querySelector('figure')?.dataset.shown > 3")
+    press(page, "#take", lambda: cockpit.desk.station.wheel.held_by() is not None)
+    press(page, "#agree", lambda: not cockpit.desk.standing())
+
+
+GAMEPADS = """
+buttons = [0, 1].map(() => Array.from({length: 17}, () => ({value: 0, pressed: false, touched: false})));
+navigator.getGamepads = () => [0, 1].map((index) => (
+  {index, connected: true, mapping: "standard", axes: [0, 0, 0, 0], buttons: buttons[index]}));
+0
+"""
+"""Two gamepads at rest."""
+KEYS = {"up": "ArrowUp", "down": "ArrowDown", "S": "KeyS", "space": "Space"}
+TRIGGERS = {"right trigger": (0, 7), "left trigger": (0, 6), "other gamepad's left trigger": (1, 6)}
+
+
+def hold(page: Page, control: str, down: bool) -> None:
+    """Press a control of keyboard, gamepad or page (its button, by mouse or finger), or release it."""
+    if control in KEYS:
+        page.do("Input.dispatchKeyEvent", type="rawKeyDown" if down else "keyUp", code=KEYS[control], key=control)
+    elif control in TRIGGERS:
+        gamepad, button = TRIGGERS[control]
+        page.value(f"Object.assign(buttons[{gamepad}][{button}], {{value: {int(down)}, pressed: {int(down)} > 0}}); 0")
+    else:
+        x, y = page.value("(b => [b.x + b.width / 2, b.y + b.height / 2])(byId('brake').getBoundingClientRect())")
+        if control == "mouse":
+            kind = "mousePressed" if down else "mouseReleased"
+            page.do("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+        else:
+            points = [{"x": x, "y": y}] if down else []
+            page.do("Input.dispatchTouchEvent", type="touchStart" if down else "touchEnd", touchPoints=points)
+
+
+def press(page: Page, button: str, done: Callable[[], bool]) -> None:
+    """Press a button, again where a busy machine was too slow for what the driver asked."""
+    end = time.monotonic() + 120
+    while not done():
+        assert time.monotonic() < end, page.value("document.body.innerText")
+        if page.value(f"!document.querySelector('{button}').disabled"):
+            page.click(button)
+        again = time.monotonic() + 3
+        while not done() and time.monotonic() < again:
+            time.sleep(0.02)
+
+
+def test_a_driver_sees_how_old_the_picture_is_confirms_and_drives_by_keys(cockpit: Cockpit, tmp_path: Path) -> None:
+    with chromium(tmp_path) as page:
+        driving(page, cockpit)
+        age = page.value("Number(document.querySelector('figure').dataset.age)")
+        assert 0 <= age < 5000 and page.value("Number(document.getElementById('age').textContent)") >= 0
+        assert "front" in page.value("document.querySelector('figcaption').textContent")
+        page.do("Input.dispatchKeyEvent", type="rawKeyDown", code="ArrowUp", key="ArrowUp")
+        until(lambda: cockpit.street.wheels.controls.throttle > 0.5)
+        page.do("Input.dispatchKeyEvent", type="keyUp", code="ArrowUp", key="ArrowUp")
+        until(lambda: cockpit.street.wheels.controls.throttle == 0 and not cockpit.desk.standing())
+        assert cockpit.street.wheels.controls.brake == 0, "it rolls: its driver still has the wheel"
+        shown = "[...document.querySelectorAll('#cameras b')].map((one) => one.textContent)"
+        assert page.value(f"camera(2), camera(1), {shown}") == ["front", "camera 1", "camera 2"], "the first is largest"
+        assert not page.errors
+
+
+def test_any_brake_stops_whatever_drives(cockpit: Cockpit, tmp_path: Path) -> None:
+    """Full throttle and a brake of the same device or another: at the vehicle, and in all that the page sends."""
+    throttles = ("up", "right trigger")
+    brakes = ("space", "down", "S", "mouse", "finger", "left trigger", "other gamepad's left trigger")
+    wheels = cockpit.street.wheels
+    with chromium(tmp_path) as page:
+        driving(page, cockpit)
+        page.value(GAMEPADS)
+        page.do("Emulation.setTouchEmulationEnabled", enabled=True)
+        page.value("sent = []; sending = send; send = (one) => { sent.push(one); sending(one); }; 0")
+        for throttle, brake in itertools.product(throttles, brakes):
+            press(page, "#agree", lambda: not cockpit.desk.standing())
+            page.value("gamepad = null; 0")  # the next one of which a button is pressed drives
+            hold(page, throttle, True)
+            until(lambda: wheels.controls.throttle > 0.9)
+            hold(page, brake, True)
+            until(lambda: wheels.controls.brake > 0.9)
+            assert wheels.controls.throttle == 0, f"{brake} while {throttle} is held"
+            hold(page, brake, False)
+            until(lambda: wheels.controls.brake == 0)
+            hold(page, throttle, False)
+            until(lambda: wheels.controls.throttle == 0)
+        braked = "sent.filter((one) => one.do === 'turn' && one.brake > 0)"
+        assert page.value(f"{braked}.length") > 0 and page.value(f"{braked}.every((one) => one.throttle === 0)")
+        assert not page.errors
+
+
+def test_a_brake_holds_beside_other_keys_and_presses_no_button(cockpit: Cockpit, tmp_path: Path) -> None:
+    with chromium(tmp_path) as page:
+        driving(page, cockpit)
+        page.value("document.getElementById('leave').focus()")
+        for ctrl in (0, 2):
+            page.do("Input.dispatchKeyEvent", type="rawKeyDown", code="Space", key=" ", modifiers=ctrl)
+            until(lambda: cockpit.street.wheels.controls.brake == 1 and not cockpit.desk.standing())
+            page.do("Input.dispatchKeyEvent", type="keyUp", code="Space", key=" ", modifiers=ctrl)
+            until(lambda: cockpit.street.wheels.controls.brake == 0)
+        assert cockpit.desk.station.wheel.held_by() is not None
+
+
+def test_a_brake_overrides_the_throttle_whatever_a_page_sends(cockpit: Cockpit) -> None:
+    wheel = cockpit.desk.station.wheel
+    with live(cockpit) as socket:
+        socket.send('{"do": "take"}')
+        socket.send('{"do": "turn", "steering": 0, "throttle": 1, "brake": 0.1, "gear": 1}')
+        until(lambda: wheel.command(0.0) is not None)
+        assert wheel.command(0.0) == Command(Controls(0.0, 0.0, 0.1, Gear.FORWARD))
+
+
+def test_a_page_in_the_background_lets_go_and_says_so(cockpit: Cockpit, tmp_path: Path) -> None:
+    with chromium(tmp_path) as page:
+        driving(page, cockpit)
+        page.value(
+            "Object.defineProperty(document, 'hidden', {value: true, configurable: true});"
+            "document.dispatchEvent(new Event('visibilitychange'))"
+        )
+        until(cockpit.desk.standing)
+        assert cockpit.desk.station.wheel.held_by() is None
+        page.until("document.getElementById('standing').textContent.includes('in the background')")
+
+
+def test_a_page_that_is_closed_lets_go(cockpit: Cockpit, tmp_path: Path) -> None:
+    with chromium(tmp_path) as page:
+        driving(page, cockpit)
+    until(cockpit.desk.standing)
+    assert cockpit.desk.station.wheel.held_by() is None
+
+
+def test_pages_need_the_token_and_other_sites_are_kept_out(tmp_path: Path) -> None:
+    (tmp_path / "token").write_text(TOKEN, encoding="utf-8")
+    with served(tmp_path, Served(port=0, token=tmp_path / "token")) as cockpit:
+        with pytest.raises(urllib.error.HTTPError, match="401"):
+            urllib.request.urlopen(f"{cockpit.url}api/station", timeout=20)
+        for protocols in (None, ["scan2sim"], ["scan2sim", "token.ff"], ["token.zz"]):
+            with pytest.raises(InvalidStatus):
+                live(cockpit, subprotocols=protocols)
+        named = ["scan2sim", f"token.{TOKEN.encode().hex()}"]
+        with live(cockpit, subprotocols=named) as socket:
+            assert socket.subprotocol == "scan2sim" and json.loads(socket.recv())["station"] == "desk"
+        with pytest.raises(InvalidStatus):
+            live(cockpit, subprotocols=named, origin="https://evil.example")
+
+
+def test_what_a_page_says_amiss_is_told_and_ends_nothing(cockpit: Cockpit) -> None:
+    with live(cockpit) as socket:
+        for said in (
+            "",
+            "[]",
+            '{"do": "fly"}',
+            '{"do": "turn", "steering": NaN}',
+            '{"do": "turn", "steering": 2}',
+            "x" * 999,
+        ):
+            socket.send(said)
+            while "fault" not in (told := json.loads(socket.recv())):
+                pass
+            assert "can't be understood" in told["fault"]
+        socket.send('{"do": "take"}')
+        until(lambda: "page" in (json.loads(socket.recv()).get("driver") or ""))

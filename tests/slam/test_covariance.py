@@ -1,0 +1,51 @@
+"""How sure a trajectory is of itself."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from scan2sim.slam.mapping.covariance import covariances
+from scan2sim.slam.mapping.map_file import Mapped
+from scan2sim.slam.mapping.marginalization import Information, Tie
+from tests.slam.synthetic import Follower, drive, inside, off, run, scatter
+
+
+def test_ellipsoids_hold_errors_and_none_is_a_point() -> None:
+    held = []
+    for seed in range(4):
+        times, poses = drive(12, turn=0.05 * (1 + seed))
+        odometry = run(times, Follower(poses, scatter(poses, seed=seed), seed=seed))
+        known = covariances(Mapped.of(odometry, ()), None)
+        assert (np.linalg.eigvalsh(known) > 0).all()
+        held.append(inside(off(odometry, poses), known).mean())
+    assert np.mean(held) > 0.85
+    assert np.degrees(odometry.map.information.noise(0.0)) == pytest.approx(0.03, rel=0.1)
+
+
+def test_a_gap_stays_uncertain_after_it() -> None:
+    times, poses = drive(20)
+    black = (times >= 10) & (times < 12)
+    hidden = Follower(poses, scatter(poses), hide=lambda frame, points: np.full(len(points), black[frame]))
+    odometry = run(times, hidden)
+    known = np.sqrt(np.trace(covariances(Mapped.of(odometry, ()), None)[:, :3, :3], axis1=1, axis2=2))
+    assert known[-1] > 10 * known[np.flatnonzero(black)[0] - 1]
+    assert all(p.unsure for p in odometry.placed[100:])  # nothing ties what is seen afterwards to what was seen before
+
+
+def test_a_band_is_inverted_as_a_whole_matrix_is() -> None:
+    rng, count = np.random.default_rng(0), 9
+    known, whole = Information(4), np.zeros((6 * count, 6 * count))
+    for first in range(count - 3):
+        J = rng.normal(size=(30, 24))
+        known.tell(range(first, first + 4), np.arange(3) + 3 * first, J.T @ J, np.ones(50))
+        at = slice(6 * first, 6 * first + 24)
+        whole[at, at] += J.T @ J
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, 3] = rng.normal(size=(count, 3))
+    far = Tie(1e6, 1e6)
+    found = known.covariance(poses, [Tie(1.0, 1.0), *[far] * (count - 1)], [], np.full(count, np.inf), 1.0)
+    whole = whole / known.noise(1.0) ** 2
+    whole[:6, :6] += np.eye(6)
+    blocks = np.linalg.inv(whole).reshape(count, 6, count, 6)
+    assert np.allclose(found, [blocks[k, :, k] for k in range(count)], rtol=1e-3, atol=1e-6)

@@ -1,0 +1,51 @@
+"""Frames that are missing, and nothing says so: whatever is wrong after them is marked."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from scan2sim.pipeline.core.types import Camera, Trajectory
+from scan2sim.slam.geometry import exp_so3
+from scan2sim.slam.odometry.odometry import Odometry, OdometryParams
+from tests.slam.conftest import AHEAD, film
+
+WIDE = Camera("pinhole", 320, 160, 180.0, 180.0, 159.5, 79.5)
+
+
+@pytest.fixture(scope="module")
+def turn() -> tuple[Trajectory, np.ndarray]:
+    """A path of 16 m that turns by 60 degrees, and what a perspective camera sees of it."""
+    heading = np.radians(60) * np.clip((np.arange(40) - 5) / 30, 0, 1)
+    steps = 0.4 * np.stack([np.cos(heading), 0.15 * np.sin(heading), 0 * heading], axis=1)
+    rotations = exp_so3(np.stack([0 * heading, 0 * heading, heading], axis=1)) @ AHEAD
+    truth = Trajectory(np.arange(40) / 10, np.cumsum(steps, axis=0), rotations)
+    return truth, film(WIDE, truth)
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [list(range(40)), [*range(10), *range(25, 40)], list(range(0, 40, 5))],
+    ids=("whole", "fifteen cut out", "every fifth"),
+)
+def test_what_is_wrong_after_frames_that_are_missing_is_marked(
+    turn: tuple[Trajectory, np.ndarray], rows: list[int]
+) -> None:
+    truth, greys = turn
+    odometry = Odometry(WIDE, OdometryParams())
+    for at, row in enumerate(rows):  # as if they followed each other
+        odometry.add(at / 10, greys[row])
+    found = np.stack([odometry.pose_of(placed)[:3, 3] for placed in odometry.placed])
+    there = truth.positions[rows] - truth.positions[0]
+    second = round(10 * odometry.map.keyframes[1].time)  # the unit of lengths is how far that is
+    unit = np.linalg.norm(there[second]) / max(float(np.linalg.norm(found[second])), 1e-9)
+    off = np.linalg.norm(unit * found @ odometry_axes(truth).T - there, axis=1)
+    unsure = np.array([placed.unsure for placed in odometry.placed])
+    assert unsure[off > 1.0].all(), np.round(off, 1)
+    assert (off > 1.0).any() == unsure.any() == (len(rows) < 40), np.round(off, 1)
+
+
+def odometry_axes(truth: Trajectory) -> np.ndarray:
+    """(3, 3) of the odometry's world, the first camera's."""
+    assert truth.rotations is not None
+    return np.asarray(truth.rotations[0])

@@ -1,0 +1,192 @@
+"""Lidar, camera and GPS in one graph: no worse than the best of them, and none spoils the others."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bench.slam.lidar import Simulated, ate, simulated
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.step import silent
+from scan2sim.pipeline.core.types import F64, Frame, PointCloud, Trajectory
+from scan2sim.pipeline.io import trajectory as trajectory_io
+from scan2sim.pipeline.io.clouds import las
+from scan2sim.slam.geometry import inverse
+from scan2sim.slam.lidar_odometry import Matched
+from scan2sim.slam.steps.fuse import FuseParams, fuse_path
+from scan2sim.slam.trajectory.fusion import SIZE, Fused, Steps, _marginals, _solved, camera_steps, fuse, lidar_steps
+from tests.present import present
+
+ALL = ("lidar", "camera", "gps")
+
+
+def off(fused: Fused, drive: Simulated) -> float:
+    return ate(fused.trajectory.positions, drive.truth[:, :3, 3])
+
+
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
+def test_all_together_are_no_worse_than_the_best_alone(seed: int) -> None:
+    whole = simulated(seed, tunnel=(0, 0), dark=(0, 0), outliers=0)
+    alone = whole.measure()
+    assert alone["fused"] < 1.1 * min(alone["lidar"], alone["visual"], alone["gps"])
+    failing = simulated(seed)
+    broken = failing.measure()
+    assert broken["lidar"] > 5 and broken["visual"] > 1 and broken["gps"] > 5
+    assert broken["fused"] < 0.8
+    path = failing.fused(*ALL).trajectory
+    assert not present(path.unsure).any()
+    error = path.positions - failing.truth[:, :3, 3]
+    squared = np.einsum("ni,nij,nj->n", error, np.linalg.inv(present(path.covariance)[:, :3, :3]), error)
+    assert (squared < 7.81).mean() > 0.9  # of 95 % ellipsoids
+
+
+def test_a_tunnel_and_the_dark_are_bridged_by_the_other() -> None:
+    drive = simulated(1)
+    assert off(drive.fused("lidar"), drive) > 5
+    both = drive.fused("lidar", "camera")
+    assert off(both, drive) < 1.0 and not present(both.trajectory.unsure).any()
+    scale = 1 / np.median(both.scale)
+    assert scale == pytest.approx(np.median(np.linalg.norm(np.diff(drive.camera.positions, axis=0), axis=1)), rel=0.1)
+
+
+def test_where_all_fail_it_is_said() -> None:
+    drive = simulated(2, tunnel=(150, 190), dark=(140, 200))
+    blind = drive.fused("lidar", "camera")
+    unsure = present(blind.trajectory.unsure)
+    assert unsure[151:191].all() and not unsure[:150].any() and unsure[191:].all()
+    seen = drive.fused(*ALL)
+    unsure = present(seen.trajectory.unsure)
+    assert unsure[151:191].all() and not unsure[:150].any() and not unsure[195:].any()  # GPS tells how far it was
+
+
+def test_outliers_of_gps_move_nothing() -> None:
+    clean, jumping = simulated(3, outliers=0), simulated(3)
+    assert np.array_equal(clean.lidar.T, jumping.lidar.T)
+    a, b = (drive.fused(*ALL).trajectory.positions for drive in (clean, replace(clean, gps=jumping.gps)))
+    assert np.abs(a - b).max() < 1.5
+    assert np.abs(jumping.gps - clean.gps).max() > 30
+
+
+def test_a_sensor_that_is_sure_and_wrong_is_doubted() -> None:
+    drive = simulated(4, tunnel=(0, 0), dark=(0, 0), outliers=0)
+    lidar = drive.lidar.T.copy()
+    lidar[200:210, 0, 3] = 0.0  # it slipped, and says nothing of it
+    wrong = replace(drive, lidar=drive.lidar._replace(T=lidar))
+    found = wrong.fused(*ALL)
+    assert found.trust["lidar"][200:210].max() < 0.2 < found.trust["camera"][200:210].min()
+    assert off(found, wrong) < 1.0 < off(wrong.fused("lidar"), wrong)
+
+
+def test_a_bridged_pose_of_the_camera_counts_by_its_covariance() -> None:
+    drive = simulated(5)
+    n = len(drive.times)
+    known = np.tile(np.diag([1e-4] * 3 + [1e-8] * 3), (n, 1, 1))
+    known[200:] += np.diag([9.0] * 3 + [0.04] * 3)
+    steps = camera_steps(replace(drive.camera, covariance=known), drive.times)
+    spread = np.sqrt(steps.covariance[:, 0, 0])
+    assert spread[199] > 2.5 and spread[:199].max() < 0.1 and spread[200:].max() < 0.1
+    assert not steps.sure[250:300].any() and steps.sure[:249].all()
+    late = camera_steps(replace(drive.camera, times=drive.times + 5.0), drive.times)
+    assert not late.sure[:50].any() and late.sure[60:200].all()
+
+
+def test_errors_of_a_tunnel_are_one() -> None:
+    poses = np.tile(np.eye(4), (6, 1, 1))
+    covariance = np.tile(np.diag([1e-4] * 6), (5, 1, 1))
+    covariance[1:4, 0, 0] = 1.0
+    steps = lidar_steps(Matched(np.arange(6.0), poses, covariance, np.ones(5)))
+    assert list(steps.sure) == [True, False, False, False, True]
+    assert steps.covariance[:, 0, 0] == pytest.approx([1e-4, 3, 3, 3, 1e-4])
+
+
+def test_the_banded_system_is_the_dense_one() -> None:
+    rng, n = np.random.default_rng(0), 5
+    dense = rng.normal(size=(n * SIZE, n * SIZE))
+    dense = dense @ dense.T + 50 * np.eye(n * SIZE)
+    for i in range(n):
+        for j in range(n):
+            if abs(i - j) > 1:
+                dense[i * SIZE : (i + 1) * SIZE, j * SIZE : (j + 1) * SIZE] = 0
+    dense += 200 * np.eye(n * SIZE)
+    blocks = dense.reshape(n, SIZE, n, SIZE).transpose(0, 2, 1, 3)
+    D, above = blocks[np.arange(n), np.arange(n)], blocks[np.arange(n - 1), np.arange(1, n)]
+    b = rng.normal(size=(n, SIZE))
+    np.testing.assert_allclose(_solved(D, above, b).ravel(), np.linalg.solve(dense, b.ravel()), rtol=1e-9)
+    inverted = np.linalg.inv(dense).reshape(n, SIZE, n, SIZE).transpose(0, 2, 1, 3)
+    np.testing.assert_allclose(_marginals(D, above), inverted[np.arange(n), np.arange(n)], rtol=1e-9, atol=1e-15)
+
+
+# --- as files
+
+
+def recorded(folder: Path, drive: Simulated) -> dict[str, Path]:
+    """A drive's sensors as the step reads them."""
+    (folder / "sweeps").mkdir(parents=True)
+    for time in drive.times:
+        las.write(folder / "sweeps" / f"{time:.3f}.laz", PointCloud(Frame(), np.ones((1, 3), np.float32)))
+    poses = [np.eye(4)]
+    for step in drive.lidar.T:
+        poses.append(poses[-1] @ step)
+    overlap = np.ones(len(drive.lidar.T))
+    Matched(drive.times, np.array(poses), drive.lidar.covariance, overlap).save(folder / "matched.npz")
+    trajectory_io.write(folder / "camera.csv", drive.camera)
+    np.savetxt(folder / "T.txt", drive.T_camera_scanner[:3], "%.9f")
+    table = np.column_stack([drive.times + 100, drive.gps])
+    np.savetxt(folder / "gps.csv", table, "%.4f", delimiter=",", header="time,x,y,z", comments="")
+    beside = {"matched": "matched.npz", "poses": "camera.csv", "extrinsics": "T.txt", "gps": "gps.csv"}
+    return {name: folder / file for name, file in {"sweeps": "sweeps", **beside}.items()}
+
+
+def placed(files: dict[str, Path], out: Path, *names: str, **how: float | str) -> tuple[Trajectory, str]:
+    (out / "-".join(names)).mkdir(parents=True)
+    given = {name: files[name] for name in ("sweeps", *names)}
+    done = fuse_path(given, FuseParams.model_validate(how), out / "-".join(names), silent)
+    return trajectory_io.read(done.files["trajectory"]), done.facts["told"]
+
+
+def test_what_is_given_is_fused_and_told(tmp_path: Path) -> None:
+    drive = simulated(6, outliers=0)
+    files, truth = recorded(tmp_path, drive), drive.truth[:, :3, 3]
+
+    def error(path: Trajectory) -> F64:
+        return np.linalg.norm(path.positions - truth, axis=1)
+
+    alone, told = placed(files, tmp_path / "out", "matched")
+    assert told == "placed by sweeps (85 % of the steps)" and present(alone.unsure).mean() > 0.5
+    path, told = placed(files, tmp_path / "out", "matched", "poses", "extrinsics")
+    assert told == "placed by sweeps (85 % of the steps), trajectory (87 % of the steps)"
+    assert error(path).max() < 5 and ate(path.positions, truth) < 1
+    everything = ("matched", "poses", "extrinsics", "gps")
+    path, told = placed(files, tmp_path / "out", *everything, gps_offset=-100.0)
+    places = re.search(r"GPS \((\d+) of 400 places\)", told)
+    assert places and int(places[1]) > 300 and ate(path.positions, truth) < 0.8 and error(path).max() < 6
+    assert path.times == pytest.approx(drive.times)
+    late, _ = placed(files, tmp_path / "late", *everything, gps_offset=-80.0, time_offset=20.0)
+    assert late.times == pytest.approx(drive.times)  # in the sweeps' own clock
+
+
+def test_sensors_of_other_times_are_told(tmp_path: Path) -> None:
+    files = recorded(tmp_path, simulated(7, outliers=0))
+    with pytest.raises(InputError, match=r"gps\.csv: spans 100\.00 to 139\.90 s, the sweeps 0\.00 to 39\.90 s.*offset"):
+        placed(files, tmp_path / "a", "matched", "gps")
+    with pytest.raises(InputError, match=r"camera\.csv: spans .*--time-offset"):
+        placed(files, tmp_path / "b", "matched", "poses", time_offset=500.0)
+
+
+def test_a_camera_the_wrong_way_round_is_noticed(tmp_path: Path) -> None:
+    files = recorded(tmp_path, simulated(8, outliers=0))
+    np.savetxt(files["extrinsics"], inverse(simulated(8).T_camera_scanner)[:3])
+    (tmp_path / "out").mkdir()
+    done = fuse_path({k: v for k, v in files.items() if k != "gps"}, FuseParams(), tmp_path / "out", silent)
+    assert any("contradict each other" in text for text in done.warnings)
+
+
+def test_steps_alone_come_out_as_they_are() -> None:
+    drive = simulated(9, tunnel=(0, 0))
+    exact = Steps(inverse(drive.truth[:-1]) @ drive.truth[1:], drive.lidar.covariance, drive.lidar.sure)
+    found = fuse(drive.times, lidar=exact).trajectory.poses
+    np.testing.assert_allclose(found, inverse(drive.truth[0]) @ drive.truth, atol=1e-3)

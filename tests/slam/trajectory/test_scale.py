@@ -1,0 +1,29 @@
+"""Scale tied by GPS: as far as the camera drifts, and as the receiver can be believed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from scan2sim.data_samples.gps import receiver
+from scan2sim.pipeline.core.types import GpsTrack, Trajectory
+from scan2sim.slam.trajectory import scale
+from scan2sim.slam.trajectory.gps import smooth
+from tests.slam.synthetic import ate, drifting_turn
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_gps_of_ten_centimetres_halves_a_turns_error(seed: int) -> None:
+    times, truth, found = drifting_turn()
+    gps = smooth(GpsTrack(times, truth + np.random.default_rng(seed).normal(0, 0.1, truth.shape)))
+    factor = scale.factors(times, found, np.zeros(51, bool), gps, scale.AHEAD)
+    assert ate(scale.apply(found, factor), truth) < 0.5 * ate(found, truth)
+
+
+def test_a_consumers_receiver_does_no_harm_to_a_360_camera() -> None:
+    times = np.arange(0, 60, 0.1)
+    heading = 0.5 * np.sin(times / 9)
+    truth = np.cumsum(np.stack([np.cos(heading), np.sin(heading), 0 * heading], axis=1), axis=0)
+    moments, fixes = receiver(Trajectory(times, truth), seed=1)
+    factor = scale.factors(times, truth, np.zeros(len(times), bool), smooth(GpsTrack(moments, fixes)))
+    assert np.abs(factor - 1).max() < 0.008

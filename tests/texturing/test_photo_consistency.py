@@ -1,0 +1,106 @@
+"""Photos that disagree with the rest: ghosts, wrong poses, blur, overexposure."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from scan2sim.pipeline.camera.renderer import Body, Renderer, look_at
+from scan2sim.pipeline.core.step import Done
+from scan2sim.pipeline.core.types import F64, U8
+from tests.texturing.corner import BOX, CAMERAS, GROUND, Street, photograph, points
+from tests.texturing.test_texture import from_above
+
+CAMERA = CAMERAS["pinhole"]
+POSES = [look_at((-4, y, 1.8), (0, y / 2, 0.6)) for y in (-3.0, -1.5, 0.0, 1.5, 3.0)]
+
+
+def grainy(pose: F64) -> U8:
+    """A photo of the corner with a fine pattern on its ground: something to tell sharpness and displacement by."""
+    from scan2sim.pipeline.camera.models import pixel_rays
+
+    image = Renderer([Body(GROUND), Body(BOX)]).view(CAMERA, pose)
+    at = pose[:3, 3] + (pixel_rays(CAMERA) @ pose[:3, :3].T) * np.where(image.hit, image.range, 0)[..., None]
+    grain = 35 * np.sign(np.sin(9 * at[..., 0] + 2 * at[..., 1]) * np.sin(8 * at[..., 1]))
+    plain = photograph(CAMERA, pose).astype(float)
+    return np.clip(plain + grain[..., None], 0, 255).astype(np.uint8)
+
+
+def rows_of(folder: Path) -> dict[str, Any]:
+    """What `agreement` said of each photo, by name."""
+    return {
+        row["name"]: row
+        for row in json.loads((folder.parent / "agreement" / "agreement.json").read_text(encoding="utf-8"))
+    }
+
+
+def test_a_passing_car_leaves_no_ghost(street: Street) -> None:
+    for i, pose in enumerate(POSES):
+        image = photograph(CAMERA, pose)
+        if i == 2:
+            image[310:390, 260:400] = (255, 0, 255)  # on ground that the others see too
+        street.add(CAMERA, pose, image)
+    street.clouds["terrain"] = points()
+
+    def magenta(**given: Any) -> tuple[int, Done]:
+        folder, done = street.run(band=0, **given)
+        rgb, *_ = from_above(folder)
+        return int(((rgb[..., 0] > 150) & (rgb[..., 1] < 90) & (rgb[..., 2] > 150)).sum()), done
+
+    without, done = magenta()
+    assert without == 0
+    assert done.facts["coverage"] > 0.3
+    assert magenta(agreement={"ghosts": False})[0] > 50
+
+
+@pytest.mark.parametrize("turn, shift", [(0.5, 0.0), (0.0, 0.2)])
+def test_a_wrong_pose_is_named_and_left_out(street: Street, turn: float, shift: float) -> None:
+    for i, pose in enumerate(POSES):
+        true = pose.copy()
+        if i == 3:
+            c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
+            true[:3, :3] = pose[:3, :3] @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+            true[1, 3] += shift
+        street.add(CAMERA, pose, grainy(true))
+    folder, done = street.run(agreement={"max_shift": 2.0})
+    rows = rows_of(folder)
+    assert [name for name, row in rows.items() if not row["usable"]] == ["photo3"]
+    assert rows["photo3"]["shift_px"] > 2 and max(rows[f"photo{i}"]["shift_px"] for i in (0, 1, 2, 4)) < 1.5
+    assert any("photo3" in warning and "pixels" in warning for warning in done.warnings)
+    assert "photo3" not in done.facts["texels_by_photo"]
+
+
+def test_a_blurred_photo_gives_little(street: Street) -> None:
+    for i, pose in enumerate(POSES):
+        image = grainy(pose)
+        street.add(CAMERA, pose, cv2.GaussianBlur(image, (0, 0), 4) if i == 2 else image)
+    folder, done = street.run()
+    rows = rows_of(folder)
+    assert rows["photo2"]["sharpness_factor"] < 0.5
+    assert all(rows[f"photo{i}"]["sharpness_factor"] == 1 for i in (0, 1, 3, 4))
+    assert any("photo2" in warning and "blurred" in warning for warning in done.warnings)
+
+
+def test_an_overexposed_photo_is_left_out(street: Street) -> None:
+    for i, pose in enumerate(POSES):
+        street.add(CAMERA, pose, np.full((480, 640, 3), 255, np.uint8) if i == 1 else None)
+    _, done = street.run()
+    assert any("photo1" in warning and "overexposed" in warning for warning in done.warnings)
+    assert "photo1" not in done.facts["texels_by_photo"]
+
+
+def test_photos_that_agree_are_all_used_whole(street: Street) -> None:
+    for pose in POSES:
+        street.add(CAMERA, pose)
+    folder, done = street.run()
+    assert not done.warnings and done.facts["photos"] == len(POSES)
+    assert max(row.get("ghost_share", 0) for row in rows_of(folder).values()) < 0.01
+
+
+def test_one_photo_alone_will_do(street: Street) -> None:
+    street.add(CAMERA, POSES[2])
+    _, done = street.run()
+    assert done.facts["photos"] == 1 and not done.warnings

@@ -1,0 +1,36 @@
+"""Pages written beside the painting of the next."""
+
+from __future__ import annotations
+
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from scan2sim.pipeline.core.types import U8
+from scan2sim.pipeline.io.images import image
+
+if TYPE_CHECKING:  # it loads numba
+    from scan2sim.texturing.inpainting.hole_filling import Page
+
+
+class Writer:
+    """Writes a page while the next one is painted: one at a time, so that memory holds two pages at most."""
+
+    def __init__(self) -> None:
+        self._pool = ThreadPoolExecutor(1)
+        self._last: Future[None] | None = None
+
+    def write(self, path: Path, page: Page, compression: int = 2) -> None:
+        """Begin `path`.png and `path`_seen.png, once the page before is written."""
+        self.finish()
+        self._last = self._pool.submit(_write, path, page.rgb, page.seen, compression)
+
+    def finish(self) -> None:
+        """Wait; raises what went wrong."""
+        if self._last is not None:
+            self._last.result()
+
+
+def _write(path: Path, rgb: U8, seen: U8, compression: int) -> None:
+    image.write(path.with_name(f"{path.name}.png"), rgb, compression=compression)
+    image.write(path.with_name(f"{path.name}_seen.png"), seen, compression=min(1, compression))

@@ -1,0 +1,224 @@
+"""What no photo saw: colours from the points around, and the room between charts. Import late: it loads numba.
+
+Points are about 10 cm apart and texels 1 cm: colours are asked for on a coarse lattice of texels on each
+face's plane, and interpolated in between.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit, prange
+
+from scan2sim.pipeline.core.classes import colour_of
+from scan2sim.pipeline.core.types import F32, I32, I64, U8, Bools
+from scan2sim.pipeline.geometry.height_map import spacing
+from scan2sim.texturing.bake.texel_map import box, frame
+
+LATTICE = 0.08
+"""Metres between the places where points are asked for their colour."""
+NEIGHBOURS = 4
+REACH = (0.25, 1.0)
+"""Metres beyond which a point's colour is no longer called the surface's own, at least and at most."""
+SPACINGS = 3.0
+"""In between it is so many times what points are apart."""
+FAR_NEIGHBOURS, FAR_STEP = 32, 8
+"""What is farther from every point takes the mean of so many of every so-manieth: one point's would be a flat patch."""
+SEEN, FROM_POINTS, FILLED = 255, 128, 64
+"""Marks of texels: a photo saw them, points lent their colour, or neither."""
+
+
+class Colours:
+    """Coloured points that can be asked for the colour at a place.
+
+    Args:
+        xyz: (N, 3) local metres, N > 0.
+        rgb: (N, 3) uint8.
+        mark: (N,) uint8 or one for all, what texels coloured by them are marked with (`FROM_POINTS` or `FILLED`).
+    """
+
+    def __init__(self, xyz: F32, rgb: U8, mark: int | U8 = FROM_POINTS) -> None:
+        from scipy.spatial import cKDTree
+
+        self._tree = cKDTree(xyz, balanced_tree=False, compact_nodes=False)
+        self._rgb = rgb.astype(np.float32)
+        self._far = cKDTree(xyz[::FAR_STEP])
+        self._reach = float(np.clip(SPACINGS * spacing(xyz), *REACH))
+        self._mark = np.broadcast_to(np.asarray(mark, np.uint8), len(xyz))
+
+    def at(self, places: F32) -> tuple[F32, U8]:
+        """(M, 3) colours, the inverse-square mean of the nearest points, and (M,) the nearest one's mark.
+
+        Where that is too far to be the surface's own it is `FILLED`.
+        """
+        k = min(NEIGHBOURS, self._tree.n)
+        distance, index = self._tree.query(places, k=k, workers=-1)
+        distance, index = distance.reshape(len(places), k), index.reshape(len(places), k)
+        colour, far = _mean(distance, self._rgb[index]), distance[:, 0] > self._reach
+        if far.any():
+            k = min(FAR_NEIGHBOURS, self._far.n)
+            distance_far, index_far = self._far.query(places[far], k=k, workers=-1)
+            shape = (len(distance_far), k)
+            colour[far] = _mean(distance_far.reshape(shape), self._rgb[::FAR_STEP][index_far.reshape(shape)])
+        mark = np.where(distance[:, 0] <= self._reach, self._mark[index[:, 0]], FILLED)
+        return colour, mark.astype(np.uint8)
+
+
+def _mean(distance: npt.NDArray[np.floating], rgb: F32) -> F32:
+    """(M, 3) means of colours (M, K, 3), weighted by the inverse square of their distance (M, K)."""
+    weight = (1.0 / (distance**2 + 1e-4)).astype(np.float32)
+    mean: F32 = np.einsum("mk,mkc->mc", weight, rgb) / weight.sum(axis=1, keepdims=True)
+    return mean
+
+
+@dataclass(frozen=True)
+class Page:
+    """A page while it is painted: `rgb` (H, W, 3), `seen` (H, W), `owner` (H, W), and its faces."""
+
+    rgb: U8
+    seen: U8
+    owner: I32
+    flat: F32
+    corners: F32
+
+
+def fill(page: Page, colours: Colours, texel: float) -> None:
+    """Colour the texels of faces that have none yet (`seen` 0), in place; far from any point they are marked filled.
+
+    Args:
+        page: to be filled.
+        colours: of the points around.
+        texel: metres a texel spans.
+    """
+    step = max(1, round(LATTICE / texel))
+    shape = _lattice(page.owner, page.seen, page.flat, step)
+    start = np.concatenate([[0], np.cumsum(shape[:, 0].astype(np.int64) * shape[:, 1])])
+    if start[-1] == 0:
+        return
+    colour, mark = colours.at(_places(page.flat, page.corners, shape, start, step, page.owner.shape))
+    _interpolate(page.rgb, page.seen, page.owner, page.flat, shape, start, step, colour, mark)
+
+
+def seen_points(page: Page, every: int) -> tuple[F32, U8]:
+    """Places (N, 3) and colours (N, 3) of every n-th texel each way that a photo saw."""
+    rows, columns = np.nonzero(page.seen[::every, ::every] == SEEN)
+    rows, columns = rows * every, columns * every
+    return texel_places(page.owner, page.flat, page.corners, rows, columns), page.rgb[rows, columns]
+
+
+def pad(rgb: U8, seen: U8, reach: int) -> None:
+    """Carry colours outwards into the room between charts, `reach` texels far; beyond is their mean. In place.
+
+    So neither bilinear lookups nor mip-maps draw the background into the surface.
+    """
+    import cv2
+
+    coloured = seen > 0
+    if not coloured.any():
+        rgb[:] = 128
+        return
+    distance, nearest = cv2.distanceTransformWithLabels(
+        (~coloured).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    mean = rgb[::97, ::97][coloured[::97, ::97]].mean(axis=0) if coloured[::97, ::97].any() else np.full(3, 128.0)
+    _carry(rgb, coloured, distance, nearest, reach, np.round(mean).astype(np.uint8))
+
+
+@njit(cache=True, parallel=True)
+def _carry(rgb: U8, coloured: Bools, distance: F32, nearest: I32, reach: int, beyond: U8) -> None:
+    height, width = coloured.shape
+    row, column = np.zeros(nearest.max() + 1, np.int32), np.zeros(nearest.max() + 1, np.int32)
+    for y in prange(height):
+        for x in range(width):
+            if coloured[y, x]:  # every coloured texel has a number of its own
+                row[nearest[y, x]], column[nearest[y, x]] = y, x
+    for y in prange(height):
+        for x in range(width):
+            if coloured[y, x]:
+                continue
+            for k in range(3):
+                rgb[y, x, k] = (
+                    rgb[row[nearest[y, x]], column[nearest[y, x]], k] if distance[y, x] <= reach else beyond[k]
+                )
+
+
+@njit(cache=True, parallel=True)
+def _lattice(owner: I32, seen: U8, flat: F32, step: int) -> I32:
+    """(F, 2) int32 lattice nodes in x and y over every face that has an unseen texel; zero for the others."""
+    height, width = owner.shape
+    shape = np.zeros((len(flat), 2), np.int32)
+    for f in prange(len(flat)):
+        x0, y0, x1, y1 = box(flat, f, width, height)
+        wanting = False
+        for y in range(y0, y1 + 1):
+            for x in range(x0, x1 + 1):
+                if owner[y, x] == f and seen[y, x] == 0:
+                    wanting = True
+                    break
+            if wanting:
+                break
+        if wanting:
+            shape[f, 0], shape[f, 1] = (x1 - x0) // step + 2, (y1 - y0) // step + 2
+    return shape
+
+
+@njit(cache=True, parallel=True)
+def _places(flat: F32, corners: F32, shape: I32, start: I64, step: int, size: tuple[int, int]) -> F32:
+    out = np.empty((start[-1], 3), np.float32)
+    for f in prange(len(flat)):
+        if shape[f, 0] == 0:
+            continue
+        origin, per_x, per_y, _ = frame(flat, corners, f)
+        x0, y0, _, _ = box(flat, f, size[1], size[0])
+        for j in range(shape[f, 1]):
+            for i in range(shape[f, 0]):
+                x, y = x0 + i * step, y0 + j * step
+                for k in range(3):
+                    out[start[f] + j * shape[f, 0] + i, k] = origin[k] + x * per_x[k] + y * per_y[k]
+    return out
+
+
+@njit(cache=True, parallel=True)
+def _interpolate(
+    rgb: U8, seen: U8, owner: I32, flat: F32, shape: I32, start: I64, step: int, colour: F32, mark: U8
+) -> None:
+    height, width = owner.shape
+    for f in prange(len(flat)):
+        if shape[f, 0] == 0:
+            continue
+        x0, y0, x1, y1 = box(flat, f, width, height)
+        for y in range(y0, y1 + 1):
+            for x in range(x0, x1 + 1):
+                if owner[y, x] != f or seen[y, x] != 0:
+                    continue
+                i, j = (x - x0) // step, (y - y0) // step
+                fx, fy = (x - x0) / step - i, (y - y0) / step - j
+                a = start[f] + j * shape[f, 0] + i
+                b = a + shape[f, 0]
+                for k in range(3):
+                    upper = colour[a, k] * (1 - fx) + colour[a + 1, k] * fx
+                    lower = colour[b, k] * (1 - fx) + colour[b + 1, k] * fx
+                    rgb[y, x, k] = min(255.0, upper * (1 - fy) + lower * fy + 0.5)
+                seen[y, x] = mark[a]
+
+
+@njit(cache=True, parallel=True)
+def texel_places(owner: I32, flat: F32, corners: F32, rows: I64, columns: I64) -> F32:
+    """(N, 3) local metres of texels at rows and columns (N,) of a page, on the faces that own them."""
+    out = np.empty((len(rows), 3), np.float32)
+    for i in prange(len(rows)):
+        f = owner[rows[i], columns[i]]
+        origin, per_x, per_y, _ = frame(flat, corners, f)
+        for k in range(3):
+            out[i, k] = origin[k] + columns[i] * per_x[k] + rows[i] * per_y[k]
+    return out
+
+
+def shaded(classification: U8, normal: npt.NDArray[np.floating] | None) -> U8:
+    """(N, 3) display colours of classes (N,), a little darker where normals (N, 3) turn from above."""
+    rgb = colour_of()[classification].astype(np.float32)
+    if normal is not None:
+        rgb *= (0.75 + 0.25 * np.clip(normal @ np.array([0.3, 0.2, 0.93]), 0, 1))[:, None]
+    return rgb.astype(np.uint8)
