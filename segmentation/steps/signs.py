@@ -1,4 +1,4 @@
-"""Signs: the plates of traffic signs fitted to photos, also where the scan ends (kernels in outlines.py)."""
+"""Signs: the plates of traffic signs fitted to photos, also where the scan ends (kernels in fit_outline.py)."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Global adjustment: all keyframes and points at once, by pycolmap (Ceres), after odometry; reported apart from it.
 
 Schoenberger and Frahm, "Structure-from-Motion Revisited", CVPR 2016; pycolmap knows equirectangular cameras. Features
-that neither odometry nor the adjustment has used (`witness.py`) tell which of both paths is kept.
+that neither odometry nor the adjustment has used (`cross_validation.py`) tell which of both paths is kept.
 """
 
 from __future__ import annotations

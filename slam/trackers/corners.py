@@ -2,7 +2,7 @@
 
 Needs no weights. A corner is followed there and back; one that doesn't return to where it was is lost. Pictures are
 brought to one exposure before, and what is left of its change is taken out (`exposure.py`). What is found is laid onto
-what the corner looked like at first (`patches.py`): a corner that looks otherwise is lost, too.
+what the corner looked like at first (`patch_alignment.py`): a corner that looks otherwise is lost, too.
 """
 
 from __future__ import annotations

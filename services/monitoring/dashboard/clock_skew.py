@@ -1,4 +1,4 @@
-"""How far a node's clock is off, by when its records come: for places in time, not for latencies (`clock.py`).
+"""How far a node's clock is off, by when its records come: for places in time, not for latencies (`clock_sync.py`).
 
 Kafka's own times don't tell: a message bears its producer's, unless its topic is set up otherwise.
 """
